@@ -1,0 +1,40 @@
+"""Configuration of the actor pool. Imports the standard library and gvz.errors only."""
+
+from dataclasses import dataclass
+
+from gvz.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ActorsConfig:
+    """How many processes play, and how patiently they are watched. Times in seconds, sizes in step records."""
+
+    num_actors: int | None = None
+    """actor processes; default one per CPU core"""
+    games_per_actor: int | None = None
+    """games each actor plays and acts on in one batch; default the smallest number >= 4 that gives every actor
+    every task"""
+    ring_capacity: int = 256
+    """step records a ring holds; a full ring makes its actor wait"""
+    start_timeout_s: float = 120.0
+    """an actor that has not started all its games by then is restarted"""
+    heartbeat_timeout_s: float = 30.0
+    """an actor that shows no sign of life for so long is killed and restarted"""
+    max_restarts: int = 20
+    """restarts of one actor within restart_window_s before the run stops with an error"""
+    restart_window_s: float = 600.0
+    """length of the window in which restarts are counted"""
+    recycle_episodes: int = 1000
+    """a game's engine is restarted after so many episodes (0: never); ViZDoom has leaked memory over hours"""
+
+    def __post_init__(self) -> None:
+        for name, low in (("num_actors", 1), ("games_per_actor", 1), ("ring_capacity", 8)):
+            value = getattr(self, name)
+            if value is not None and value < low:
+                raise ConfigError(f"actors.{name}: got {value}, want at least {low}")
+        for name in ("start_timeout_s", "heartbeat_timeout_s", "restart_window_s"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"actors.{name}: got {getattr(self, name)}, want more than 0 seconds")
+        for name in ("max_restarts", "recycle_episodes"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"actors.{name}: got {getattr(self, name)}, want 0 or more")
