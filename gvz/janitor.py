@@ -1,0 +1,193 @@
+"""Finds and removes what dead processes of ours left behind. Linux; standard library and gvz.errors only.
+
+A SIGKILL leaves shared memory, private directories and, at worst, engines. So whoever makes such a thing first
+writes a record of it: a small private file that names the thing and its owner (process id and start time, so that
+a reused process id is not mistaken for its owner). `clean_dead_instances` removes what belongs to records whose
+owner is gone, and nothing else: nothing is ever matched by a pattern of names.
+
+Every step can be repeated and any number of janitors may run at once: names are never used twice.
+"""
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import signal
+import stat
+import tempfile
+from pathlib import Path
+from typing import Literal
+
+from gvz.errors import ResourceError
+
+Kind = Literal["engine", "segment"]
+"""engine: `name` is an engine's private directory; segment: `name` is a file of /dev/shm."""
+
+SHM_DIR = Path("/dev/shm")
+ENGINE_DIR_PREFIX = "gvz-engine-"
+"""every engine's private directory is called so, followed by random letters"""
+INSTANCE_FILE = "instance.json"
+"""in an engine's private directory: {"pid", "start", "id"} of the engine, written by `engine_wrapper.py`"""
+_ENGINE_SHM_PREFIXES = ("ViZDoomSM", "ViZDoomMQCtr", "ViZDoomMQDoom")
+
+
+def runtime_dir() -> Path:
+    """This user's private directory for records and locks (made if missing, mode 0700).
+
+    Raises:
+        ResourceError: the directory exists but is not ours alone, or cannot be made.
+    """
+    base = os.environ.get("XDG_RUNTIME_DIR")
+    if not base or not os.access(base, os.W_OK | os.X_OK):
+        base = tempfile.gettempdir()
+    path = Path(base) / f"gvizdoom-{os.getuid()}"
+    try:
+        path.mkdir(mode=0o700, exist_ok=True)
+        found = path.lstat()
+    except OSError as error:
+        raise ResourceError(
+            f"runtime directory {path}: {error}; set TMPDIR to a writable directory"
+        ) from error
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise ResourceError(
+            f"runtime directory {path}: got owner {found.st_uid}, mode {stat.filemode(found.st_mode)}, "
+            f"want a directory of user {os.getuid()} that nobody else can enter (drwx------); "
+            "remove it, or set TMPDIR to another directory"
+        )
+    return path
+
+
+def record(kind: Kind, name: str) -> None:
+    """Notes that this process owns `name`. Call it before the thing is made: no instant is unprotected."""
+    _check_name(kind, name)
+    path = _record_path(kind, name)
+    content = {
+        "kind": kind,
+        "name": name,
+        "owner_pid": os.getpid(),
+        "owner_start": process_start(os.getpid()),
+        "machine": _machine(),
+    }
+    # whole or not at all: a janitor never sees half a record
+    partial = path.with_suffix(".partial")
+    with os.fdopen(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
+        json.dump(content, file)
+    partial.replace(path)
+
+
+def forget(kind: Kind, name: str) -> None:
+    """Takes back this process's `record`; call it after the thing is gone. Unknown names are ignored."""
+    _record_path(kind, name).unlink(missing_ok=True)
+
+
+def clean_dead_instances() -> list[str]:
+    """Removes what dead owners left: engines, shared memory, private directories.
+
+    Returns:
+        One line for each thing removed, and for each record that cannot be read (these are left alone).
+    """
+    done: list[str] = []
+    for path in sorted(runtime_dir().glob("*.json")):
+        try:
+            content = json.loads(path.read_text())
+            kind, name = content["kind"], content["name"]
+            _check_name(kind, name)
+            foreign = content["machine"] != _machine()
+            owner_lives = process_start(int(content["owner_pid"])) == content["owner_start"]
+        except FileNotFoundError:
+            continue  # its owner, or another janitor, was faster
+        except (ValueError, KeyError, TypeError) as error:
+            done.append(f"left alone: unreadable record {path} ({error})")
+            continue
+        if foreign or owner_lives:
+            continue
+        done += clean_engine(Path(name)) if kind == "engine" else _unlink_shm(name)
+        path.unlink(missing_ok=True)
+    return done
+
+
+def clean_engine(directory: Path) -> list[str]:
+    """Ends the engine of a private directory if it runs, unlinks its shared memory, deletes the directory."""
+    done: list[str] = []
+    instance = read_instance(directory)
+    if instance is not None:
+        pid, start, instance_id = instance
+        # the engine carries its instance id on its command line: proof that this process is the one recorded
+        if process_start(pid) == start and instance_id in _arguments(pid):
+            os.kill(pid, signal.SIGKILL)
+            done.append(f"engine {instance_id} (pid {pid})")
+        for prefix in _ENGINE_SHM_PREFIXES:
+            done += _unlink_shm(prefix + instance_id)
+    if directory.is_dir():
+        shutil.rmtree(directory, ignore_errors=True)
+        done.append(f"directory {directory}")
+    return done
+
+
+def read_instance(directory: Path) -> tuple[int, int, str] | None:
+    """(pid, start time, instance id) of the engine of a private directory; None if none was launched there."""
+    try:
+        content = json.loads((directory / INSTANCE_FILE).read_text())
+    except FileNotFoundError:
+        return None
+    instance_id = str(content["id"])
+    if re.fullmatch(r"[A-Za-z0-9]+", instance_id) is None:
+        raise ValueError(
+            f"{directory / INSTANCE_FILE}: got instance id {instance_id!r}, want letters and digits"
+        )
+    return int(content["pid"]), int(content["start"]), instance_id
+
+
+def process_start(pid: int) -> int | None:
+    """Clock ticks from boot to the start of a process; None if it does not exist or is a zombie.
+
+    Differs: psutil's creation time is a wall clock time and moves when the clock is set; this one never does.
+    """
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return None
+    fields = text[text.rindex(")") + 2 :].split()  # the command's name may hold blanks and brackets
+    state, start = fields[0], int(fields[19])
+    return None if state in "ZX" else start
+
+
+def _arguments(pid: int) -> list[str]:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
+    except (FileNotFoundError, ProcessLookupError):
+        return []
+
+
+def _machine() -> str:
+    """Process ids mean something only within one boot and one pid namespace (containers may share a disk)."""
+    boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    return f"{boot} {Path('/proc/self/ns/pid').readlink()}"
+
+
+def _record_path(kind: Kind, name: str) -> Path:
+    digest = hashlib.blake2b(name.encode(), digest_size=8).hexdigest()
+    return runtime_dir() / f"{kind}-{os.getpid()}-{process_start(os.getpid())}-{digest}.json"
+
+
+def _check_name(kind: str, name: str) -> None:
+    """A damaged or forged record must not make us delete anything but what we could have made."""
+    if kind == "engine":
+        good = Path(name).is_absolute() and Path(name).name.startswith(ENGINE_DIR_PREFIX) and ".." not in name
+        wanted = f"an absolute path that ends in {ENGINE_DIR_PREFIX}..."
+    elif kind == "segment":
+        good = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) is not None
+        wanted = "a file name of letters, digits, '.', '_', '-'"
+    else:
+        raise ValueError(f"record of kind {kind!r}: want engine or segment")
+    if not good:
+        raise ValueError(f"record of kind {kind!r}: got name {name!r}, want {wanted}")
+
+
+def _unlink_shm(name: str) -> list[str]:
+    try:
+        (SHM_DIR / name).unlink()
+    except FileNotFoundError:
+        return []
+    return [f"shared memory {name}"]
