@@ -1,0 +1,235 @@
+"""Checkpoints: orbax arrays, a JSON host state, and a manifest that proves the whole. May import gvz tier 0 only.
+
+    checkpoints/<updates>/  arrays/ (orbax)  host.json  manifest.json      the whole state, `keep` of them
+    policies/<updates>/     the same, parameters only, never pruned         what evaluation reads
+
+Writing: snapshot to host memory now, write into a hidden sibling in a thread, hash every file into the manifest,
+fsync, rename. A directory without a manifest that agrees with its files is damaged and named, never used; nothing in
+a checkpoint is unpickled, so one from a stranger can be read.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+
+from gvz.errors import CheckpointError
+
+CHECKPOINT_SCHEMA = 1
+"""Raised by one whenever the arrays' or the host state's meaning changes."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Restored:
+    """A checkpoint that was read whole.
+
+    Attributes:
+        num_updates: gradient steps it had done.
+        arrays: the pytree of the template, numpy leaves.
+        host: the host state.
+        damage: one message for each newer checkpoint that could not be used.
+    """
+
+    num_updates: int
+    arrays: Any
+    host: dict[str, Any]
+    damage: list[str]
+
+
+def _is_key(x: Any) -> bool:
+    return isinstance(x, jax.Array | jax.ShapeDtypeStruct) and jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def snapshot(tree: Any) -> Any:
+    """Copies every array of `tree` to host memory that nothing else owns (a donated buffer may be reused at once)."""
+    return jax.tree.map(lambda x: np.array(jax.random.key_data(x) if _is_key(x) else x, copy=True), tree)
+
+
+def _leaf_specs(tree: Any) -> dict[str, list[Any]]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {jax.tree_util.keystr(path): [list(np.shape(leaf)), str(leaf.dtype)] for path, leaf in leaves}
+
+
+def _digest(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+
+
+def _files(directory: Path) -> list[Path]:
+    return sorted(p for p in directory.rglob("*") if p.is_file() and p.name != "manifest.json")
+
+
+def write(directory: Path, arrays: Any, host: dict[str, Any]) -> None:
+    """Writes `arrays` (numpy leaves) and `host` (JSON types) to `directory`, whole or not at all.
+
+    Raises:
+        CheckpointError: the disk is full, permission is missing, or the like; nothing is left behind.
+    """
+    writing = directory.with_name(f".writing-{directory.name}-{os.getpid()}")
+    try:
+        shutil.rmtree(writing, ignore_errors=True)
+        writing.mkdir(parents=True, mode=0o700)
+        flat = {f"{i:03d}": leaf for i, leaf in enumerate(jax.tree.leaves(arrays))}
+        with ocp.StandardCheckpointer() as checkpointer:
+            checkpointer.save((writing / "arrays").absolute(), flat)
+            checkpointer.wait_until_finished()
+        (writing / "host.json").write_text(json.dumps(host))
+        manifest = {
+            "schema": CHECKPOINT_SCHEMA,
+            "leaves": _leaf_specs(arrays),
+            "files": {str(f.relative_to(writing)): [f.stat().st_size, _digest(f)] for f in _files(writing)},
+        }
+        with (writing / "manifest.json").open("w") as stream:
+            json.dump(manifest, stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+        if directory.exists():
+            shutil.rmtree(directory)
+        writing.rename(directory)
+    except Exception as error:  # orbax and tensorstore raise many unrelated classes for one full disk
+        shutil.rmtree(writing, ignore_errors=True)
+        raise CheckpointError(f"checkpoint {directory} could not be written: {type(error).__name__}: {error}") from error
+
+
+def verify(directory: Path) -> dict[str, Any]:
+    """Checks every file of a checkpoint against its manifest and returns the manifest.
+
+    Raises:
+        CheckpointError: says which file is missing, cut, changed or unknown.
+    """
+    try:
+        manifest = json.loads((directory / "manifest.json").read_text())
+        schema, listed = manifest["schema"], manifest["files"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(f"{directory}: no readable manifest.json ({type(error).__name__}): not whole") from error
+    if schema != CHECKPOINT_SCHEMA:
+        raise CheckpointError(f"{directory}: schema {schema!r}, want {CHECKPOINT_SCHEMA}")
+    present = {str(f.relative_to(directory)): f for f in _files(directory)}
+    if present.keys() != listed.keys():
+        raise CheckpointError(f"{directory}: files missing or unknown: {sorted(present.keys() ^ listed.keys())[:3]}")
+    for name, (size, digest) in listed.items():
+        if present[name].stat().st_size != size:
+            raise CheckpointError(f"{directory}/{name}: {present[name].stat().st_size} bytes, want {size}: cut short")
+        if _digest(present[name]) != digest:
+            raise CheckpointError(f"{directory}/{name}: contents do not match the manifest: damaged")
+    return manifest
+
+
+def read(directory: Path, template: Any) -> tuple[Any, dict[str, Any]]:
+    """Reads a checkpoint into the structure of `template` (arrays or ShapeDtypeStructs).
+
+    Returns: the pytree with numpy leaves (typed PRNG keys are wrapped again), and the host state.
+
+    Raises:
+        CheckpointError: damaged, or its leaves are not the template's (names the leaf, got and wanted).
+    """
+    manifest = verify(directory)
+    plain = jax.tree.map(lambda x: jax.eval_shape(jax.random.key_data, x) if _is_key(x) else x, template)
+    wanted, got = _leaf_specs(plain), manifest["leaves"]
+    for path in [*wanted, *got]:
+        if wanted.get(path) != got.get(path):
+            raise CheckpointError(
+                f"{directory}: leaf {path}: got {got.get(path, 'nothing')}, want {wanted.get(path, 'nothing')}; "
+                "it belongs to another configuration"
+            )
+    leaves = jax.tree.leaves(plain)
+    abstract = {f"{i:03d}": np.empty(np.shape(leaf), leaf.dtype) for i, leaf in enumerate(leaves)}
+    try:
+        with ocp.StandardCheckpointer() as checkpointer:
+            flat = checkpointer.restore((directory / "arrays").absolute(), abstract)
+        host = json.loads((directory / "host.json").read_text())
+    except Exception as error:  # as for writing
+        raise CheckpointError(f"{directory} cannot be read: {type(error).__name__}: {error}") from error
+    arrays = jax.tree.unflatten(jax.tree.structure(plain), [flat[f"{i:03d}"] for i in range(len(leaves))])
+    return jax.tree.map(lambda t, x: jax.random.wrap_key_data(x) if _is_key(t) else x, template, arrays), host
+
+
+def checkpoint_steps(directory: Path) -> list[int]:
+    """Gradient steps of the checkpoints in `directory`, ascending, valid or not."""
+    return sorted(int(p.name) for p in directory.glob("*") if p.is_dir() and p.name.isdigit())
+
+
+def restore_newest(directory: Path, template: Any) -> Restored | None:
+    """Reads the newest valid checkpoint; None if there is no checkpoint at all.
+
+    Raises:
+        CheckpointError: there are checkpoints but none is valid; names the damage of each.
+    """
+    damage: list[str] = []
+    for step in reversed(checkpoint_steps(directory)):
+        try:
+            arrays, host = read(directory / str(step), template)
+        except CheckpointError as error:
+            damage.append(str(error))
+            continue
+        return Restored(num_updates=step, arrays=arrays, host=host, damage=damage)
+    if damage:
+        raise CheckpointError("no checkpoint is valid:\n  " + "\n  ".join(damage))
+    return None
+
+
+class Checkpointer:
+    """Writes a run's checkpoints in a thread, one at a time, and keeps `keep` of them."""
+
+    def __init__(self, run_path: Path, *, keep: int):
+        """Removes what a killed run was still writing.
+
+        Args:
+            run_path: the run directory.
+            keep: whole checkpoints to keep, at least 1.
+        """
+        self._checkpoints, self._policies, self._keep = run_path / "checkpoints", run_path / "policies", keep
+        self._thread: threading.Thread | None = None
+        self._failures: list[str] = []
+        for folder in (self._checkpoints, self._policies):
+            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            for left in folder.glob(".writing-*"):
+                shutil.rmtree(left, ignore_errors=True)
+
+    @property
+    def busy(self) -> bool:
+        """A checkpoint is being written."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def save(self, num_updates: int, arrays: Any, params: Any, host: dict[str, Any]) -> None:
+        """Snapshots `arrays` now and writes them in the background, `params` beside them for evaluation.
+
+        Waits for an earlier save first. A failure is kept for `failures`, never raised here.
+        """
+        self.wait()
+        arrays, params = snapshot(arrays), snapshot(params)
+
+        def work() -> None:
+            try:
+                write(self._policies / str(num_updates), params, {"num_updates": num_updates})
+                write(self._checkpoints / str(num_updates), arrays, host)
+                for step in checkpoint_steps(self._checkpoints)[: -self._keep]:
+                    shutil.rmtree(self._checkpoints / str(step), ignore_errors=True)
+            except CheckpointError as error:
+                self._failures.append(str(error))
+
+        self._thread = threading.Thread(target=work, name=f"checkpoint-{num_updates}")
+        self._thread.start()
+
+    def failures(self) -> list[str]:
+        """Messages of saves that failed since the last call."""
+        failed, self._failures = self._failures, []
+        return failed
+
+    def wait(self, on_wait: Callable[[], None] | None = None) -> None:
+        """Waits until nothing is being written, calling `on_wait` every quarter of a second."""
+        while self.busy:
+            assert self._thread is not None
+            self._thread.join(0.25)
+            if on_wait is not None:
+                on_wait()
+        self._thread = None
