@@ -1,0 +1,53 @@
+# Everything starts here: `make train` and `make test` set up what they need on a fresh machine.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+ARGS   ?=
+
+.PHONY: help install install-cuda train test test-fast test-slow lint format lock bench clean
+
+help:            ## show this list
+	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
+
+install: $(VENV)/.installed ## make the virtual environment in .venv
+
+$(VENV)/.installed: requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+install-cuda: install ## add JAX for NVIDIA GPUs
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[cuda]'
+
+train: install   ## run the main job (ARGS="--learner.total-updates 5000 ...")
+	$(BIN)/python -m gvz.launch --config rainbow_4task.py $(ARGS)
+
+test: install    ## all tests but the slow lane (under 20 minutes on 2 cores)
+	$(BIN)/python -m pytest -m "not slow" $(ARGS)
+
+test-fast: install ## unit tests that start no engine
+	$(BIN)/python -m pytest -m "not slow and not engine and not e2e" $(ARGS)
+
+test-slow: install ## learning and fault tests that take minutes each
+	$(BIN)/python -m pytest -m slow --timeout 1800 $(ARGS)
+
+lint: install    ## format check, lint, types
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/basedpyright
+
+format: install  ## apply formatting and safe fixes
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+bench: install   ## benchmark bodies, timed
+	$(BIN)/python -m pytest tests/perf --benchmark-enable $(ARGS)
+
+lock: install    ## resolve requirements.lock anew from pyproject.toml
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev pyproject.toml \
+	  --no-emit-index-url --no-header --no-annotate --no-emit-package opencv-python --output-file requirements.lock
+
+clean:           ## remove the virtual environment and caches
+	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis build dist
