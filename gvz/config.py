@@ -338,7 +338,10 @@ def differences(old: RunConfig, new: RunConfig) -> list[str]:
         for derived in ("scenario", "training_set", "actors.num_actors", "actors.games_per_actor"):
             del values[derived]
         values["tasks"] = tuple(task.id for task in config.resolved_tasks())
-        values["actors.num_actors"], values["actors.games_per_actor"] = config.num_actors, config.games_per_actor
+        values["actors.num_actors"], values["actors.games_per_actor"] = (
+            config.num_actors,
+            config.games_per_actor,
+        )
         return values
 
     def may_change(name: str) -> bool:

@@ -43,7 +43,9 @@ class RunDir:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             self._lock.close()
-            raise ResumeError(f"run directory {path}: another running process uses it; wait or use --run-dir") from error
+            raise ResumeError(
+                f"run directory {path}: another running process uses it; wait or use --run-dir"
+            ) from error
         self.checkpoints = path / "checkpoints"
         self.tensorboard = path / "tensorboard"
         self.work = path / "work"

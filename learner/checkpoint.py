@@ -97,7 +97,9 @@ def write(directory: Path, arrays: Any, host: dict[str, Any]) -> None:
         writing.rename(directory)
     except Exception as error:  # orbax and tensorstore raise many unrelated classes for one full disk
         shutil.rmtree(writing, ignore_errors=True)
-        raise CheckpointError(f"checkpoint {directory} could not be written: {type(error).__name__}: {error}") from error
+        raise CheckpointError(
+            f"checkpoint {directory} could not be written: {type(error).__name__}: {error}"
+        ) from error
 
 
 def verify(directory: Path) -> dict[str, Any]:

@@ -1,0 +1,130 @@
+"""What a run records about itself: rows of metrics, episodes and faults, TensorBoard events, the status panel.
+
+Scalars are named `group/name_unit` and are the same in metrics.jsonl and in TensorBoard. Episode rows carry no
+wall-clock time, so that two synchronous runs with one seed write the same bytes.
+"""
+
+import time
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+from tensorboardX import SummaryWriter
+
+from gvz.progress import TaskStatus
+from gvz.rundir import RunDir
+from gvz.transport.messages import EpisodeStats, Fault
+
+RECENT_EPISODES = 30
+"""episodes in a task's recent score (thesis 4.3.2 uses 30 for its KPI)"""
+
+
+class Rates:
+    """Turns counters into rates per second between calls."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, float] = {}
+        self._time_s = time.monotonic()
+
+    def __call__(self, counters: Mapping[str, float]) -> tuple[dict[str, float], float]:
+        """Returns the rate of each counter since the last call, and the seconds that passed."""
+        now = time.monotonic()
+        passed_s = max(now - self._time_s, 1e-9)
+        rates = {name: (value - self._last.get(name, value)) / passed_s for name, value in counters.items()}
+        self._last, self._time_s = dict(counters), now
+        return rates, passed_s
+
+
+class Telemetry:
+    """Writes the records of one run and remembers the recent score of each task."""
+
+    def __init__(self, run: RunDir, *, tasks: tuple[str, ...], upper_bound: float, tensorboard: bool, num_updates: int):
+        """Opens the records.
+
+        Args:
+            run: the run directory.
+            tasks: ids, in the order of the step records' task index.
+            upper_bound: of the scenario's score.
+            tensorboard: write events too.
+            num_updates: gradient steps done; later events of a killed run are hidden.
+        """
+        self._run, self._tasks, self._upper_bound = run, tasks, upper_bound
+        self._recent: list[deque[float]] = [deque(maxlen=RECENT_EPISODES) for _ in tasks]
+        self._episodes = [0] * len(tasks)
+        self._events = SummaryWriter(str(run.tensorboard), purge_step=num_updates) if tensorboard else None
+
+    def episode(self, stats: EpisodeStats, *, num_updates: int, env_steps: int) -> None:
+        """Records a finished episode."""
+        self._episodes[stats.task] += 1
+        if not stats.cut:
+            self._recent[stats.task].append(stats.score)
+        self._run.append(
+            "episodes.jsonl",
+            {
+                "num_updates": num_updates,
+                "env_steps": env_steps,
+                "task": self._tasks[stats.task],
+                "lane": stats.lane,
+                "episode": stats.episode,
+                "seed": stats.seed,
+                "score": stats.score,
+                "normalized_score": 100 * stats.score / self._upper_bound,
+                "reward": stats.reward,
+                "reward_components": stats.reward_components,
+                "length_frames": stats.length_frames,
+                "length_steps": stats.length_steps,
+                "params_version": stats.params_version,
+                "terminated": stats.terminated,
+                "truncated": stats.truncated,
+                "cut": stats.cut,
+            },
+        )
+
+    def fault(self, fault: Fault, *, num_updates: int) -> None:
+        """Records something that failed and was handled."""
+        self._run.append(
+            "faults.jsonl",
+            {
+                "num_updates": num_updates,
+                "time_s": time.time(),
+                "actor": fault.actor,
+                "lane": fault.lane,
+                "kind": fault.kind,
+                "message": fault.message,
+                "traceback": fault.traceback,
+            },
+        )
+
+    def scalars(self, num_updates: int, values: Mapping[str, float]) -> None:
+        """Records a row of scalars at a gradient step."""
+        row = {**values, **{f"task/{t.task}/score": t.score for t in self.task_statuses() if t.episodes}}
+        self._run.append("metrics.jsonl", {"num_updates": num_updates, "time_s": time.time(), **row})
+        if self._events is not None:
+            for name, value in row.items():
+                self._events.add_scalar(name, value, num_updates)
+
+    def task_statuses(self) -> tuple[TaskStatus, ...]:
+        """Recent play of each task."""
+        return tuple(
+            TaskStatus(
+                task=task,
+                episodes=self._episodes[i],
+                score=sum(self._recent[i]) / len(self._recent[i]) if self._recent[i] else float("nan"),
+                upper_bound=self._upper_bound,
+            )
+            for i, task in enumerate(self._tasks)
+        )
+
+    def state(self) -> dict[str, Any]:
+        """What a resumed run goes on from."""
+        return {"episodes": list(self._episodes), "recent": [list(r) for r in self._recent]}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """The inverse of `state`."""
+        self._episodes = list(state["episodes"])
+        self._recent = [deque(r, maxlen=RECENT_EPISODES) for r in state["recent"]]
+
+    def close(self) -> None:
+        """Flushes the events."""
+        if self._events is not None:
+            self._events.close()

@@ -1,0 +1,87 @@
+"""Imports point down only: the tiers of docs/ARCHITECTURE.md, checked from the syntax tree."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+TIER_0 = ("gvz", "gvz.errors", "gvz.specs", "gvz.registry", "gvz.transport")
+TIER_1 = (
+    "gvz.engine",
+    "gvz.engine_wrapper",
+    "gvz.janitor",
+    "gvz.env",
+    "gvz.tasks",
+    "gvz.scenarios",
+    "gvz.wad",
+)
+BENCHMARK_MUST_NOT = ("jax", "flax", "optax", "chex", "orbax", "actors", "learner")
+OURS = ("gvz", "actors", "learner", "configs")
+
+
+def modules() -> list[tuple[str, Path]]:
+    found = []
+    for package in OURS:
+        for file in sorted((ROOT / package).rglob("*.py")):
+            parts = file.relative_to(ROOT).with_suffix("").parts
+            found.append((".".join(parts[:-1] if parts[-1] == "__init__" else parts), file))
+    return found
+
+
+def imports_of(file: Path) -> set[str]:
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}: relative import"
+            names.add(node.module or "")
+            names.update(f"{node.module}.{alias.name}" for alias in node.names)
+    return names
+
+
+def under(name: str, packages: tuple[str, ...]) -> bool:
+    return any(name == p or name.startswith(p + ".") for p in packages)
+
+
+def tier(module: str) -> int:
+    if under(module, TIER_0[1:]) or module == "gvz":
+        return 0
+    if under(module, TIER_1):
+        return 1
+    return 2 if under(module, ("actors", "learner")) else 3
+
+
+@pytest.mark.parametrize(("module", "file"), modules(), ids=lambda v: v if isinstance(v, str) else "")
+def test_imports_point_down(module: str, file: Path):
+    own = {name for _, name in [(f, m) for m, f in modules()]}
+    for name in imports_of(file):
+        target = name if name in own else name.rpartition(".")[0]
+        if target in own and target != "gvz":
+            assert tier(target) <= tier(module), f"{module} (tier {tier(module)}) imports {target}"
+        if under(module, ("actors",)):
+            assert not under(name, ("learner",)), f"{module} imports its sibling {name}"
+        if under(module, ("learner",)):
+            assert not under(name, ("actors",)), f"{module} imports its sibling {name}"
+            assert tier(target) == 0 or not under(target, TIER_1), f"{module} imports {target} of tier 1"
+        if tier(module) <= 1:
+            assert not under(name, BENCHMARK_MUST_NOT), f"{module} imports {name}"
+        if under(name, ("vizdoom",)):
+            assert module == "gvz.engine", f"{module} imports vizdoom; only gvz.engine may"
+
+
+@pytest.mark.parametrize(
+    ("statement", "forbidden"),
+    [
+        ("import gvz", ("jax", "vizdoom", "cv2")),
+        ("import gvz.launch", ("jax", "vizdoom", "orbax", "flax")),
+        ("import gvz.env, gvz.tasks", ("jax", "flax", "orbax", "tyro")),
+    ],
+)
+def test_an_import_does_not_load(statement: str, forbidden: tuple[str, ...]):
+    code = f"{statement}; import sys; print([m for m in {forbidden!r} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "[]"
