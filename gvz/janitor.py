@@ -1,9 +1,9 @@
 """Finds and removes what dead processes of ours left behind. Linux; standard library and gvz.errors only.
 
-A SIGKILL leaves shared memory, private directories and, at worst, engines. So whoever makes such a thing first
-writes a record of it: a small private file that names the thing and its owner (process id and start time, so that
-a reused process id is not mistaken for its owner). `clean_dead_instances` removes what belongs to records whose
-owner is gone, and nothing else: nothing is ever matched by a pattern of names.
+A SIGKILL leaves shared memory, private directories and, at worst, engines. So whoever makes such a thing
+first writes a record of it: a small private file that names the thing and its owner (process id and start
+time, so that a reused process id is not mistaken for its owner). `clean_dead_instances` removes what belongs
+to records whose owner is gone, and nothing else: nothing is ever matched by a pattern of names.
 
 Every step can be repeated and any number of janitors may run at once: names are never used twice.
 """
@@ -27,8 +27,8 @@ Kind = Literal["engine", "segment"]
 SHM_DIR = Path("/dev/shm")
 ENGINE_DIR_PREFIX = "gvz-engine-"
 """every engine's private directory is called so, followed by random letters"""
-INSTANCE_FILE = "instance.json"
-"""in an engine's private directory: {"pid", "start", "id"} of the engine, written by `engine_wrapper.py`"""
+INSTANCE_FILE = "instance"
+"""in an engine's private directory: "pid start id" of its engine, written by `engine_wrapper.py`"""
 _ENGINE_SHM_PREFIXES = ("ViZDoomSM", "ViZDoomMQCtr", "ViZDoomMQDoom")
 
 
@@ -46,9 +46,7 @@ def runtime_dir() -> Path:
         path.mkdir(mode=0o700, exist_ok=True)
         found = path.lstat()
     except OSError as error:
-        raise ResourceError(
-            f"runtime directory {path}: {error}; set TMPDIR to a writable directory"
-        ) from error
+        raise ResourceError(f"runtime directory {path}: {error}; set TMPDIR to a writable directory") from error
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
         raise ResourceError(
             f"runtime directory {path}: got owner {found.st_uid}, mode {stat.filemode(found.st_mode)}, "
@@ -126,17 +124,15 @@ def clean_engine(directory: Path) -> list[str]:
 
 
 def read_instance(directory: Path) -> tuple[int, int, str] | None:
-    """(pid, start time, instance id) of the engine of a private directory; None if none was launched there."""
+    """(pid, start time, instance id) of the engine of a private directory; None if none was launched."""
     try:
-        content = json.loads((directory / INSTANCE_FILE).read_text())
+        text = (directory / INSTANCE_FILE).read_text()
     except FileNotFoundError:
         return None
-    instance_id = str(content["id"])
-    if re.fullmatch(r"[A-Za-z0-9]+", instance_id) is None:
-        raise ValueError(
-            f"{directory / INSTANCE_FILE}: got instance id {instance_id!r}, want letters and digits"
-        )
-    return int(content["pid"]), int(content["start"]), instance_id
+    match = re.fullmatch(r"(\d+) (\d+) ([A-Za-z0-9]+)\n", text)
+    if match is None:
+        raise ValueError(f"{directory / INSTANCE_FILE}: got {text!r}, want process id, start time, instance id")
+    return int(match[1]), int(match[2]), match[3]
 
 
 def process_start(pid: int) -> int | None:
