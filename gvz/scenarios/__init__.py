@@ -1,0 +1,1 @@
+"""Scenarios: one file each, discovered by its SCENARIO; the compiler that makes maps of them."""

@@ -1,0 +1,246 @@
+"""Defend the Center: a turret in a round room. Imports gvz.scenarios.base and gvz.scenarios.rewards.
+
+Ability tested: aiming, and telling who is nearest. The agent stands in the middle of a round room and cannot walk.
+Actions: ATTACK, TURN_LEFT, TURN_RIGHT.
+Observation: the screen with weapon and HUD; variables KILLCOUNT, AMMO2, HEALTH.
+Reward (eq. 3.3): [kill] - [death] - 0.1 [ammo fell] - 0.2 [health fell].
+Start: the centre of the room, a pistol and 26 bullets; 5 enemies of 1 health stand at the wall, 72 degrees apart.
+    90 tics after its death an enemy is back at its place (levdoom: at a random one).
+Termination: the agent dies. Truncation: after 1100 tics (levdoom: 2100).
+Metric: frames alive, at most the time-out.
+Attributes: thesis B.1, below. Tasks: thesis Table A.1.
+"""
+
+from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing
+from gvz.scenarios.rewards import Reward, death, fell, rose
+
+WAD = "defend_the_center.wad"
+
+SCRIPT = """\
+#include "zcommon.acs"
+
+global int 1:player_kills;
+global int 2:num_spawned;
+global int 60:map_magic;
+
+str classes[$num_classes] = $classes;
+int next_tid = 100;
+
+// An enemy at the wall, facing the centre; angle in turns. Returns 0 if something stands in the way.
+function int SpawnEnemy(int kind, int angle)
+{
+    int tid = next_tid;
+    int x = FixedMul(Cos(angle), $radius);
+    int y = FixedMul(Sin(angle), $radius);
+    if (Spawn(classes[kind], x, y, 0.0, tid, (angle / 256 + 128) % 256) == 0)
+        return 0;
+    next_tid++;
+    num_spawned++;
+    SetActorProperty(tid, APROP_Health, 1);
+    $entity_properties
+    SetThingSpecial(tid, ACS_ExecuteAlways, 3, 0, tid, kind, angle);
+    return 1;
+}
+
+script 1 OPEN
+{
+    player_kills = 0;
+    num_spawned = 0;
+    map_magic = $map_magic;
+    for (int i = 0; i < $num_enemies; i++)
+    {
+        SpawnEnemy(i % $num_classes, i * 1.0 / $num_enemies);
+        Delay($spawn_delay);
+    }
+}
+
+script 2 ENTER
+{
+    ClearInventory();
+    GiveInventory("Pistol", 1);
+    SetWeapon("Pistol");
+    GiveInventory("ClipBox", 6);
+    $agent_properties
+}
+
+// An enemy died; the killer is the activator.
+script 3 (int tid, int kind, int angle)
+{
+    if (PlayerNumber() >= 0)
+        player_kills++;
+    Thing_Remove(tid);
+    Delay($respawn_delay);
+    angle = $respawn_angle;
+    while (SpawnEnemy(kind, angle) == 0)
+        Delay(1);
+}
+"""
+
+COUNTED_MARINE = """\
+ACTOR MarineChainsawVzd : MarineChainsaw
+{
+  +COUNTKILL
+}
+"""
+
+SLOW_RESPAWN = Content(parameters={"respawn_delay": 150})
+
+
+def _gore() -> tuple[Thing, ...]:
+    places = {
+        26: ((-352, 160), (-96, 608), (480, 352), (96, -224), (-544, -352)),  # a twitching man on a stick
+        28: ((288, 160), (352, -544), (640, 32), (-288, -288), (-608, 352)),  # skulls on a stick
+        29: ((224, 416), (480, -224), (-128, -608), (-352, 416), (-608, -128)),  # candles and skulls
+    }
+    return tuple(Thing(kind, x, y) for kind, spots in places.items() for x, y in spots)
+
+
+def return_range(discount: float) -> tuple[float, float]:
+    """Range of discounted returns, per decision of four tics.
+
+    Upper: an enemy a shot (1 - 0.1) with every one of 26 bullets, as fast as enemies come back: five in 90 tics,
+    that is one in 18 tics or 4.5 decisions (a held trigger fires every 14). Lower: a whole clip of misses on the
+    way (-0.1 each) and dying under blows that come at every other decision. A blow takes 10 of 100 health on
+    average; with damage factor 0.3 (fast_enemies) that is some 33 blows of -0.2, then -1.
+    """
+    per_shot = discount**4.5
+    high = sum(0.9 * per_shot**shot for shot in range(26))
+    blows, misses = 33, 26
+    low = -sum(0.2 * discount ** (2 * blow) for blow in range(blows)) - discount ** (2 * blows)
+    low -= sum(0.1 * per_shot**shot for shot in range(misses))
+    return low, high
+
+
+SCENARIO = Scenario(
+    id="defend_the_center",
+    title="Defend the Center",
+    script=SCRIPT,
+    content=Content(
+        base_wad=WAD,
+        textures=Textures("TANROCK2", "FLOOR0_5", "CEIL4_1"),
+        parameters={
+            "classes": ("MarineChainsawVzd", "Demon"),
+            "num_enemies": 5,
+            "radius": 735.0,
+            "spawn_delay": 0,
+            "respawn_delay": 90,
+            "respawn_angle": "angle",
+        },
+        actors={"MarineChainsawVzd": COUNTED_MARINE},
+    ),
+    levdoom=Content(parameters={"respawn_angle": (0.0, 1.0)}),
+    attributes=(
+        Attribute(name="gore", groups=("decorations",), content=Content(things={WAD: _gore()})),
+        Attribute(
+            name="mossy_bricks",
+            groups=("textures",),
+            content=Content(textures=Textures("A-MOSBRI", "FLOOR4_6", "CEIL5_1")),
+        ),
+        Attribute(
+            name="stone_wall",
+            groups=("textures",),
+            content=Content(textures=Textures("FLAT5_7", "FLOOR1_6", "CEIL3_3")),
+        ),
+        Attribute(
+            name="fuzzy_enemies",
+            groups=("entity_rendering",),
+            aliases=("fuzzy",),
+            content=Content(entity={"RenderStyle": "STYLE_Fuzzy"}),
+            levdoom=SLOW_RESPAWN,
+        ),
+        Attribute(
+            name="resized_enemies",
+            groups=("entity_size",),
+            aliases=("resized",),
+            content=Content(entity={"ScaleX": (0.3, 3.0), "ScaleY": (0.3, 3.0)}),
+            levdoom=SLOW_RESPAWN,
+        ),
+        Attribute(
+            name="fast_enemies",
+            groups=("entity_speed",),
+            aliases=("fast",),
+            content=Content(entity={"Speed": 20.0}, agent={"DamageFactor": 0.3}),
+            levdoom=Content(entity={"Speed": 15.0}, parameters={"respawn_delay": 150}),
+        ),
+        Attribute(
+            name="flying_enemies",
+            groups=("entity_type",),
+            aliases=("flying",),
+            content=Content(parameters={"classes": ("LostSoul",), "spawn_delay": 10}),
+            levdoom=Content(parameters={"respawn_delay": 90}),
+        ),
+    ),
+    complete=("gore", "mossy_bricks", "fuzzy_enemies", "resized_enemies", "fast_enemies", "flying_enemies"),
+    levdoom_tasks={
+        "fast_enemies+flying_enemies": Content(agent={"DamageFactor": 1.0}),
+        "gore+mossy_bricks": Content(agent={"DamageFactor": 0.7}),
+        "fuzzy_enemies+resized_enemies": Content(agent={"DamageFactor": 0.7}),
+        "flying_enemies+stone_wall": Content(agent={"DamageFactor": 0.7}),
+        "flying_enemies+mossy_bricks+resized_enemies": Content(agent={"DamageFactor": 0.85}),
+        "fuzzy_enemies+gore+stone_wall": Content(agent={"DamageFactor": 0.85}),
+        "fast_enemies+gore+resized_enemies": Content(agent={"DamageFactor": 0.85}),
+        "complete": Content(
+            textures=Textures("RROCK02", "FWATER1", "AQF062"),
+            parameters={"classes": ("MarineChainsawVzd", "Demon", "LostSoul"), "num_enemies": 6},
+            entity={"Speed": 20.0},
+            agent={"DamageFactor": 1.0},
+        ),
+    },
+    tasks=(
+        "default",
+        "gore",
+        "mossy_bricks",
+        "stone_wall",
+        "fuzzy_enemies",
+        "resized_enemies",
+        "fast_enemies",
+        "flying_enemies",
+        "fast+flying",
+        "gore+mossy_bricks",
+        "resized+fuzzy",
+        "stone_wall+flying",
+        "fast+fuzzy",
+        "resized+gore",
+        "resized+flying+mossy_bricks",
+        "gore+stone_wall+fuzzy",
+        "fast+resized+gore",
+        "complete",
+    ),
+    splits={
+        "train1": ("default",),
+        "train4": ("default", "gore", "stone_wall", "fast_enemies"),
+        "train8": (
+            "default",
+            "gore",
+            "mossy_bricks",
+            "stone_wall",
+            "fuzzy_enemies",
+            "resized_enemies",
+            "fast_enemies",
+            "flying_enemies",
+        ),
+        "test": (
+            "gore+mossy_bricks",
+            "resized+fuzzy",
+            "stone_wall+flying",
+            "resized+flying+mossy_bricks",
+            "gore+stone_wall+fuzzy",
+            "fast+resized+gore",
+            "complete",
+        ),
+    },
+    buttons=("ATTACK", "TURN_LEFT", "TURN_RIGHT"),
+    game_variables=("KILLCOUNT", "AMMO2", "HEALTH"),
+    metric="frames_alive",
+    render_weapon=True,
+    timeouts={"thesis": 1100, "levdoom": 2100},
+    upper_bounds={"thesis": 1100, "levdoom": 2100},
+    rewards={
+        "kill": Reward(event=rose("KILLCOUNT"), weight=1.0, levdoom=1.0),
+        "player_kill": Reward(event=rose("PLAYER_KILLS"), weight=0.0, levdoom=0.0),
+        "death": Reward(event=death, weight=-1.0, levdoom=0.0),
+        "ammo_spent": Reward(event=fell("AMMO2"), weight=-0.1, levdoom=-0.01),
+        "health_lost": Reward(event=fell("HEALTH"), weight=-0.2, levdoom=-0.01),
+    },
+    return_range=return_range,
+)

@@ -1,0 +1,86 @@
+"""Rewards as named events of one decision, each with a weight. Imports gvz.errors and the standard library."""
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from gvz.errors import ConfigError
+
+Variables = Mapping[str, float]
+"""What the game says after a decision: name of a game or bookkeeping variable -> value."""
+
+Event = Callable[[Sequence[Variables], bool], float]
+"""f(history, terminated) -> how much of the event this decision brought, at least 0 (the weight has the sign).
+
+`history` holds the variables after each of the last decisions, oldest first: history[-1] is now, history[-2] one
+decision ago, back to the start of the episode or HISTORY_STEPS decisions, whichever is nearer.
+"""
+
+HISTORY_STEPS = 5
+"""decisions an event can look back (eq. 3.5 needs five)"""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Reward:
+    """One component of a scenario's reward: an event and what it is worth."""
+
+    event: Event
+    weight: float
+    levdoom: float
+    """the weight in profile levdoom"""
+
+
+def living(_history: Sequence[Variables], _terminated: bool) -> float:
+    """1 for every decision."""
+    return 1.0
+
+
+def death(_history: Sequence[Variables], terminated: bool) -> float:
+    """1 if the episode ended by the rules: in every scenario that is the agent's death."""
+    return float(terminated)
+
+
+def rose(name: str) -> Event:
+    """1 if variable `name` is higher than one decision ago."""
+    return lambda history, _terminated: float(history[-1][name] > history[-2][name])
+
+
+def fell(name: str) -> Event:
+    """1 if variable `name` is lower than one decision ago."""
+    return lambda history, _terminated: float(history[-1][name] < history[-2][name])
+
+
+def moved(history: Sequence[Variables], _terminated: bool) -> float:
+    """Map units between here and where the agent stood HISTORY_STEPS decisions ago, or at the episode's start."""
+    old, new = history[0], history[-1]
+    dx, dy = new["POSITION_X"] - old["POSITION_X"], new["POSITION_Y"] - old["POSITION_Y"]
+    return (dx * dx + dy * dy) ** 0.5
+
+
+class Rewarder:
+    """Turns the variables of one game into rewards; remembers the last HISTORY_STEPS decisions of its episode."""
+
+    def __init__(self, events: Mapping[str, Event], weights: Mapping[str, float]):
+        """Raises ConfigError for a weight whose name is no event's."""
+        if unknown := sorted(weights.keys() - events.keys()):
+            raise ConfigError(f"reward weights: unknown components {unknown}, want some of {sorted(events)}")
+        self.weights = {name: weights.get(name, 0.0) for name in events}
+        self._events = dict(events)
+        self._history: deque[Variables] = deque(maxlen=HISTORY_STEPS + 1)
+
+    def reset(self, variables: Variables) -> None:
+        """Starts an episode with the variables that came with its first observation."""
+        self._history.clear()
+        self._history.append(dict(variables))
+
+    def step(self, variables: Variables, terminated: bool) -> dict[str, float]:
+        """Rewards of one decision, by component, weights applied; the reward is their sum.
+
+        Args:
+            variables: the variables after the decision. When the agent died, the last that could be read.
+            terminated: the episode ended by the rules (a time-out is not).
+        """
+        assert self._history, "Rewarder.step before reset"
+        self._history.append(dict(variables))
+        history = tuple(self._history)
+        return {name: self.weights[name] * event(history, terminated) for name, event in self._events.items()}
