@@ -16,13 +16,15 @@ from typing import Any, Literal
 
 from actors.config import ActorsConfig
 from gvz.errors import ConfigError
-from gvz.scenarios.base import Scenario
+from gvz.scenarios.base import Scenario, Split
 from gvz.specs import EnvConfig
 from gvz.tasks import Task, named_tasks, parse_task
 from learner.config import AgentConfig, LearnerConfig, ReplayConfig
 
 CONFIG_SCHEMA = 1
 """Raised by one whenever a saved config.json can no longer be read as before."""
+
+_SPLITS: dict[int, Split] = {1: "train1", 4: "train4", 8: "train8"}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -116,21 +118,19 @@ class RunConfig:
             TaskError: an unknown scenario or task. ConfigError: tasks of two scenarios, none, or one twice.
         """
         if self.tasks is None:
-            return named_tasks(scenario=self.scenario, split=f"train{self.training_set}")
+            return named_tasks(scenario=self.scenario, split=_SPLITS[self.training_set])
         tasks = tuple(parse_task(text) for text in self.tasks)
         if not tasks:
             raise ConfigError("tasks: got none, want at least one task id")
-        if len({task.scenario for task in tasks}) > 1:
-            raise ConfigError(f"tasks: got tasks of {sorted({t.scenario for t in tasks})}, want one scenario")
+        if len({task.scenario.id for task in tasks}) > 1:
+            raise ConfigError(f"tasks: got tasks of {sorted({t.scenario.id for t in tasks})}, want one scenario")
         if len({task.id for task in tasks}) < len(tasks):
             raise ConfigError(f"tasks: got one task twice in {[task.id for task in tasks]}")
         return tasks
 
     def resolved_scenario(self) -> Scenario:
         """The scenario of this run's tasks."""
-        from gvz.scenarios import get_scenario
-
-        return get_scenario(self.resolved_tasks()[0].scenario)
+        return self.resolved_tasks()[0].scenario
 
     @property
     def num_actors(self) -> int:

@@ -1,0 +1,41 @@
+"""Ctrl-C and SIGTERM: the first asks the loop to finish its update, a second one ends it at once. Standard library."""
+
+import signal
+from types import FrameType, TracebackType
+
+
+class StopRequest:
+    """Catches SIGINT and SIGTERM while it is entered.
+
+    Attributes:
+        signal: number of the first signal caught, or None.
+    """
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+        self._before: dict[int, object] = {}
+
+    def __enter__(self) -> "StopRequest":
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)  # pyright: ignore[reportArgumentType]  # what signal.signal returned
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        del frame
+        if self.signal is not None:
+            raise KeyboardInterrupt
+        self.signal = number
+
+    @property
+    def requested(self) -> bool:
+        """A signal has asked the run to stop."""
+        return self.signal is not None
+
+    @property
+    def exit_code(self) -> int:
+        """128 + the signal's number, as shells expect; 0 without one."""
+        return 0 if self.signal is None else 128 + self.signal

@@ -1,0 +1,179 @@
+"""Configurations: found, overridden, saved and compared; everything wrong is said before any process starts."""
+
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+
+import pytest
+
+from gvz.config import (
+    RunConfig,
+    config_from_dict,
+    config_to_dict,
+    configs_directory,
+    differences,
+    find_config_file,
+    load_config,
+)
+from gvz.errors import ConfigError, TaskError
+from gvz.launch import parse
+
+ALL_CONFIGS = sorted(p.stem for p in configs_directory().glob("*.py") if p.stem != "__init__")
+
+
+@pytest.mark.parametrize("name", ALL_CONFIGS)
+def test_every_config_loads_and_survives_json(name):
+    config = load_config(name)
+    assert config.name == name
+    saved = json.loads(json.dumps(config_to_dict(config)))
+    assert differences(config_from_dict(saved), config) == []
+
+
+def test_the_main_config_plays_the_four_tasks():
+    assert [t.id for t in load_config("rainbow_4task.py").resolved_tasks()] == [
+        "defend_the_center/default",
+        "defend_the_center/gore",
+        "defend_the_center/stone_wall",
+        "defend_the_center/fast_enemies",
+    ]
+
+
+def test_a_path_is_taken_as_a_path(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text("from gvz.config import RunConfig\nCONFIG = RunConfig(name='mine', seed=5)\n")
+    assert load_config(str(file)).seed == 5
+    with pytest.raises(ConfigError, match=r"no file '.*/other\.py'"):
+        find_config_file(str(tmp_path / "other.py"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x = 1", "got NoneType for CONFIG, want `CONFIG = RunConfig"),
+        ("1 / 0", "ZeroDivisionError: division by zero"),
+        ("def (", "SyntaxError"),
+        ("from gvz.config import RunConfig\nCONFIG = RunConfig(name='a b')", "name: got 'a b'"),
+    ],
+)
+def test_a_broken_config_file_is_named(tmp_path, text, message):
+    file = tmp_path / "broken.py"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=re.escape(str(file)) + ".*" + re.escape(message)):
+        load_config(str(file))
+
+
+def test_a_near_miss_is_suggested():
+    with pytest.raises(ConfigError, match="did you mean 'rainbow_4task'"):
+        load_config("rainbow_4tasks")
+
+
+def test_flags_override_every_field():
+    launch = parse(
+        "--config rainbow_4task.py --run-dir out --seed 2222 --learner.total-updates 7 --learner.warmup-steps 64 "
+        "--learner.batch-size 16 --replay.capacity 1000 --actors.num-actors 2 --actors.games-per-actor 2 --mode sync "
+        "--checkpoint.period-updates 5 --scenario seek_and_kill --agent.noisy off --learner.max-grad-norm 10".split()
+    )
+    run = launch.run
+    assert (str(run.run_dir), run.seed, run.mode, run.scenario) == ("out", 2222, "sync", "seek_and_kill")
+    assert (run.learner.total_updates, run.learner.batch_size, run.replay.capacity) == (7, 16, 1000)
+    assert (run.agent.noisy, run.learner.max_grad_norm, run.checkpoint.period_updates) == ("off", 10.0, 5)
+    assert [t.id for t in run.resolved_tasks()] == [
+        f"seek_and_kill/{a}" for a in ("default", "red", "obstacles", "mixed_enemies")
+    ]
+
+
+def test_tasks_may_be_named():
+    run = parse(["--tasks", "defend_the_center/gore", "defend_the_center/gore+mossy_bricks"]).run
+    assert [t.id for t in run.resolved_tasks()] == ["defend_the_center/gore", "defend_the_center/gore+mossy_bricks"]
+
+
+BAD = {
+    "--seed -1": "seed: got -1",
+    "--learner.batch-size 0": "learner.batch_size: got 0",
+    "--learner.warmup-steps 200000": "learner.warmup_steps: got 200000, more than replay.capacity",
+    "--learner.warmup-steps 20": "learner.batch_size: got 32, more than the 20 decisions",
+    "--replay.capacity 70 --learner.warmup-steps 64": "replay.capacity: got 70, want at least",
+    "--learner.learning-rate nan": "learner.learning_rate",
+    "--replay.num-newest 33": "replay.num_newest: got 33",
+    "--tasks defend_the_center/gor": "gore",
+    "--tasks defend_the_center/gore health_gathering/lava": "want one scenario",
+    "--tasks defend_the_center/gore defend_the_center/gore": "one task twice",
+    "--scenario doom": "defend_the_center",
+    "--agent.conv-channels 32 --agent.conv-kernels 8 4": "want one equal length",
+    "--actors.num-actors 1 --actors.games-per-actor 2": "every task needs a game: want at least 4",
+    "--checkpoint.keep 0": "checkpoint.keep: got 0",
+    "--log.period-updates 0": "log.period_updates: got 0",
+    "--env.frame-skip 99": "env.frame_skip: got 99",
+    "--name a/b": "name: got 'a/b'",
+}
+
+
+@pytest.mark.parametrize("flags", BAD)
+def test_a_bad_value_is_refused_by_name(flags):
+    with pytest.raises((ConfigError, TaskError), match=re.escape(BAD[flags])):
+        parse(flags.split())
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--learner.batch-sizes 3", "batch-size"),
+        ("--learner.batch-size many", "batch-size"),
+        ("--mode fast", "async"),
+        ("--config nope", "there are"),
+        ("--tasks defend_the_center/gor", "gore"),
+    ],
+)
+def test_the_command_exits_with_2_and_one_message(flags, message):
+    done = subprocess.run(
+        [sys.executable, "-m", "gvz.launch", *flags.split()], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_help_lists_flags_units_and_defaults():
+    done = subprocess.run(
+        [sys.executable, "-m", "gvz.launch", "--help"], capture_output=True, text=True, timeout=60, check=True
+    )
+    for part in ("--config", "--fresh", "--run-dir", "--learner.total-updates", "200000", "gradient steps", "--tasks"):
+        assert part in done.stdout
+
+
+def test_a_saved_configuration_with_an_unknown_key_is_refused():
+    saved = config_to_dict(load_config("rainbow_4task"))
+    saved["config"]["learner"]["batchsize"] = 3
+    with pytest.raises(ConfigError, match=r"config.learner.batchsize: unknown key, did you mean batch_size\?"):
+        config_from_dict(saved)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("seed", "x", "config.seed: got 'x', want int"),
+        ("seed", True, "config.seed: got True, want int"),
+        ("mode", "x", "config.mode: got 'x', want one of"),
+        ("agent", 3, "config.agent: got int, want a map"),
+        ("tasks", 3, "config.tasks: got int, want a list"),
+    ],
+)
+def test_a_saved_configuration_of_wrong_type_is_refused(key, value, message):
+    saved = config_to_dict(load_config("rainbow_4task"))
+    saved["config"][key] = value
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        config_from_dict(saved)
+
+
+def test_another_schema_is_refused():
+    with pytest.raises(ConfigError, match="schema 1"):
+        config_from_dict({"schema": 2})
+
+
+def test_derived_numbers_are_saved_explicitly():
+    config = RunConfig(name="x")
+    saved = config_from_dict(config_to_dict(config))
+    assert saved.actors.num_actors == config.num_actors
+    assert dataclasses.replace(saved, actors=config.actors) == config

@@ -1,0 +1,121 @@
+"""The run directory: locked, private, never overwritten; its records survive a cut."""
+
+import dataclasses
+import json
+import stat
+
+import pytest
+
+from gvz.config import load_config
+from gvz.errors import ConfigError, GvzError, ResumeError
+from gvz.rundir import RunDir, move_aside, read_records
+
+CONFIG = load_config("rainbow_4task")
+
+
+def test_it_is_private_and_held_by_one(tmp_path):
+    with RunDir(tmp_path / "run") as run:
+        assert stat.S_IMODE(run.path.stat().st_mode) == 0o700
+        with pytest.raises(ResumeError, match="another running process uses it"):
+            RunDir(tmp_path / "run")
+    RunDir(tmp_path / "run").close()
+
+
+def test_a_path_that_cannot_be_made_says_so(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ResumeError, match=r"file/run: Not a directory; choose another with --run-dir"):
+        RunDir(tmp_path / "file" / "run")
+
+
+def test_the_saved_configuration_comes_back(tmp_path):
+    with RunDir(tmp_path) as run:
+        assert run.saved_config() is None
+        run.write_config(CONFIG)
+        saved = run.saved_config()
+        assert saved is not None
+        assert saved.agent == CONFIG.agent
+        assert saved.num_lanes == CONFIG.num_lanes
+        run.check_resumable(CONFIG)
+
+
+def test_a_change_of_meaning_is_refused_field_by_field(tmp_path):
+    with RunDir(tmp_path) as run:
+        run.write_config(CONFIG)
+        other = dataclasses.replace(
+            CONFIG,
+            seed=3,
+            learner=dataclasses.replace(CONFIG.learner, batch_size=64, total_updates=300_000),
+            log=dataclasses.replace(CONFIG.log, period_updates=7),
+        )
+        with pytest.raises(ResumeError) as refusal:
+            run.check_resumable(other)
+    text = str(refusal.value)
+    assert "seed: 1111 -> 3" in text
+    assert "learner.batch_size: 32 -> 64" in text
+    assert "total_updates" not in text
+    assert "log." not in text
+
+
+def test_total_updates_may_not_shrink(tmp_path):
+    with RunDir(tmp_path) as run:
+        run.write_config(CONFIG)
+        learner = dataclasses.replace(CONFIG.learner, total_updates=5)
+        with pytest.raises(ResumeError, match=r"total_updates: 200000 -> 5 \(it may only grow\)"):
+            run.check_resumable(dataclasses.replace(CONFIG, learner=learner))
+
+
+def test_a_damaged_config_is_named(tmp_path):
+    with RunDir(tmp_path) as run:
+        (tmp_path / "config.json").write_text('{"schema": 1, "config": {"nam')
+        with pytest.raises(ResumeError, match=r"config.json cannot be read"):
+            run.saved_config()
+
+
+def test_records_are_cut_to_what_a_checkpoint_vouches_for(tmp_path):
+    with RunDir(tmp_path) as run:
+        run.append("episodes.jsonl", {"episode": 0})
+        lengths = run.record_lengths()
+        run.append("episodes.jsonl", {"episode": 1})
+        assert run.truncate_records(lengths) > 0
+        assert run.truncate_records(lengths) == 0
+    rows, problems = read_records(tmp_path / "episodes.jsonl")
+    assert ([row["episode"] for row in rows], problems) == ([0], [])
+    assert json.loads((tmp_path / "discarded" / "episodes.jsonl").read_text())["episode"] == 1
+
+
+def test_everything_readable_of_a_damaged_record_is_read(tmp_path):
+    file = tmp_path / "episodes.jsonl"
+    file.write_text('{"schema": 1, "a": 1}\nnonsense\n{"schema": 9}\n[1]\n{"schema": 1, "a": 2}\n{"schema": 1, "a')
+    rows, problems = read_records(file)
+    assert [row["a"] for row in rows] == [1, 2]
+    assert [p.split(": ", 1)[1] for p in problems] == [
+        "not JSON (half-written?)",
+        "schema 9, want 1",
+        "schema 'list', want 1",
+        "not JSON (half-written?)",
+    ]
+
+
+def test_a_missing_record_file_is_an_error(tmp_path):
+    with pytest.raises(GvzError, match="no such record file"):
+        read_records(tmp_path / "episodes.jsonl")
+
+
+def test_fresh_moves_an_old_run_aside(tmp_path):
+    path = tmp_path / "run"
+    assert move_aside(path) is None
+    for _ in range(2):  # twice within a second: the names must not collide
+        with RunDir(path) as run:
+            run.write_config(CONFIG)
+        moved = move_aside(path)
+        assert moved is not None
+        assert (moved / "config.json").exists()
+        assert not path.exists()
+
+
+def test_fresh_refuses_what_is_no_run_or_in_use(tmp_path):
+    (tmp_path / "thesis.tex").write_text("precious")
+    with pytest.raises(ConfigError, match="is not a run directory"):
+        move_aside(tmp_path)
+    with RunDir(tmp_path / "run"), pytest.raises(ResumeError, match="another running process"):
+        move_aside(tmp_path / "run")
