@@ -1,0 +1,117 @@
+"""What an agent is: four pure functions. May import jax, learner.config, learner.replay, gvz.registry.
+
+A third agent is one file beside this one that sets `AGENT` to something callable as `AGENT(config, spec)` which
+returns an `Agent`; its file name is its `agent.name`.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
+
+from gvz.errors import ConfigError
+from gvz.registry import discover
+from learner.config import AgentConfig
+from learner.replay import Transitions
+
+Params = Any
+"""A pytree of float32 arrays."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class AgentSpec:
+    """What an agent must fit."""
+
+    obs_shape: tuple[int, int, int]
+    """(H, W, stack * C) of an observation, uint8"""
+    num_actions: int
+    num_tasks: int
+    v_min: float
+    """smallest return the distributional part represents; agent.v_min overrides it"""
+    v_max: float
+    """largest return; agent.v_max overrides it"""
+
+    def __post_init__(self) -> None:
+        if not self.v_min < self.v_max:
+            raise ConfigError(f"AgentSpec.v_min, v_max: got {self.v_min}, {self.v_max}, want v_min < v_max")
+        for name in ("num_actions", "num_tasks"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"AgentSpec.{name}: got {getattr(self, name)}, want at least 1")
+
+
+class Evaluation(NamedTuple):
+    """What an agent thinks of a batch of observations with its noise off."""
+
+    action: Int[Array, "B"]
+    """the greedy action"""
+    q_values: Float[Array, "B A"]
+    probabilities: Float[Array, "B A N"] | None = None
+    """return distributions, if the agent has them"""
+    atoms: Float[Array, "N"] | None = None
+    """the returns that `probabilities` stand for"""
+
+
+class AgentLoss(NamedTuple):
+    """One number per sample of a batch."""
+
+    loss: Float[Array, "B"]
+    """what the gradient step makes smaller, before any weights"""
+    priority: Float[Array, "B"]
+    """how surprising the sample was, >= 0: |TD error|, or the KL divergence if distributional"""
+    q_tm1: Float[Array, "B"]
+    """online Q(s, a) of the action taken"""
+
+
+class Agent(Protocol):
+    """Pure functions; the object holds configuration only and is hashable."""
+
+    @property
+    def spec(self) -> AgentSpec:
+        """What it was made for."""
+        ...
+
+    def init(self, key: PRNGKeyArray) -> Params:
+        """Fresh parameters."""
+        ...
+
+    def act(
+        self,
+        params: Params,
+        key: PRNGKeyArray,
+        obs: UInt8[Array, "B H W C"],
+        task: Int[Array, "B"],
+        epsilon: Float[Array, ""],
+    ) -> Int[Array, "B"]:
+        """Exploring actions: with fresh noise, or uniformly random with probability epsilon, or both."""
+        ...
+
+    def evaluate(self, params: Params, obs: UInt8[Array, "B H W C"], task: Int[Array, "B"]) -> Evaluation:
+        """Greedy actions and values without noise."""
+        ...
+
+    def loss(self, online_params: Params, target_params: Params, key: PRNGKeyArray, batch: Transitions) -> AgentLoss:
+        """Per-sample losses; differentiable in `online_params`, constant in `target_params`."""
+        ...
+
+
+def make_agent(config: AgentConfig, spec: AgentSpec) -> Agent:
+    """Builds the agent that `config.name` names.
+
+    Raises:
+        ConfigError: no such agent, or a configuration that the agent cannot be built from.
+    """
+    agents = {name: m.AGENT for name, m in discover("learner.agents").items() if hasattr(m, "AGENT")}
+    if config.name not in agents:
+        raise ConfigError(f"agent.name: got {config.name!r}, want one of {', '.join(agents)}")
+    return agents[config.name](config, spec)
+
+
+def epsilon_greedy(key: PRNGKeyArray, q_values: Float[Array, "B A"], epsilon: Float[Array, ""]) -> Int[Array, "B"]:
+    """The greedy action of each row, or with probability epsilon a uniformly random one (thesis, Algorithm 1)."""
+    key_coin, key_action = jax.random.split(key)
+    batch_size, num_actions = q_values.shape
+    explore = jax.random.uniform(key_coin, (batch_size,)) < epsilon
+    random_action = jax.random.randint(key_action, (batch_size,), 0, num_actions)
+    return jnp.where(explore, random_action, jnp.argmax(q_values, axis=-1)).astype(jnp.int32)

@@ -1,0 +1,108 @@
+"""Rainbow: thesis 4.2, Hessel et al. 2018. May import jax, learner.networks, learner.losses, learner.agents.base.
+
+Four of its six parts live here, each behind a switch of `AgentConfig`: double, dueling, noisy, distributional. The
+other two, prioritized replay and n-step returns, are the replay's. With all of them off it is DQN.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
+
+from gvz.errors import ConfigError
+from learner import losses
+from learner.agents.base import AgentLoss, AgentSpec, Evaluation, Params, epsilon_greedy
+from learner.config import AgentConfig
+from learner.networks import QNetwork, check_fits
+from learner.replay import Transitions
+
+
+@dataclass(frozen=True, slots=True)
+class Rainbow:
+    """Raises ConfigError: v_min not below v_max, or the frames are too small for the convolutions."""
+
+    config: AgentConfig
+    spec: AgentSpec
+
+    def __post_init__(self) -> None:
+        v_min, v_max = self._value_range()
+        if not v_min < v_max:
+            raise ConfigError(f"agent.v_min, v_max: got {v_min}, {v_max}, want v_min < v_max")
+        check_fits(self.config, *self.spec.obs_shape[:2])
+
+    @property
+    def atoms(self) -> Float[Array, "N"]:
+        """The returns that a distribution's masses stand for."""
+        return losses.support(*self._value_range(), self.config.num_atoms)
+
+    def logits(
+        self,
+        params: Params,
+        obs: UInt8[Array, "B H W C"],
+        task: Int[Array, "B"],
+        key: PRNGKeyArray | None = None,
+        *,
+        noise_per_sample: bool = False,
+    ) -> Float[Array, "B A N"]:
+        """Logits of the return distributions; Q values (N = 1) if not distributional. No noise without a key."""
+        network = QNetwork(self.config, self.spec.num_actions, self.spec.num_tasks)
+        return jnp.asarray(network.apply(params, obs, task, key, noise_per_sample=noise_per_sample))
+
+    def q_values(self, logits: Float[Array, "B A N"]) -> Float[Array, "B A"]:
+        if not self.config.distributional:
+            return logits[:, :, 0]
+        return losses.expectation(jax.nn.softmax(logits), self.atoms)
+
+    def init(self, key: PRNGKeyArray) -> Params:
+        network = QNetwork(self.config, self.spec.num_actions, self.spec.num_tasks)
+        return network.init(key, jnp.zeros((1, *self.spec.obs_shape), jnp.uint8), jnp.zeros((1,), jnp.int32))
+
+    def act(
+        self,
+        params: Params,
+        key: PRNGKeyArray,
+        obs: UInt8[Array, "B H W C"],
+        task: Int[Array, "B"],
+        epsilon: Float[Array, ""],
+    ) -> Int[Array, "B"]:
+        """Greedy in a freshly drawn noisy network (per game if factorized), then epsilon-greedy."""
+        key_noise, key_epsilon = (None, key) if self.config.noisy == "off" else jax.random.split(key)
+        logits = self.logits(params, obs, task, key_noise, noise_per_sample=True)
+        return epsilon_greedy(key_epsilon, self.q_values(logits), epsilon)
+
+    def evaluate(self, params: Params, obs: UInt8[Array, "B H W C"], task: Int[Array, "B"]) -> Evaluation:
+        logits = self.logits(params, obs, task)
+        q = self.q_values(logits)
+        if not self.config.distributional:
+            return Evaluation(jnp.argmax(q, axis=-1), q)
+        return Evaluation(jnp.argmax(q, axis=-1), q, jax.nn.softmax(logits), self.atoms)
+
+    def loss(self, online_params: Params, target_params: Params, key: PRNGKeyArray, batch: Transitions) -> AgentLoss:
+        """One noise sample a batch for the online network, a fresh one for the target (Fortunato et al. 2018)."""
+        key_online, key_target = jax.random.split(key)
+        logits_tm1 = self.logits(online_params, batch.obs_tm1, batch.task, key_online)
+        logits_t = self.logits(target_params, batch.obs_t, batch.task, key_target)
+        q_t_selector = None
+        if self.config.double:
+            q_t_selector = self.q_values(self.logits(online_params, batch.obs_t, batch.task, key_online))
+            q_t_selector = jax.lax.stop_gradient(q_t_selector)
+        q_tm1 = self.q_values(logits_tm1)
+        if self.config.distributional:
+            loss, priority = losses.categorical_q_learning(
+                logits_tm1, batch.a_tm1, batch.r_t, batch.discount_t, logits_t, self.atoms, q_t_selector
+            )
+        else:
+            td = losses.q_learning_td(q_tm1, batch.a_tm1, batch.r_t, batch.discount_t, logits_t[:, :, 0], q_t_selector)
+            loss, priority = losses.huber(td), jnp.abs(td)
+        return AgentLoss(loss, jax.lax.stop_gradient(priority), losses.take_action(q_tm1, batch.a_tm1))
+
+    def _value_range(self) -> tuple[float, float]:
+        config, spec = self.config, self.spec
+        return (
+            spec.v_min if config.v_min is None else config.v_min,
+            spec.v_max if config.v_max is None else config.v_max,
+        )
+
+
+AGENT = Rainbow

@@ -1,0 +1,82 @@
+"""Valid strided convolution in two forms with the same parameters: `direct` and `shifted`. May import jax, flax.
+
+XLA's own convolution is right on a GPU. On a CPU a few large matrix products are much faster, above all for the
+first layer (few input channels, large kernel, large stride).
+"""
+
+from typing import Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from learner.config import ConvForm
+
+
+def conv2d(
+    x: Float[Array, "B H W C"], kernel: Float[Array, "k k C F"], stride: int, form: Literal["direct", "shifted"]
+) -> Float[Array, "B h w F"]:
+    """Convolution without padding; h = (H - k) // stride + 1."""
+    return _shifted(x, kernel, stride) if form == "shifted" else _direct(x, kernel, stride)
+
+
+def _direct(x: Array, kernel: Array, stride: int) -> Array:
+    return jax.lax.conv_general_dilated(
+        x, kernel, (stride, stride), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
+    )
+
+
+def _shifted(x: Array, kernel: Array, stride: int) -> Array:
+    """One matrix product over all positions, then the sum of its shifted parts.
+
+    With s = stride and q = ceil(k / s): the image becomes a grid of s x s blocks (s*s*C channels), the kernel a
+    q x q kernel of stride 1 over blocks. One product gives every block's contribution to each of the q*q offsets;
+    the output is the sum of the q*q parts, each read at its offset.
+    """
+    b, height, width, c = x.shape
+    k, _, _, f = kernel.shape
+    s, q = stride, -(-k // stride)
+    out_h, out_w = (height - k) // s + 1, (width - k) // s + 1
+    grid_h, grid_w = out_h + q - 1, out_w + q - 1
+    pad_h, pad_w = max(0, grid_h * s - height), max(0, grid_w * s - width)
+    x = jnp.pad(x[:, : grid_h * s, : grid_w * s], ((0, 0), (0, pad_h), (0, pad_w), (0, 0)))
+    x = x.reshape(b, grid_h, s, grid_w, s * c).swapaxes(2, 3).reshape(b * grid_h * grid_w, s * s * c)
+    kernel = jnp.pad(kernel, ((0, q * s - k), (0, q * s - k), (0, 0), (0, 0)))
+    kernel = kernel.reshape(q, s, q, s, c, f).transpose(1, 3, 4, 0, 2, 5).reshape(s * s * c, q * q * f)
+    parts = (x @ kernel).reshape(b, grid_h, grid_w, q, q, f)
+    return sum(  # pyright: ignore[reportReturnType]
+        parts[:, i : i + out_h, j : j + out_w, i, j] for i in range(q) for j in range(q)
+    )
+
+
+class Conv(nn.Module):
+    """Convolution with bias, He-uniform kernel `[k, k, C, F]` whatever the form, so checkpoints fit all forms.
+
+    Attributes:
+        features: output channels F.
+        kernel_size: k.
+        stride: stride, pixels.
+        form: how it is computed; auto is shifted on a CPU and direct elsewhere.
+    """
+
+    features: int
+    kernel_size: int
+    stride: int
+    form: ConvForm = "auto"
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "B H W C"]) -> Float[Array, "B h w F"]:
+        k = self.kernel_size
+        kernel = self.param("kernel", nn.initializers.he_uniform(), (k, k, x.shape[-1], self.features))
+        bias = self.param("bias", nn.initializers.zeros, (self.features,))
+        kernel, bias = kernel.astype(x.dtype), bias.astype(x.dtype)
+        if self.form != "auto":
+            return conv2d(x, kernel, self.stride, self.form) + bias
+        y = jax.lax.platform_dependent(
+            x,
+            kernel,
+            cpu=lambda x, w: _shifted(x, w, self.stride),
+            default=lambda x, w: _direct(x, w, self.stride),
+        )
+        return y + bias

@@ -1,0 +1,133 @@
+"""The losses of DQN and Rainbow as pure functions over a batch, in the papers' symbols. May import jax and chex.
+
+Every function returns one number (or distribution) per sample; means and weights are the train step's work.
+Subscripts: `tm1` is time t - 1, where the action was taken; `t` is where the n-step window ended. `discount_t` is
+gamma^n, and 0 where the episode terminated inside the window.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+
+def q_learning_td(
+    q_tm1: Float[Array, "B A"],
+    a_tm1: Int[Array, "B"],
+    r_t: Float[Array, "B"],
+    discount_t: Float[Array, "B"],
+    q_t_value: Float[Array, "B A"],
+    q_t_selector: Float[Array, "B A"] | None = None,
+) -> Float[Array, "B"]:
+    """TD error of (double, n-step) Q-learning: r + discount * Q'(s', argmax_a S(s', a)) - Q(s, a).
+
+    Args:
+        q_tm1: online action values at t - 1.
+        a_tm1: actions taken, 0..A-1.
+        r_t: (n-step) reward.
+        discount_t: what multiplies the bootstrap; 0 where terminated.
+        q_t_value: target network's action values at t.
+        q_t_selector: who chooses the action at t: the online network's values for double Q-learning; None lets
+            the target network choose its own maximum.
+
+    Returns:
+        TD errors; no gradient flows through the target.
+
+    Source: thesis eq. 4.1 with the missing plus sign, 4.7, 4.9 (double) and 4.16 (n-step).
+    """
+    chex.assert_rank([q_tm1, a_tm1, r_t, discount_t, q_t_value], [2, 1, 1, 1, 2])
+    chex.assert_equal_shape([q_tm1, q_t_value])
+    selector = q_t_value if q_t_selector is None else q_t_selector
+    chex.assert_equal_shape([q_tm1, selector])
+    target = r_t + discount_t * take_action(q_t_value, jnp.argmax(selector, axis=-1))
+    return jax.lax.stop_gradient(target) - take_action(q_tm1, a_tm1)
+
+
+def huber(td: Float[Array, "B"], delta: float = 1.0) -> Float[Array, "B"]:
+    """0.5 td^2 inside [-delta, delta], linear outside with the same slope.
+
+    Source: thesis 5.1.2 (Huber loss); Mnih et al. 2015 clip the error's derivative at 1, which is delta = 1.
+    """
+    inside = jnp.clip(td, -delta, delta)
+    return inside * (td - 0.5 * inside)
+
+
+def take_action(values: Float[Array, "B A *rest"], actions: Int[Array, "B"]) -> Float[Array, "B *rest"]:
+    """values[i, actions[i]] for every i of the batch."""
+    return jax.vmap(lambda value, action: value[action])(values, actions)
+
+
+def support(v_min: float, v_max: float, num_atoms: int) -> Float[Array, "N"]:
+    """The atoms z_i = v_min + (i - 1) (v_max - v_min) / (N - 1). Source: thesis 4.2.6."""
+    return jnp.linspace(v_min, v_max, num_atoms, dtype=jnp.float32)
+
+
+def project(
+    shifted_atoms: Float[Array, "B N"], probabilities: Float[Array, "B N"], atoms: Float[Array, "N"]
+) -> Float[Array, "B N"]:
+    """Projects a distribution on moved atoms onto the evenly spaced support, sharing mass between neighbours.
+
+    (Phi z)_i = sum_j clip(1 - |clip(z'_j, v_min, v_max) - z_i| / dz, 0, 1) p_j
+
+    Args:
+        shifted_atoms: r + discount * z, anywhere on the real line.
+        probabilities: their masses.
+        atoms: the evenly spaced support, rising.
+
+    Returns:
+        Masses on `atoms`: same total, and the same mean where nothing was clipped.
+
+    Source: Bellemare et al. 2017, eq. 7; thesis 4.2.6.
+    """
+    chex.assert_equal_shape([shifted_atoms, probabilities])
+    chex.assert_shape(atoms, shifted_atoms.shape[1:])
+    width = (atoms[-1] - atoms[0]) / (atoms.shape[0] - 1)
+    moved = jnp.clip(shifted_atoms, atoms[0], atoms[-1])
+    share = jnp.clip(1.0 - jnp.abs(moved[:, None, :] - atoms[None, :, None]) / width, 0.0, 1.0)  # [B, N, N]
+    return jnp.einsum("bij,bj->bi", share, probabilities, precision=jax.lax.Precision.HIGHEST)
+
+
+def categorical_q_learning(
+    logits_tm1: Float[Array, "B A N"],
+    a_tm1: Int[Array, "B"],
+    r_t: Float[Array, "B"],
+    discount_t: Float[Array, "B"],
+    logits_t_value: Float[Array, "B A N"],
+    atoms: Float[Array, "N"],
+    q_t_selector: Float[Array, "B A"] | None = None,
+) -> tuple[Float[Array, "B"], Float[Array, "B"]]:
+    """Cross-entropy between the projected target distribution and the online one, and their KL divergence.
+
+    Args:
+        logits_tm1: online logits of the return distribution at t - 1.
+        a_tm1: actions taken.
+        r_t: (n-step) reward.
+        discount_t: 0 where terminated.
+        logits_t_value: target network's logits at t.
+        atoms: the support.
+        q_t_selector: action values that choose the action at t (double: the online network's means); None lets
+            the target network choose by its own means.
+
+    Returns:
+        (cross-entropy, KL divergence), one each per sample. Both have the same gradient; the KL divergence is 0 for
+        a perfect prediction, so it is what priorities are made of (Hessel et al. 2018, "Multi-step learning": p_t is
+        proportional to the KL loss to the power omega).
+
+    Source: thesis eq. 4.17 and 4.2.6; Bellemare et al. 2017, Algorithm 1; Hessel et al. 2018.
+    """
+    chex.assert_rank([logits_tm1, a_tm1, r_t, discount_t, logits_t_value], [3, 1, 1, 1, 3])
+    chex.assert_equal_shape([logits_tm1, logits_t_value])
+    probabilities_t = jax.nn.softmax(logits_t_value)
+    selector = expectation(probabilities_t, atoms) if q_t_selector is None else q_t_selector
+    p_t = take_action(probabilities_t, jnp.argmax(selector, axis=-1))  # [B, N]
+    target = project(r_t[:, None] + discount_t[:, None] * atoms, p_t, atoms)
+    target = jax.lax.stop_gradient(target)
+    log_p_tm1 = jax.nn.log_softmax(take_action(logits_tm1, a_tm1))
+    cross_entropy = -jnp.sum(target * log_p_tm1, axis=-1)
+    entropy = -jnp.sum(jax.scipy.special.xlogy(target, target), axis=-1)
+    return cross_entropy, jnp.maximum(cross_entropy - entropy, 0.0)
+
+
+def expectation(probabilities: Float[Array, "*batch N"], atoms: Float[Array, "N"]) -> Float[Array, "*batch"]:
+    """Mean of a distribution on the atoms: Q(s, a) = E[Z(s, a)]. Source: thesis 4.2.6."""
+    return jnp.sum(probabilities * atoms, axis=-1)

@@ -1,0 +1,70 @@
+"""The acting function as bytes, and parameters as one flat vector. May import jax, learner.agents.base.
+
+The bytes are `jax.export` of the agent's own acting function (StableHLO in a flatbuffer, not a pickle), lowered for a
+CPU wherever the learner runs. An actor calls them without importing this package.
+"""
+
+import hashlib
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import export
+from jaxtyping import Array, Float
+
+from learner.agents.base import Agent, Params
+
+
+def flatten_params(params: Params) -> Float[Array, "P"]:
+    """All leaves in tree order as one float32 vector."""
+    return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(params)])
+
+
+def unflatten_params(flat: Float[Array, "P"], template: Params) -> Params:
+    """The inverse of `flatten_params`; `template` gives structure and shapes (arrays or ShapeDtypeStructs)."""
+    leaves, treedef = jax.tree.flatten(template)
+    sizes = [leaf.size for leaf in leaves]
+    if flat.shape != (sum(sizes),):
+        raise ValueError(f"flat parameters: got shape {flat.shape}, want ({sum(sizes)},), the template's size")
+    offsets = np.cumsum([0, *sizes])
+    parts = [flat[start:stop] for start, stop in pairwise(offsets)]
+    return jax.tree.unflatten(treedef, [part.reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)])
+
+
+def layout_hash(params: Params) -> int:
+    """64 bits that differ when any path, shape, dtype or the order of the leaves does."""
+    leaves = jax.tree_util.tree_leaves_with_path(params)
+    layout = [(jax.tree_util.keystr(path), tuple(leaf.shape), str(leaf.dtype)) for path, leaf in leaves]
+    return int.from_bytes(hashlib.blake2b(repr(layout).encode(), digest_size=8).digest(), "little")
+
+
+def export_policy(agent: Agent, template: Params, batch_size: int, *, explore: bool = True) -> bytes:
+    """Serializes the acting function for a CPU.
+
+    Args:
+        agent: whose acting function.
+        template: parameters (values do not matter) or their ShapeDtypeStructs.
+        batch_size: games acted on in one call.
+        explore: True acts with noise and epsilon, False greedily with both ignored.
+
+    Returns:
+        Bytes for `jax.export.deserialize`; `.call` takes (params f32[P], obs u8[B, H, W, C], task i32[B],
+        key u32[2], epsilon f32[]) and returns the actions, i32[B].
+    """
+
+    def policy(flat: Array, obs: Array, task: Array, key_data: Array, epsilon: Array) -> Array:
+        params = unflatten_params(flat, template)
+        if not explore:
+            return agent.evaluate(params, obs, task).action.astype(jnp.int32)
+        key = jax.random.wrap_key_data(key_data, impl="threefry2x32")
+        return agent.act(params, key, obs, task, epsilon)
+
+    arguments = (
+        jax.ShapeDtypeStruct((sum(leaf.size for leaf in jax.tree.leaves(template)),), jnp.float32),
+        jax.ShapeDtypeStruct((batch_size, *agent.spec.obs_shape), jnp.uint8),
+        jax.ShapeDtypeStruct((batch_size,), jnp.int32),
+        jax.ShapeDtypeStruct((2,), jnp.uint32),
+        jax.ShapeDtypeStruct((), jnp.float32),
+    )
+    return bytes(export.export(jax.jit(policy), platforms=["cpu"])(*arguments).serialize())
