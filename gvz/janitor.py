@@ -8,6 +8,7 @@ to records whose owner is gone, and nothing else: nothing is ever matched by a p
 Every step can be repeated and any number of janitors may run at once: names are never used twice.
 """
 
+import contextlib
 import hashlib
 import json
 import os
@@ -91,17 +92,14 @@ def clean_dead_instances() -> list[str]:
             content = json.loads(path.read_text())
             kind, name = content["kind"], content["name"]
             _check_name(kind, name)
-            foreign = content["machine"] != _machine()
-            owner_lives = process_start(int(content["owner_pid"])) == content["owner_start"]
+            if content["machine"] != _machine() or process_start(content["owner_pid"]) == content["owner_start"]:
+                continue
+            done += clean_engine(Path(name)) if kind == "engine" else _unlink_shm(name)
+            path.unlink(missing_ok=True)
         except FileNotFoundError:
             continue  # its owner, or another janitor, was faster
         except (ValueError, KeyError, TypeError) as error:
             done.append(f"left alone: unreadable record {path} ({error})")
-            continue
-        if foreign or owner_lives:
-            continue
-        done += clean_engine(Path(name)) if kind == "engine" else _unlink_shm(name)
-        path.unlink(missing_ok=True)
     return done
 
 
@@ -113,7 +111,8 @@ def clean_engine(directory: Path) -> list[str]:
         pid, start, instance_id = instance
         # the engine carries its instance id on its command line: proof that this process is the one recorded
         if process_start(pid) == start and instance_id in _arguments(pid):
-            os.kill(pid, signal.SIGKILL)
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
             done.append(f"engine {instance_id} (pid {pid})")
         for prefix in _ENGINE_SHM_PREFIXES:
             done += _unlink_shm(prefix + instance_id)

@@ -1,0 +1,218 @@
+"""Start and end of an engine's process: private directory, launch script, start-up limit, watchdog, removal.
+
+Knows processes and files, not vizdoom: the game it starts is any object with `init` and `close`. Imports
+gvz.errors, gvz.janitor and the standard library.
+"""
+
+import contextlib
+import fcntl
+import os
+import secrets
+import shlex
+import shutil
+import sys
+import tempfile
+import threading
+import time
+import weakref
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Protocol
+
+from gvz import janitor
+from gvz.errors import EngineError, ResourceError
+
+_MAX_STARTING = 8
+"""engines of one user that start at the same time, over all processes; many at once fail (ViZDoom #355)"""
+_SHM_BYTES = 16 * 2**20
+"""free shared memory a start needs: the three files of one engine take 10.8 MB"""
+_WATCH_PERIOD_S = 0.5
+
+
+class Startable(Protocol):
+    """A vizdoom.DoomGame, as far as this file is concerned."""
+
+    def init(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def make_directory() -> Path:
+    """A new private directory for one engine, known to the janitor before it exists.
+
+    Raises:
+        EngineError: programs in the temporary directory may not be run.
+    """
+    directory = Path(tempfile.gettempdir()) / (janitor.ENGINE_DIR_PREFIX + secrets.token_hex(8))
+    janitor.record("engine", str(directory))
+    directory.mkdir(mode=0o700)
+    return directory
+
+
+def write_launcher(directory: Path, engine: Path, log: Path) -> Path:
+    """Writes the script that the client library launches in place of the engine (see engine_wrapper.py).
+
+    It is made anew for every engine, because an installed file might not be executable, and its first line might
+    be too long or hold blanks for a `#!` line.
+
+    Raises:
+        EngineError: programs in this directory may not be run.
+    """
+    wrapper = Path(__file__).with_name("engine_wrapper.py")
+    words = (sys.executable, "-IS", wrapper, os.getpid(), directory, log, engine)
+    launcher = directory / "launch"
+    launcher.write_text(f'#!/bin/sh\nexec {shlex.join(str(word) for word in words)} "$@"\n')
+    launcher.chmod(0o700)
+    if not os.access(launcher, os.X_OK):
+        raise EngineError(
+            f"engine launcher {launcher}: the file system forbids running programs (noexec); "
+            "set TMPDIR to a directory where they may run"
+        )
+    return launcher
+
+
+def start(game: Startable, directory: Path, log: Path, timeout_s: float) -> None:
+    """Runs `game.init()`, one of few at a time on this machine, with a deadline.
+
+    It runs in a thread of its own. Past the deadline that thread is left behind, engine and all: ending an engine
+    that is still starting would crash this process. Should it come up after all, it is closed at once.
+
+    Raises:
+        ResourceError: not enough free shared memory.
+        EngineError: not started within `timeout_s`, or ViZDoom raised.
+    """
+    deadline = time.monotonic() + timeout_s
+    free = shutil.disk_usage(janitor.SHM_DIR).free
+    if free < _SHM_BYTES:
+        raise ResourceError(
+            f"{janitor.SHM_DIR}: {free / 2**20:.0f} MiB free, an engine needs {_SHM_BYTES / 2**20:.0f}; "
+            "enlarge it (docker run --shm-size=1g, or mount -o remount,size=1g /dev/shm)"
+        )
+    attempt = _Attempt(game, directory)
+    with start_slot(deadline):
+        attempt.thread.start()
+        try:
+            attempt.thread.join(max(0.0, deadline - time.monotonic()))
+        except BaseException:  # Ctrl-C while waiting
+            attempt.give_up()
+            raise
+        late = attempt.thread.is_alive()
+    tail = log_tail(log)
+    if late:
+        attempt.give_up()
+        raise EngineError(f"engine in {directory}: not started within {timeout_s:g} s{tail}")
+    if attempt.error is not None:
+        end(game, directory)
+        raise EngineError(f"engine in {directory}: did not start: {attempt.error!r}{tail}") from attempt.error
+
+
+class _Attempt:
+    """One run of `game.init()` in a thread, which can be given up."""
+
+    def __init__(self, game: Startable, directory: Path):
+        self.error: Exception | None = None
+        self.thread = threading.Thread(target=self._run, name=f"start {directory.name}", daemon=True)
+        self._game = game
+        self._directory = directory
+        self._lock = threading.Lock()
+        self._finished = False
+        self._given_up = False
+
+    def _run(self) -> None:
+        try:
+            self._game.init()
+        except Exception as error:  # handed to the waiting thread
+            self.error = error
+        with self._lock:
+            self._finished = True
+            if self._given_up:
+                end(self._game, self._directory)
+
+    def give_up(self) -> None:
+        """Closes the engine, at once if it is up, else when it comes up."""
+        with self._lock:
+            self._given_up = True
+            if self._finished:
+                end(self._game, self._directory)
+
+
+@contextlib.contextmanager
+def start_slot(deadline: float) -> Iterator[None]:
+    """Holds one of the machine's few start-up places: a locked file, given back even by a SIGKILL.
+
+    Raises:
+        EngineError: none became free before `deadline` (monotonic seconds).
+    """
+    num_slots = min(_MAX_STARTING, max(2, os.cpu_count() or 1))
+    with contextlib.ExitStack() as stack:
+        files = [
+            stack.enter_context((janitor.runtime_dir() / f"start-{slot}.lock").open("w")) for slot in range(num_slots)
+        ]
+        while not any(_try_lock(file) for file in files):
+            if time.monotonic() > deadline:
+                raise EngineError(f"engine: none of {num_slots} start-up places became free in time")
+            time.sleep(0.005)
+        yield
+
+
+def _try_lock(file: IO[str]) -> bool:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def end(game: Startable, directory: Path) -> None:
+    """Ends an engine and removes what it had. The order matters: with its engine dead, `game.close` cannot hang."""
+    janitor.clean_engine(directory)
+    game.close()
+    janitor.forget("engine", str(directory))
+
+
+def end_if_ours(game: Startable, directory: Path, owner_pid: int) -> None:
+    """`end`, unless this process is a fork of the owner, which inherited the object but not the engine."""
+    if os.getpid() == owner_pid:
+        end(game, directory)
+
+
+def log_tail(log: Path, num_lines: int = 8) -> str:
+    """The last lines of an engine's log, ready to be put behind an error message."""
+    if not log.exists():
+        return "; it printed nothing"
+    lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    return "; its last lines:\n  " + "\n  ".join(lines[-num_lines:]) if lines else "; it printed nothing"
+
+
+class Watched(Protocol):
+    """Something with a deadline (monotonic seconds; None: nothing to wait for) that can be killed."""
+
+    deadline: float | None
+
+    def kill_overdue(self) -> None: ...
+
+
+_watched: weakref.WeakSet[Watched] = weakref.WeakSet()
+_watched_lock = threading.Lock()
+_watcher: threading.Thread | None = None
+
+
+def watch(one: Watched) -> None:
+    """From now on `one` is killed when its deadline has passed. One thread watches for the whole process."""
+    global _watcher
+    with _watched_lock:
+        _watched.add(one)
+        if _watcher is None or not _watcher.is_alive():  # in a forked child the thread is gone
+            _watcher = threading.Thread(target=_watch, name="engine watchdog", daemon=True)
+            _watcher.start()
+
+
+def _watch() -> None:
+    while True:
+        time.sleep(_WATCH_PERIOD_S)
+        with _watched_lock:
+            watched = list(_watched)
+        for one in watched:
+            if one.deadline is not None and time.monotonic() > one.deadline:
+                one.kill_overdue()
+        del watched  # no strong references while asleep
