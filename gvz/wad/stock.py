@@ -1,0 +1,40 @@
+"""What the installed engine brings along: its files and its actor classes.
+
+Read from the vizdoom package's data files; its compiled module is never imported.
+"""
+
+import importlib.util
+import zipfile
+from functools import cache
+from pathlib import Path
+
+from gvz.errors import WadError
+from gvz.wad.decorate import declared_actors
+
+
+@cache
+def engine_directory() -> Path:
+    """The directory of the installed vizdoom package.
+
+    Raises:
+        WadError: vizdoom is not installed.
+    """
+    spec = importlib.util.find_spec("vizdoom")
+    if spec is None or not spec.submodule_search_locations:
+        raise WadError("vizdoom: got no installed package, want one; run `pip install vizdoom`")
+    return Path(spec.submodule_search_locations[0])
+
+
+@cache
+def stock_actors() -> frozenset[str]:
+    """Names of the actor classes the engine has for Doom, from the DECORATE text in its vizdoom.pk3.
+
+    Classes of Heretic, Hexen, Strife and Chex Quest are left out: the engine knows them, but has no pictures.
+    """
+    with zipfile.ZipFile(engine_directory() / "vizdoom.pk3") as archive:
+        texts = [
+            archive.read(name).decode("latin-1")
+            for name in sorted(archive.namelist())
+            if name.startswith(("actors/doom/", "actors/shared/", "actors/actor.txt")) and name.endswith(".txt")
+        ]
+    return frozenset(name for text in texts for name in declared_actors(text))
