@@ -8,7 +8,9 @@ n-step returns and discounts are the replay's work.
 Control messages are msgpack maps with a `type`, never pickles: nothing that comes from a peer is ever executed.
 """
 
-from dataclasses import asdict, dataclass, field, fields
+import types
+import typing
+from dataclasses import asdict, dataclass, field
 from typing import Any, ClassVar
 
 import msgpack
@@ -137,6 +139,10 @@ class ActorSpec:
     ring_name: str
     ring_capacity: int
     broadcast_name: str
+    num_params: int
+    """length of the flat parameter vector; 0 for a random policy, which has no queue"""
+    layout_hash: int
+    """hash of the parameter tree, as in ParamsHeader"""
     work_dir: str
     """private directory for the engines' files and the worker's logs"""
     recycle_episodes: int = 0
@@ -145,11 +151,16 @@ class ActorSpec:
 
 Message = EpisodeStats | Ready | Fault | Stop | ActorSpec
 _TYPES: dict[str, type[Any]] = {cls.type: cls for cls in (EpisodeStats, Ready, Fault, Stop, ActorSpec)}
+_FIELDS = {
+    cls: {key: kind for key, kind in typing.get_type_hints(cls).items() if key != "type"} for cls in _TYPES.values()
+}
 
 
 def encode(message: Message) -> bytes:
     """Packs a message as msgpack."""
-    return msgpack.packb({"type": message.type, "schema": SCHEMA_VERSION, **asdict(message)}, use_bin_type=True)
+    packed = msgpack.packb({"type": message.type, "schema": SCHEMA_VERSION, **asdict(message)}, use_bin_type=True)
+    assert packed is not None  # only a Packer that does not reset itself returns nothing
+    return packed
 
 
 def decode(data: bytes) -> Message:
@@ -170,13 +181,29 @@ def decode(data: bytes) -> Message:
     cls = _TYPES.get(name)
     if cls is None:
         raise TransportError(f"control message: unknown type {name!r}, want one of {sorted(_TYPES)}")
-    wanted = {f.name for f in fields(cls)}
-    if not (raw.keys() <= wanted):
-        raise TransportError(f"control message {name!r}: unknown fields {sorted(raw.keys() - wanted)}")
+    for key, value in raw.items():
+        if key not in _FIELDS[cls]:
+            raise TransportError(f"control message {name!r}: unknown field {key!r}")
+        if not _fits(value, _FIELDS[cls][key]):
+            raise TransportError(f"control message {name!r}: got {value!r:.80} for {key}, want {_FIELDS[cls][key]}")
     try:
         return cls(**raw)
     except TypeError as error:
         raise TransportError(f"control message {name!r}: {error}") from error
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Whether an unpacked value is of an annotated type; an int passes for a float, a bool never for a number."""
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if kind is Any:
+        return True
+    if origin is types.UnionType:
+        return any(_fits(value, arg) for arg in args)
+    if origin is list:
+        return type(value) is list and all(_fits(item, args[0]) for item in value)
+    if origin is dict:
+        return type(value) is dict and all(_fits(k, args[0]) and _fits(v, args[1]) for k, v in value.items())
+    return type(value) is kind or (kind is float and type(value) is int)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

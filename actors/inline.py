@@ -1,0 +1,138 @@
+"""The pool of sync mode: the same acting loop in the learner's own process. Imports gvz (tier 0) and actors.
+
+A game is played only inside `drain`, so a run is a function of its seed, and `state` holds all that is needed to go
+on bit for bit.
+"""
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from actors.loop import ActorLoop
+from actors.pool import PoolConfig, PoolStatistics, num_decisions
+from gvz.errors import ResumeError
+from gvz.transport.messages import STEP_DTYPE, EpisodeStats, Message, ParamsHeader, StepBlock, decode, encode
+from gvz.transport.ring import RingReader
+
+_COMMITTED = [name for name in STEP_DTYPE.names or () if name not in ("sequence", "pad")]
+
+
+class InlinePool:
+    """One loop that plays every lane. Use as a context manager, or `close` it."""
+
+    def __init__(self, config: PoolConfig, state: dict[str, Any] | None = None):
+        """Starts every game.
+
+        Args:
+            config: what to play; sync mode has `num_actors` 1.
+            state: what `state()` returned in the run that is resumed.
+
+        Raises:
+            ValueError: more than one actor.
+            ResumeError: a game does not come to where `state` left it.
+        """
+        if config.num_actors != 1:
+            raise ValueError(f"num_actors: got {config.num_actors}, want 1: inline, all games are one actor's")
+        (spec,) = config.actor_specs("inline", [0] * config.num_lanes)
+        self._messages: list[Message] = []
+        self._ring = RingReader.create(None, spec.ring_capacity, config.frame_shape)
+        self._writer = self._ring.writer()
+        self._published: tuple[np.ndarray, ParamsHeader] | None = None
+        self._num_games = len(spec.lanes)
+        self._needs_params = bool(spec.policy)
+        self._env_steps = self._episodes = 0
+        self._loop = ActorLoop(spec, self._writer, self._messages.append)
+        try:
+            if state is None:
+                self._loop.begin()
+            else:
+                self._restore(state)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> "InlinePool":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def publish(self, params: np.ndarray, header: ParamsHeader) -> None:
+        """Acts by `params` float32[P] (copied) from now on."""
+        if self._needs_params:
+            self._published = (params.copy(), header)
+            self._loop.set_params(*self._published)
+
+    def wait_for_records(self, timeout_s: float) -> None:
+        """Returns at once: `drain` plays until it has what it is asked for."""
+
+    def drain(self, max_records: int) -> list[StepBlock]:
+        """Plays until there are `max_records` records and returns exactly so many.
+
+        Raises:
+            ValueError: no parameters were published.
+        """
+        if self._needs_params and self._published is None:
+            raise ValueError("drain: publish parameters first")
+        blocks: list[StepBlock] = []
+        while max_records > 0:
+            while self._ring.num_unread < max_records and self._writer.free >= self._num_games:
+                self._loop.step()
+            blocks.append(self._ring.read(max_records))
+            max_records -= len(blocks[-1])
+            self._env_steps += num_decisions(blocks[-1].steps)
+        return blocks
+
+    def poll(self) -> list[Message]:
+        """Episodes and faults since the last call."""
+        messages = list(self._messages)
+        self._messages.clear()
+        self._episodes += sum(isinstance(message, EpisodeStats) for message in messages)
+        return messages
+
+    def state(self) -> dict[str, Any]:
+        """All that a pool of the same configuration needs to go on from here bit for bit, as msgpack types."""
+        unread = self._ring.peek(self._ring.capacity)
+        published = None
+        if self._published is not None:
+            params, header = self._published
+            published = {"params": params.tobytes(), "header": asdict(header)}
+        return {
+            "loop": self._loop.state(),
+            "published": published,
+            "unread_steps": unread.steps.tobytes(),
+            "unread_frames": unread.frames.tobytes(),
+            "messages": [encode(message) for message in self._messages],
+        }
+
+    def statistics(self) -> PoolStatistics:
+        """Counters for the log; nobody ever waits."""
+        return PoolStatistics(
+            env_steps=self._env_steps,
+            episodes=self._episodes,
+            restarts=0,
+            actors_ready=1,
+            waited_for_space_s=0.0,
+            waited_for_records_s=0.0,
+        )
+
+    def close(self) -> None:
+        """Closes every game. Can be repeated."""
+        self._loop.close()
+        self._writer.close()
+        self._ring.close()
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        if (got := len(state["loop"]["games"])) != self._num_games:
+            raise ResumeError(f"state of the inline pool: got {got} games, want {self._num_games}")
+        self._loop.begin(state["loop"])
+        if state["published"] is not None:
+            header = ParamsHeader(**state["published"]["header"])
+            self.publish(np.frombuffer(state["published"]["params"], np.float32), header)
+        steps = np.frombuffer(state["unread_steps"], STEP_DTYPE)
+        frames = np.frombuffer(state["unread_frames"], np.uint8).reshape(len(steps), *self._ring.frame_shape)
+        for step, frame in zip(steps, frames, strict=True):
+            self._writer.reserve()[...] = frame
+            self._writer.commit(**{name: step[name].item() for name in _COMMITTED})
+        self._messages += [decode(data) for data in state["messages"]]

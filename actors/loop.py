@@ -1,0 +1,227 @@
+"""The acting loop: several games, one batched decision, step records out. Imports numpy, gvz (tiers 0-1), actors.
+
+The same loop runs in a worker process and, in sync mode, inside the learner's.
+"""
+
+import importlib
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from actors.policy import make_policy
+from actors.preprocess import push_frame, start_stack
+from gvz.errors import ConfigError, ResumeError
+from gvz.transport.messages import ActorSpec, EpisodeStats, Fault, Message, ParamsHeader
+from gvz.transport.ring import RingWriter, WriterState
+
+
+@dataclass(kw_only=True, slots=True)
+class Game:
+    """One lane: an environment and what has happened since its episode began."""
+
+    env: gymnasium.Env[np.ndarray, int]
+    lane: int
+    task: int
+    stack: np.ndarray
+    """uint8[H, W, stack_size * C], a view of the batch that the policy sees"""
+    episode: int
+    """number within the lane"""
+    num_recycled: int = 0
+    """episodes since the engine started"""
+    seed: int = 0
+    frame: np.ndarray = field(default_factory=lambda: np.empty(0, np.uint8))
+    """uint8[H, W, C], o_t"""
+    reward: float = 0.0
+    """r_t"""
+    terminated: bool = False
+    truncated: bool = False
+    params_version: int = 0
+    """of the parameters that chose the last action"""
+    actions: list[int] = field(default_factory=list)
+    """since the episode began; with the seed they reproduce it"""
+    reward_sum: float = 0.0
+    reward_components: dict[str, float] = field(default_factory=dict)
+    info: dict[str, Any] = field(default_factory=dict)
+
+
+class ActorLoop:
+    """Plays the games of one actor.
+
+    Args:
+        spec: what to play, and how.
+        ring: where records go; `step` writes one for each game.
+        emit: takes an `EpisodeStats` for each episode that ends, and a `Fault` for each engine that crashed.
+    """
+
+    def __init__(self, spec: ActorSpec, ring: RingWriter, emit: Callable[[Message], None]):
+        height, width, channels = spec.frame_shape
+        obs_shape = (len(spec.lanes), height, width, channels * spec.stack_size)
+        self._spec = spec
+        self._ring = ring
+        self._emit = emit
+        self._obs = np.zeros(obs_shape, np.uint8)
+        self._tasks = np.array(spec.lane_tasks, np.int32)
+        self._params_version = 0
+        self.games: list[Game] = []
+        ring.beat(WriterState.STARTING)
+        self._policy = make_policy(
+            spec.policy,
+            num_actions=spec.num_actions,
+            num_params=spec.num_params,
+            obs_shape=obs_shape,
+            seed=derive_seed(spec.seed, spec.actor, *spec.first_episodes),
+        )
+
+    def begin(self, state: dict[str, Any] | None = None) -> None:
+        """Starts every game: at its first episode, or where `state` says.
+
+        Raises:
+            ResumeError: a game does not come to where it was.
+        """
+        spec = self._spec
+        for index, (lane, task, episode) in enumerate(
+            zip(spec.lanes, spec.lane_tasks, spec.first_episodes, strict=True)
+        ):
+            self._ring.beat(WriterState.STARTING)
+            game = Game(env=self._make_env(task), lane=lane, task=task, stack=self._obs[index], episode=episode)
+            self.games.append(game)
+            if state is None:
+                self._reset(game)
+            else:
+                self._replay(game, state["games"][index])
+        if state is not None:
+            self._policy.num_calls = state["num_calls"]
+
+    def set_params(self, params: np.ndarray, header: ParamsHeader) -> None:
+        """Acts by `params` float32[P] (copied) from now on."""
+        self._policy.set_params(params, header)
+        self._params_version = header.version
+
+    def step(self) -> None:
+        """One decision for every game: writes one record each, then plays on. The ring must have the room."""
+        actions = self._policy.act(self._obs, self._tasks).tolist()
+        for game, action in zip(self.games, actions, strict=True):
+            self._write(game, action)
+        for game, action in zip(self.games, actions, strict=True):
+            if game.terminated or game.truncated:
+                self._finish(game)
+            else:
+                self._ring.beat(WriterState.ACTING)
+                game.params_version = self._params_version
+                self._play(game, action)
+
+    def state(self) -> dict[str, Any]:
+        """All that `begin` needs to come back here, as msgpack types. The parameters are not in it."""
+        games = [
+            {
+                "episode": game.episode,
+                "actions": list(game.actions),
+                "params_version": game.params_version,
+                "num_recycled": game.num_recycled,
+                "frame_crc": zlib.crc32(game.frame.tobytes()),
+            }
+            for game in self.games
+        ]
+        return {"num_calls": self._policy.num_calls, "games": games}
+
+    def close(self) -> None:
+        """Closes every game. Can be repeated."""
+        while self.games:
+            self.games.pop().env.close()
+
+    def _make_env(self, task: int) -> gymnasium.Env[np.ndarray, int]:
+        module, _, name = self._spec.env_entry_point.partition(":")
+        return getattr(importlib.import_module(module), name)(self._spec.tasks[task], self._spec.env_config)
+
+    def _write(self, game: Game, action: int) -> None:
+        self._ring.reserve()[...] = game.frame
+        self._ring.commit(
+            episode=game.episode,
+            params_version=self._params_version,
+            action=0 if game.terminated or game.truncated else action,
+            reward=game.reward,
+            lane=game.lane,
+            task=game.task,
+            first=not game.actions,
+            terminated=game.terminated,
+            truncated=game.truncated,
+        )
+
+    def _play(self, game: Game, action: int) -> None:
+        frame, reward, game.terminated, game.truncated, game.info = game.env.step(action)
+        game.frame, game.reward = frame, float(reward)
+        game.actions.append(action)
+        game.reward_sum += game.reward
+        for name, value in game.info["reward_components"].items():
+            game.reward_components[name] = game.reward_components.get(name, 0.0) + float(value)
+        push_frame(game.stack, frame)
+
+    def _finish(self, game: Game) -> None:
+        """Reports the episode, whose last record is written, and starts the next."""
+        crashed = bool(game.info.get("engine_crash", False))
+        if crashed:
+            where = f"lane {game.lane}, task {self._spec.tasks[game.task]}, episode {game.episode}, seed {game.seed}"
+            message = f"{where}: the engine died at decision {len(game.actions)}; a new one is started"
+            self._emit(Fault(actor=self._spec.actor, lane=game.lane, kind="engine_crash", message=message))
+        self._emit(
+            EpisodeStats(
+                lane=game.lane,
+                task=game.task,
+                episode=game.episode,
+                seed=game.seed,
+                score=float(game.info["score"]),
+                reward=game.reward_sum,
+                reward_components=game.reward_components,
+                length_frames=int(game.info["episode_frames"]),
+                length_steps=len(game.actions),
+                params_version=game.params_version,
+                terminated=game.terminated,
+                truncated=game.truncated,
+                cut=crashed,
+            )
+        )
+        game.episode += 1
+        game.num_recycled += 1
+        if 0 < self._spec.recycle_episodes <= game.num_recycled:
+            self._ring.beat(WriterState.RESETTING)
+            game.env.close()
+            game.env, game.num_recycled = self._make_env(game.task), 0
+        self._reset(game)
+
+    def _reset(self, game: Game) -> None:
+        """Starts episode `game.episode`."""
+        self._ring.beat(WriterState.RESETTING)
+        game.seed = derive_seed(self._spec.seed, game.task, game.lane, game.episode)
+        game.frame, game.info = game.env.reset(options={"episode_seed": game.seed})
+        if list(game.frame.shape) != self._spec.frame_shape or game.frame.dtype != np.uint8:
+            raise ConfigError(
+                f"{self._spec.env_entry_point}({self._spec.tasks[game.task]!r}): got a frame "
+                f"{game.frame.dtype}{list(game.frame.shape)}, want uint8{self._spec.frame_shape}"
+            )
+        game.reward, game.terminated, game.truncated = 0.0, False, False
+        game.actions, game.reward_sum, game.reward_components = [], 0.0, {}
+        start_stack(game.stack, game.frame)
+
+    def _replay(self, game: Game, state: dict[str, Any]) -> None:
+        """Brings a game to where `state` left it: same episode, same seed, same actions."""
+        game.episode, game.params_version = state["episode"], state["params_version"]
+        game.num_recycled = state["num_recycled"]
+        self._reset(game)
+        for action in state["actions"]:
+            self._ring.beat(WriterState.RESETTING)
+            self._play(game, action)
+        if zlib.crc32(game.frame.tobytes()) != state["frame_crc"]:
+            raise ResumeError(
+                f"lane {game.lane}, task {self._spec.tasks[game.task]}: replaying {len(game.actions)} actions of "
+                f"episode {game.episode} (seed {game.seed}) did not come to the same frame; resume with the engine "
+                "and the maps that the run was started with"
+            )
+
+
+def derive_seed(*entropy: int) -> int:
+    """A 31-bit seed from integers of at least 0: the same for the same numbers, independent for others."""
+    return int(np.random.SeedSequence(entropy).generate_state(1)[0] & 0x7FFFFFFF)

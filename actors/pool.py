@@ -1,0 +1,396 @@
+"""The pool of actor processes: starts them, watches them, takes their records. Imports gvz (tier 0) and actors.
+
+`ActorPool` and `actors.inline.InlinePool` have one interface: `publish`, `wait_for_records`, `drain`, `poll`,
+`state`, `statistics`, `close`. Neither starts a thread: all watching happens in `poll`, which the learner calls in
+every round.
+"""
+
+import os
+import secrets
+import time
+from collections import deque
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from actors.config import ActorsConfig
+from actors.process import ActorProcess
+from gvz import janitor
+from gvz.errors import ConfigError, ResumeError, WorkerError
+from gvz.transport.broadcast import BroadcastWriter, broadcast_bytes
+from gvz.transport.messages import ActorSpec, EpisodeStats, Fault, Message, ParamsHeader, Ready, StepBlock
+from gvz.transport.ring import RingReader, WriterStatus, ring_bytes
+
+STOP_TIMEOUT_S = 5.0
+"""how long actors may take over their last step, and then over SIGTERM"""
+_DUMP_S = 0.5
+"""time given to a stuck actor to write its stacks before it is killed"""
+_STABLE_S = 10.0
+"""an actor that has played for so long is restarted at once; others wait longer each time"""
+_WAIT_SLEEP_S = 0.0005
+_FIRST_BACKOFF_S, _LONGEST_BACKOFF_S = 0.25, 15.0
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PoolConfig:
+    """What a pool plays. Lane i is game i % games_per_actor of actor i // games_per_actor and plays task i % T."""
+
+    tasks: tuple[str, ...]
+    """ids of the run's tasks"""
+    num_actors: int
+    games_per_actor: int
+    seed: int
+    """the run's seed, at least 0"""
+    env_entry_point: str
+    """`module:callable`, called as f(task_id, env_config) -> gymnasium.Env"""
+    env_config: dict[str, Any]
+    """of plain types: it travels as msgpack"""
+    frame_shape: tuple[int, int, int]
+    """(H, W, C)"""
+    stack_size: int
+    num_actions: int
+    policy: bytes
+    """serialized acting function; empty for uniformly random play"""
+    num_params: int
+    """length of the flat float32 parameter vector; 0 for random play"""
+    layout_hash: int
+    """of the parameter tree; 0 for random play"""
+    actors: ActorsConfig
+    work_dir: Path
+    """private directory for logs and the engines' files"""
+
+    def __post_init__(self) -> None:
+        if self.actors.ring_capacity < self.games_per_actor:
+            raise ConfigError(
+                f"actors.ring_capacity: got {self.actors.ring_capacity}, want at least the {self.games_per_actor} "
+                "games of an actor: each step writes one record a game"
+            )
+        if self.num_lanes < len(self.tasks):
+            raise ConfigError(
+                f"actors: got {self.num_actors} actors with {self.games_per_actor} games for {len(self.tasks)} tasks, "
+                "want at least one game a task"
+            )
+        if self.num_lanes > 2**16:
+            raise ConfigError(f"actors: got {self.num_lanes} games, want at most {2**16} (a lane is a u16)")
+
+    @property
+    def num_lanes(self) -> int:
+        return self.num_actors * self.games_per_actor
+
+    def shared_memory_bytes(self) -> int:
+        """What an `ActorPool` takes of /dev/shm."""
+        rings = self.num_actors * ring_bytes(self.actors.ring_capacity, self.frame_shape)
+        return rings + (broadcast_bytes(self.num_params) if self.policy else 0)
+
+    def actor_specs(self, names: str, first_episodes: list[int]) -> list[ActorSpec]:
+        """One spec an actor. `names` begins the names of its segments; `first_episodes` has an entry a lane."""
+        specs = []
+        for actor in range(self.num_actors):
+            lanes = list(range(actor * self.games_per_actor, (actor + 1) * self.games_per_actor))
+            specs.append(
+                ActorSpec(
+                    actor=actor,
+                    lanes=lanes,
+                    lane_tasks=[lane % len(self.tasks) for lane in lanes],
+                    tasks=list(self.tasks),
+                    first_episodes=[first_episodes[lane] for lane in lanes],
+                    seed=self.seed,
+                    env_entry_point=self.env_entry_point,
+                    env_config=self.env_config,
+                    frame_shape=list(self.frame_shape),
+                    stack_size=self.stack_size,
+                    num_actions=self.num_actions,
+                    policy=self.policy,
+                    ring_name=f"{names}-ring-{actor}",
+                    ring_capacity=self.actors.ring_capacity,
+                    broadcast_name=f"{names}-params",
+                    num_params=self.num_params,
+                    layout_hash=self.layout_hash,
+                    work_dir=str(self.work_dir.absolute()),
+                    recycle_episodes=self.actors.recycle_episodes,
+                )
+            )
+        return specs
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PoolStatistics:
+    """Counters since the pool was made."""
+
+    env_steps: int
+    """records drained that hold a decision (all but an episode's last)"""
+    episodes: int
+    restarts: int
+    actors_ready: int
+    """actors that have started all their games and live"""
+    waited_for_space_s: float
+    """seconds actors waited for the learner to read, summed over actors"""
+    waited_for_records_s: float
+    """seconds the learner spent in `wait_for_records`"""
+
+
+@dataclass(kw_only=True, slots=True)
+class _Actor:
+    """What the pool knows of one actor: its ring outlives its processes."""
+
+    spec: ActorSpec
+    ring: RingReader
+    next_episodes: list[int]
+    """per game: one more than the largest episode number seen"""
+    process: ActorProcess | None = None
+    start_at: float = 0.0
+    """`time.monotonic()` before which it is not started again"""
+    ready_at: float | None = None
+    silent_s: float = 0.0
+    """time without a sign of life (or, before Ready, since the start) while we watched"""
+    heartbeat_ns: int = 0
+    kill_at: float | None = None
+    """set when it is stuck and has been asked for its stacks"""
+    ended_at: deque[float] = field(default_factory=deque)
+    """the ends of its processes within the restart window"""
+    failed_starts: int = 0
+    """ends in a row before the process was stable"""
+
+
+class ActorPool:
+    """Actors in processes of their own. Use as a context manager, or `close` it."""
+
+    def __init__(self, config: PoolConfig, state: dict[str, Any] | None = None):
+        """Makes the segments and starts the processes; does not wait for them.
+
+        Args:
+            config: what to play.
+            state: what `state()` returned in the run that is resumed.
+
+        Raises:
+            ResourceError: /dev/shm has no room.
+            ResumeError: `state` is of a pool of another size.
+        """
+        first_episodes = episodes_to_begin_with(config, state)
+        specs = config.actor_specs(f"gvz-{os.getpid()}-{secrets.token_hex(4)}", first_episodes)
+        self._config = config
+        self._actors: list[_Actor] = []
+        self._board: BroadcastWriter | None = None
+        self._messages: list[Message] = []
+        self._first_drained = 0  # the actor that is served first in the next drain
+        self._polled_at = time.monotonic()
+        self._env_steps = self._episodes = self._restarts = 0
+        self._waited_s = 0.0
+        try:
+            if config.policy:
+                self._board = BroadcastWriter.create(specs[0].broadcast_name, config.num_params, config.layout_hash)
+            for spec in specs:
+                ring = RingReader.create(spec.ring_name, spec.ring_capacity, config.frame_shape)
+                self._actors.append(_Actor(spec=spec, ring=ring, next_episodes=list(spec.first_episodes)))
+            for actor in self._actors:
+                self._start(actor)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> "ActorPool":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def publish(self, params: np.ndarray, header: ParamsHeader) -> None:
+        """Gives the actors `params` float32[P] to act by; they take them before their next step. Never waits."""
+        if self._board is not None:
+            self._board.publish(params, header)
+
+    def wait_for_records(self, timeout_s: float) -> None:
+        """Waits until some actor has written a record, at most `timeout_s`; the time is counted."""
+        start = time.monotonic()
+        while not any(actor.ring.num_unread for actor in self._actors) and time.monotonic() - start < timeout_s:
+            time.sleep(_WAIT_SLEEP_S)
+        self._waited_s += time.monotonic() - start
+
+    def drain(self, max_records: int) -> list[StepBlock]:
+        """Takes up to `max_records` records, an equal share from every actor as far as it has them. Never waits.
+
+        Raises:
+            TransportError: a record was lost, repeated or torn.
+        """
+        first = self._first_drained
+        self._first_drained = (first + 1) % len(self._actors)
+        # the emptiest first: what they leave of their share goes to the others
+        actors = sorted(self._actors[first:] + self._actors[:first], key=lambda actor: actor.ring.num_unread)
+        blocks = []
+        for index, actor in enumerate(actors):
+            share = -(-max_records // (len(actors) - index))
+            block = actor.ring.read(share)
+            if len(block):
+                max_records -= len(block)
+                self._note(actor, block.steps)
+                self._env_steps += num_decisions(block.steps)
+                blocks.append(block)
+        return blocks
+
+    def poll(self) -> list[Message]:
+        """Watches the actors and returns what they said: episodes, faults, Ready. Never waits long.
+
+        Dead and stuck actors are replaced; what they published stays in the ring, and their games go on with new
+        episodes.
+
+        Raises:
+            WorkerError: an actor failed more often than its budget allows.
+        """
+        now = time.monotonic()
+        # our own sleep is not the actors' silence: a learner that compiled for a minute has not watched for a minute
+        watched_s = min(now - self._polled_at, self._config.actors.heartbeat_timeout_s / 4)
+        self._polled_at = now
+        for actor in self._actors:
+            self._watch(actor, now, watched_s)
+        messages, self._messages = self._messages, []
+        return messages
+
+    def state(self) -> dict[str, Any]:
+        """What the pool of a resumed run begins with: lanes go on with new episodes."""
+        for actor in self._actors:
+            self._note(actor, actor.ring.peek(actor.ring.capacity).steps)
+        return {"next_episodes": [episode for actor in self._actors for episode in actor.next_episodes]}
+
+    def statistics(self) -> PoolStatistics:
+        """Counters for the log."""
+        return PoolStatistics(
+            env_steps=self._env_steps,
+            episodes=self._episodes,
+            restarts=self._restarts,
+            actors_ready=sum(actor.ready_at is not None for actor in self._actors),
+            waited_for_space_s=sum(status.waited_for_space_s for status in self.writer_statuses()),
+            waited_for_records_s=self._waited_s,
+        )
+
+    def writer_statuses(self) -> list[WriterStatus]:
+        """What each actor is at, in order."""
+        return [actor.ring.writer_status() for actor in self._actors]
+
+    def close(self) -> None:
+        """Ends every process within bounded time and removes every segment. Can be repeated."""
+        processes = [actor.process for actor in self._actors if actor.process is not None]
+        for process in processes:
+            process.ask_to_stop()
+        deadline = time.monotonic() + STOP_TIMEOUT_S
+        for process in processes:
+            process.wait(max(0.0, deadline - time.monotonic()))
+        deadline = time.monotonic() + STOP_TIMEOUT_S
+        for actor in self._actors:
+            if actor.process is not None:
+                actor.process.end(grace_s=max(0.0, deadline - time.monotonic()))
+                actor.process, actor.ready_at = None, None
+            actor.ring.close()
+        if self._board is not None:
+            self._board.close()
+        if processes:
+            janitor.clean_dead_instances()
+
+    def _start(self, actor: _Actor) -> None:
+        actor.process = ActorProcess(actor.spec)
+        actor.ready_at, actor.kill_at, actor.silent_s = None, None, 0.0
+        actor.heartbeat_ns = actor.ring.writer_status().heartbeat_ns
+
+    def _watch(self, actor: _Actor, now: float, watched_s: float) -> None:
+        if actor.process is None:
+            if now >= actor.start_at:
+                self._start(actor)
+            return
+        exit_text = actor.process.exit_text()  # first: what it said before its end is then all there
+        for message in actor.process.receive():
+            self._take(actor, message, now)
+        if exit_text is not None:
+            self._replace(actor, now, "died", exit_text)
+        elif actor.kill_at is not None:
+            if now >= actor.kill_at:
+                self._replace(actor, now, "stuck", self._silence(actor))
+        elif self._is_stuck(actor, watched_s):
+            actor.process.dump_stacks()
+            actor.kill_at = now + _DUMP_S
+
+    def _take(self, actor: _Actor, message: Message, now: float) -> None:
+        if isinstance(message, Ready):
+            actor.ready_at, actor.silent_s = now, 0.0
+        elif isinstance(message, EpisodeStats):
+            self._episodes += 1
+        self._messages.append(message)
+
+    def _is_stuck(self, actor: _Actor, watched_s: float) -> bool:
+        heartbeat_ns = actor.ring.writer_status().heartbeat_ns
+        if actor.ready_at is not None and heartbeat_ns != actor.heartbeat_ns:
+            actor.silent_s = 0.0
+        else:
+            actor.silent_s += watched_s
+        actor.heartbeat_ns = heartbeat_ns
+        limits = self._config.actors
+        return actor.silent_s > (limits.start_timeout_s if actor.ready_at is None else limits.heartbeat_timeout_s)
+
+    def _silence(self, actor: _Actor) -> str:
+        state = actor.ring.writer_status().state.name.lower()
+        if actor.ready_at is None:
+            return f"had not started its games after {actor.silent_s:.1f} s (actors.start_timeout_s)"
+        return f"gave no sign of life for {actor.silent_s:.1f} s (actors.heartbeat_timeout_s) while {state}"
+
+    def _replace(self, actor: _Actor, now: float, kind: str, what: str) -> None:
+        """Ends what is left of an actor's process and plans the next, if the budget allows."""
+        assert actor.process is not None
+        log_tail = actor.process.log_tail()
+        actor.process.end(grace_s=0.0)
+        actor.process = None
+        janitor.clean_dead_instances()
+        stable = actor.ready_at is not None and now - actor.ready_at > _STABLE_S
+        actor.ready_at = None
+        limits, ended_at = self._config.actors, actor.ended_at
+        ended_at.append(now)
+        while now - ended_at[0] > limits.restart_window_s:
+            ended_at.popleft()
+        index = actor.spec.actor
+        if len(ended_at) > limits.max_restarts:
+            raise WorkerError(
+                f"actor {index} {what}; that was end {len(ended_at)} within {limits.restart_window_s:.0f} s, and "
+                f"actors.max_restarts allows {limits.max_restarts} restarts. The end of {self._log_path(index)}:\n"
+                f"{log_tail}"
+            )
+        actor.failed_starts = 0 if stable else actor.failed_starts + 1
+        backoff_s = min(_FIRST_BACKOFF_S * 2**actor.failed_starts, _LONGEST_BACKOFF_S)
+        actor.start_at = now + backoff_s
+        self._restarts += 1
+        self._note(actor, actor.ring.peek(actor.ring.capacity).steps)
+        # also a lane that wrote nothing gets a new episode: its seed may be what the engine cannot start with
+        actor.next_episodes = [
+            max(next_, first + 1) for next_, first in zip(actor.next_episodes, actor.spec.first_episodes, strict=True)
+        ]
+        actor.spec = replace(actor.spec, first_episodes=actor.next_episodes)
+        message = f"actor {index} {what}; restart {len(ended_at)} of {limits.max_restarts} in {backoff_s:.2f} s"
+        self._messages.append(Fault(actor=index, lane=None, kind=kind, message=message, traceback=log_tail))
+
+    def _log_path(self, index: int) -> Path:
+        return self._config.work_dir / f"actor_{index}.log"
+
+    def _note(self, actor: _Actor, steps: np.ndarray) -> None:
+        """Keeps track of the episodes that have begun."""
+        for game, lane in enumerate(actor.spec.lanes):
+            episodes = steps["episode"][steps["lane"] == lane]
+            if episodes.size:
+                actor.next_episodes[game] = max(actor.next_episodes[game], int(episodes[-1]) + 1)
+
+
+def episodes_to_begin_with(config: PoolConfig, state: dict[str, Any] | None) -> list[int]:
+    """Number of the first episode of every lane.
+
+    Raises:
+        ResumeError: `state` is of another number of lanes.
+    """
+    episodes = [0] * config.num_lanes if state is None else list(state["next_episodes"])
+    if len(episodes) != config.num_lanes:
+        raise ResumeError(
+            f"state of the actor pool: got {len(episodes)} lanes, want {config.num_lanes} "
+            f"({config.num_actors} actors with {config.games_per_actor} games)"
+        )
+    return episodes
+
+
+def num_decisions(steps: np.ndarray) -> int:
+    """Records of STEP_DTYPE[N] that hold a decision: all but the last of an episode."""
+    return int(np.count_nonzero((steps["terminated"] | steps["truncated"]) == 0))

@@ -1,0 +1,92 @@
+"""One actor process as its parent sees it: start, signs of life, end. Imports gvz (tier 0) and the standard library.
+
+Started with `subprocess` (an exec: nothing of a JAX process is inherited by fork) in a session of its own, so that a
+Ctrl-C reaches the learner alone. It dies with the *thread* that started it.
+"""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+from gvz.transport.channel import Channel
+from gvz.transport.messages import ActorSpec, Message, Stop
+
+LOG_TAIL_BYTES = 4000
+
+_ENVIRONMENT = {
+    "JAX_PLATFORMS": "cpu",
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
+    "NPROC": "1",  # size of XLA's own thread pools
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+}
+"""A core is an actor's share. Must be set before the process imports anything."""
+
+
+class ActorProcess:
+    """A running worker. `spec` goes to it as the first message; its output is appended to a log file."""
+
+    def __init__(self, spec: ActorSpec):
+        work_dir = Path(spec.work_dir)
+        work_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self.log_path = work_dir / f"actor_{spec.actor}.log"
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        path = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path)
+        with theirs, self.log_path.open("ab") as log:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "actors.worker", str(theirs.fileno()), str(os.getpid())],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                cwd=work_dir,
+                env={**os.environ, **_ENVIRONMENT, "PYTHONPATH": path},
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,
+            )
+        self.pid = self._process.pid
+        self._channel = Channel(ours, peer=f"actor {spec.actor} (pid {self.pid})")
+        self._channel.send(spec)
+
+    def receive(self) -> list[Message]:
+        """Messages that have arrived."""
+        return self._channel.receive()
+
+    def exit_text(self) -> str | None:
+        """How the process ended, in words; None while it runs."""
+        code = self._process.poll()
+        if code is None:
+            return None
+        return f"was ended by {signal.Signals(-code).name}" if code < 0 else f"exited with code {code}"
+
+    def ask_to_stop(self) -> None:
+        """Tells it to finish its step, close its games and exit."""
+        self._channel.send(Stop())
+
+    def dump_stacks(self) -> None:
+        """Has it write the stacks of its threads into the log (faulthandler; works while Python code hangs)."""
+        self._process.send_signal(signal.SIGUSR1)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Waits for the end; False if it still runs."""
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+    def end(self, *, grace_s: float) -> None:
+        """Ends it: SIGTERM, and after `grace_s` SIGKILL. Its engines die with it. Can be repeated."""
+        self._process.terminate()
+        if not self.wait(grace_s):
+            self._process.kill()
+            self._process.wait()
+        self._channel.close()
+
+    def log_tail(self) -> str:
+        """The end of the log."""
+        data = self.log_path.read_bytes()[-LOG_TAIL_BYTES:]
+        return data.decode(errors="replace").strip()

@@ -1,0 +1,130 @@
+"""An actor process: `python -m actors.worker FD PARENT_PID`, started by `actors/process.py`.
+
+FD is its end of a socket. The first message on it is an `ActorSpec`; what follows are the acting loop and, from the
+learner, `Stop`. Everything that goes wrong becomes a `Fault` message and a non-zero exit.
+"""
+
+import contextlib
+import ctypes
+import faulthandler
+import os
+import signal
+import socket
+import sys
+import time
+import traceback
+
+from actors.loop import ActorLoop
+from gvz.errors import EngineError, WaitTimeoutError
+from gvz.transport.broadcast import BroadcastReader
+from gvz.transport.channel import Channel
+from gvz.transport.messages import ActorSpec, Fault, Ready, Stop
+from gvz.transport.ring import RingWriter, WriterState
+
+SPACE_TIMEOUT_S = 3600.0
+"""a learner that reads nothing for so long is given up (it compiles, saves and is paused for far shorter times)"""
+PARAMS_TIMEOUT_S = 600.0
+"""likewise for the first version of the parameters"""
+_PR_SET_PDEATHSIG = 1
+
+
+def die_with_parent(parent_pid: int) -> None:
+    """Asks the kernel to kill this process when the thread that started it ends; exits if that has happened."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL) != 0:
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
+    if os.getppid() != parent_pid:
+        sys.exit(1)
+
+
+class Worker:
+    """The life of an actor process after its spec has come."""
+
+    def __init__(self, spec: ActorSpec, channel: Channel):
+        height, width, channels = spec.frame_shape
+        self._spec = spec
+        self._channel = channel
+        self._ring = RingWriter.attach(spec.ring_name, spec.ring_capacity, (height, width, channels))
+        self._board = (
+            BroadcastReader.attach(spec.broadcast_name, spec.num_params, spec.layout_hash) if spec.policy else None
+        )
+        self._loop = ActorLoop(spec, self._ring, channel.send)
+
+    def run(self) -> None:
+        """Plays until told to stop or until the learner's end of the socket is closed."""
+        with contextlib.closing(self._loop):
+            self._loop.begin()
+            if not self._wait_for_params():
+                return
+            self._channel.send(Ready(actor=self._spec.actor, pid=os.getpid()))
+            num_records = len(self._spec.lanes)
+            while self._ring.wait_for_space(num_records, SPACE_TIMEOUT_S, cancelled=self._must_stop):
+                if self._must_stop():
+                    break
+                self._take_params()
+                self._loop.step()
+        self._ring.beat(WriterState.STOPPED)
+
+    def _must_stop(self) -> bool:
+        return any(isinstance(m, Stop) for m in self._channel.receive()) or self._channel.closed
+
+    def _take_params(self) -> bool:
+        """Acts by the newest parameters from now on; False if there are none newer."""
+        header = self._board.read() if self._board else None
+        if self._board is None or header is None:
+            return False
+        self._loop.set_params(self._board.params, header)
+        return True
+
+    def _wait_for_params(self) -> bool:
+        """Waits for the first version; False if told to stop first."""
+        start = time.monotonic()
+        while self._board and not self._take_params():
+            self._ring.beat(WriterState.STARTING)
+            if self._must_stop():
+                return False
+            if time.monotonic() - start > PARAMS_TIMEOUT_S:
+                raise WaitTimeoutError(
+                    f"actor {self._spec.actor} waited {PARAMS_TIMEOUT_S:.0f} s for the learner to publish the first "
+                    "parameters"
+                )
+            time.sleep(0.005)
+        return True
+
+
+def main() -> int:
+    """Entry point of the process; returns its exit code."""
+    descriptor, parent_pid = int(sys.argv[1]), int(sys.argv[2])
+    die_with_parent(parent_pid)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the learner's to decide about
+    signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
+    faulthandler.enable()
+    faulthandler.register(signal.SIGUSR1, all_threads=True)
+    channel = Channel(socket.socket(fileno=descriptor), peer="the learner")
+    spec = channel.wait_for_message()
+    if not isinstance(spec, ActorSpec):
+        raise TypeError(f"first message: got {type(spec).__name__}, want ActorSpec")
+    try:
+        Worker(spec, channel).run()
+    except Exception as error:  # the process boundary: whatever it is, the learner is to hear of it
+        traceback.print_exc()
+        kind = "engine_start" if isinstance(error, EngineError) else "exception"
+        message = f"{type(error).__name__}: {error}"
+        channel.send(
+            Fault(
+                actor=spec.actor,
+                lane=None,
+                kind=kind,
+                message=message,
+                traceback=traceback.format_exc(),
+                fatal=True,
+            )
+        )
+        return 1
+    finally:
+        channel.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

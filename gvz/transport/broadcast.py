@@ -1,0 +1,164 @@
+"""The parameter queue: one writer (the learner), many readers (actors), shared memory.
+
+Imports numpy, the standard library, gvz.errors and this package.
+
+A version of the parameters is one flat float32 vector. The writer fills the slots in turn and never waits; each slot
+has a ticket that is odd while the slot is written, so a reader that was overtaken sees it and takes the newer one.
+The number of publications is raised after a slot is whole: a writer that dies leaves the version before.
+"""
+
+import struct
+import time
+
+import numpy as np
+
+from gvz.errors import WaitTimeoutError
+from gvz.transport.messages import ParamsHeader
+from gvz.transport.segment import Fence, Segment, aligned, hash_layout
+
+_TICKET, _VERSION, _NUM_UPDATES, _EPSILON_BITS, _NUM_WORDS = 0, 1, 2, 3, 8
+"""u64 words before each slot's vector; the payload starts with as many, of which the first counts publications"""
+_READ_TIMEOUT_S = 30.0
+
+
+class _Board:
+    """What both ends share: the mapped arrays."""
+
+    def __init__(self, segment: Segment, num_params: int, num_slots: int, layout_hash: int):
+        payload = segment.payload
+        stride = _slot_bytes(num_params)
+        starts = [8 * _NUM_WORDS + slot * stride for slot in range(num_slots)]
+        self.name = segment.name
+        self.num_params = num_params
+        self.layout_hash = layout_hash
+        self._segment = segment
+        self._count = payload[: 8 * _NUM_WORDS].cast("Q")
+        self._words = [payload[start : start + 8 * _NUM_WORDS].cast("Q") for start in starts]
+        self._vectors = [np.frombuffer(payload, np.float32, num_params, start + 8 * _NUM_WORDS) for start in starts]
+        self._fence = Fence()
+
+    def close(self) -> None:
+        """Lets go of the memory; the writer also removes it. Can be repeated."""
+        self._count = memoryview(bytes(8)).cast("Q")
+        self._words, self._vectors = [], []
+        self._segment.close()
+
+
+class BroadcastWriter(_Board):
+    """The learner's end, which makes the queue."""
+
+    @classmethod
+    def create(cls, name: str, num_params: int, layout_hash: int, *, num_slots: int = 3) -> "BroadcastWriter":
+        """Makes a queue without a version.
+
+        Args:
+            name: name of the segment.
+            num_params: length P of the flat float32 vector.
+            layout_hash: u64 hash of the parameter tree; readers must bring the same.
+            num_slots: versions kept, at least 2. A reader is overtaken only when `num_slots - 1` publications begin
+                within its one copy.
+
+        Raises:
+            ResourceError: /dev/shm has no room.
+        """
+        if num_slots < 2:
+            raise ValueError(f"num_slots: got {num_slots}, want at least 2 (one is read while one is written)")
+        segment = Segment.create(
+            name,
+            broadcast_bytes(num_params, num_slots),
+            layout_hash=hash_layout("broadcast", num_params, num_slots, layout_hash),
+        )
+        board = cls(segment, num_params, num_slots, layout_hash)
+        for words in (board._count, *board._words):
+            for index in range(_NUM_WORDS):
+                words[index] = 0
+        return board
+
+    def publish(self, params: np.ndarray, header: ParamsHeader) -> None:
+        """Makes `params` float32[P] the newest version. Never waits.
+
+        Raises:
+            ValueError: another length, dtype or tree than the queue was made for.
+        """
+        if params.shape != (self.num_params,) or params.dtype != np.float32:
+            raise ValueError(
+                f"broadcast {self.name}: got {params.dtype}{list(params.shape)}, want float32[{self.num_params}]"
+            )
+        if header.layout_hash != self.layout_hash:
+            raise ValueError(
+                f"broadcast {self.name}: got layout hash {header.layout_hash:#x}, want {self.layout_hash:#x}"
+            )
+        count = self._count[0]
+        words = self._words[count % len(self._words)]
+        words[_TICKET] |= 1
+        self._fence()
+        self._vectors[count % len(self._words)][:] = params
+        words[_VERSION], words[_NUM_UPDATES] = header.version, header.num_updates
+        words[_EPSILON_BITS] = struct.unpack("<Q", struct.pack("<d", header.epsilon))[0]
+        self._fence()
+        words[_TICKET] += 1
+        self._count[0] = count + 1
+
+
+class BroadcastReader(_Board):
+    """An actor's end. Takes whole versions into `params`, a buffer of its own."""
+
+    def __init__(self, segment: Segment, num_params: int, num_slots: int, layout_hash: int):
+        super().__init__(segment, num_params, num_slots, layout_hash)
+        self.params = np.empty(num_params, np.float32)
+        self._seen = 0  # publications
+
+    @classmethod
+    def attach(cls, name: str, num_params: int, layout_hash: int, *, num_slots: int = 3) -> "BroadcastReader":
+        """Maps the queue.
+
+        Raises:
+            TransportError: no such queue, or it was made for other parameters.
+        """
+        segment = Segment.attach(
+            name,
+            broadcast_bytes(num_params, num_slots),
+            layout_hash=hash_layout("broadcast", num_params, num_slots, layout_hash),
+        )
+        return cls(segment, num_params, num_slots, layout_hash)
+
+    def read(self) -> ParamsHeader | None:
+        """Copies the newest version into `params` if it is newer than the last one read; None if there is none.
+
+        Raises:
+            WaitTimeoutError: overtaken by the writer again and again.
+        """
+        start = time.monotonic()
+        while (count := self._count[0]) != self._seen:
+            slot = (count - 1) % len(self._words)
+            words = self._words[slot]
+            self._fence()
+            ticket = words[_TICKET]
+            self._fence()
+            np.copyto(self.params, self._vectors[slot])
+            epsilon = struct.unpack("<d", struct.pack("<Q", words[_EPSILON_BITS]))[0]
+            header = ParamsHeader(
+                version=words[_VERSION],
+                num_updates=words[_NUM_UPDATES],
+                epsilon=epsilon,
+                layout_hash=self.layout_hash,
+            )
+            self._fence()
+            if ticket % 2 == 0 and words[_TICKET] == ticket:
+                self._seen = count
+                return header
+            if time.monotonic() - start > _READ_TIMEOUT_S:
+                raise WaitTimeoutError(
+                    f"broadcast {self.name}: reader waited {_READ_TIMEOUT_S:.0f} s for a whole version; the writer "
+                    "overtook every copy: raise learner.publish_period_updates"
+                )
+        return None
+
+
+def broadcast_bytes(num_params: int, num_slots: int = 3) -> int:
+    """Bytes of shared memory of a queue, without the segment's header."""
+    return 8 * _NUM_WORDS + num_slots * _slot_bytes(num_params)
+
+
+def _slot_bytes(num_params: int) -> int:
+    return 8 * _NUM_WORDS + aligned(4 * num_params)

@@ -1,0 +1,291 @@
+"""A ring of step records in shared memory: one writer (an actor), one reader (the learner).
+
+Imports numpy, the standard library, gvz.errors and this package.
+
+Layout of the payload: control words, then STEP_DTYPE[capacity], then uint8[capacity, H, W, C]. Records and frames
+stand side by side so that a run of frames is one contiguous copy. Record number s lies in slot s mod capacity;
+`published` and `consumed` count records since the ring was made and never go back. Each is written by one side only,
+after what it stands for: a reader never sees a record that is not whole, a writer never fills a slot that is not
+free, and the successor of a dead writer goes on at `published`.
+"""
+
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from gvz.errors import TransportError, WaitTimeoutError
+from gvz.transport.messages import STEP_DTYPE, StepBlock
+from gvz.transport.segment import Fence, Segment, aligned, hash_layout
+
+# u64 control words; the writer's and the reader's stand in cache lines of their own
+_PUBLISHED, _HEARTBEAT_NS, _STATE, _PID, _WAITED_NS, _CONSUMED, _NUM_WORDS = 0, 1, 2, 3, 4, 8, 16
+_UNPUBLISHED = 2**64 - 1
+"""sequence number of a slot that is being filled"""
+_PAD = (0,) * STEP_DTYPE["pad"].shape[0]
+_FIRST_SLEEP_S, _LONGEST_SLEEP_S = 20e-6, 1e-3
+
+
+class WriterState(IntEnum):
+    """What the writer is at. A silent writer is stuck in any of them; a waiting one keeps its heart beating."""
+
+    ABSENT = 0
+    STARTING = 1
+    ACTING = 2
+    RESETTING = 3
+    WAITING_FOR_SPACE = 4
+    STOPPED = 5
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class WriterStatus:
+    """What the writer says of itself."""
+
+    pid: int
+    state: WriterState
+    heartbeat_ns: int
+    """`time.monotonic_ns()` of the writer's last sign of life; 0 before the first"""
+    waited_for_space_s: float
+    """seconds writers of this ring have waited for the reader"""
+
+
+class _Ring:
+    """What both ends share: the mapped arrays."""
+
+    def __init__(self, segment: Segment, capacity: int, frame_shape: tuple[int, int, int]):
+        steps_at, frames_at, _ = _offsets(capacity, frame_shape)
+        payload = segment.payload
+        self.name = segment.name
+        self.capacity = capacity
+        self.frame_shape = frame_shape
+        self._segment = segment
+        self._words = payload[: 8 * _NUM_WORDS].cast("Q")
+        self._steps = np.frombuffer(payload, STEP_DTYPE, capacity, steps_at)
+        self._sequence = self._steps["sequence"]
+        self._frames = np.frombuffer(payload, np.uint8, capacity * math.prod(frame_shape), frames_at)
+        self._frames = self._frames.reshape(capacity, *frame_shape)
+        self._fence = Fence()
+
+    def _num_unread(self) -> int:
+        published, consumed = self._words[_PUBLISHED], self._words[_CONSUMED]
+        if not 0 <= published - consumed <= self.capacity:
+            raise TransportError(
+                f"ring {self.name}: {published} records published and {consumed} consumed do not fit a capacity of "
+                f"{self.capacity}; its control words are damaged"
+            )
+        return published - consumed
+
+    def close(self) -> None:
+        """Lets go of the memory; the end that created the ring also removes it. Can be repeated."""
+        self._words = memoryview(bytes(8 * _NUM_WORDS)).cast("Q")
+        self._steps, self._frames = np.empty(0, STEP_DTYPE), np.empty(0, np.uint8)
+        self._sequence = self._steps["sequence"]
+        self._segment.close()
+
+
+class RingReader(_Ring):
+    """The learner's end, which makes the ring and outlives its writers."""
+
+    @classmethod
+    def create(cls, name: str | None, capacity: int, frame_shape: tuple[int, int, int]) -> "RingReader":
+        """Makes an empty ring.
+
+        Args:
+            name: name of the segment; None for a ring within this process.
+            capacity: records, at least 1.
+            frame_shape: (H, W, C) of a frame, uint8.
+
+        Raises:
+            ResourceError: /dev/shm has no room.
+        """
+        segment = Segment.create(
+            name, ring_bytes(capacity, frame_shape), layout_hash=_layout_hash(capacity, frame_shape)
+        )
+        ring = cls(segment, capacity, frame_shape)
+        for index in range(_NUM_WORDS):
+            ring._words[index] = 0
+        return ring
+
+    def writer(self) -> "RingWriter":
+        """The writing end for a writer in this process."""
+        return RingWriter(self._segment, self.capacity, self.frame_shape)
+
+    @property
+    def num_unread(self) -> int:
+        """Records published and not yet read.
+
+        Raises:
+            TransportError: the control words contradict each other.
+        """
+        return self._num_unread()
+
+    def peek(self, max_records: int) -> StepBlock:
+        """Copies up to `max_records` of the oldest unread records, without waiting; they stay unread.
+
+        Raises:
+            TransportError: a record is missing, repeated or overwritten while being read.
+        """
+        first = self._words[_CONSUMED]
+        count = min(self._num_unread(), max_records)
+        self._fence()
+        block = StepBlock(steps=self._copy(self._steps, first, count), frames=self._copy(self._frames, first, count))
+        self._fence()
+        expected = np.arange(first, first + count, dtype=np.uint64)
+        # in the copy: every record is the one it should be; in the ring, afterwards: none was touched meanwhile
+        for found in (block.steps["sequence"], self._copy(self._sequence, first, count)):
+            wrong = np.flatnonzero(found != expected)
+            if wrong.size:
+                at = int(wrong[0])
+                raise TransportError(
+                    f"ring {self.name}: got record {int(found[at])} where {int(expected[at])} should be; "
+                    "records were lost, repeated or torn"
+                )
+        return block
+
+    def read(self, max_records: int) -> StepBlock:
+        """As `peek`, and gives the space back to the writer. The block may be empty."""
+        block = self.peek(max_records)
+        self._words[_CONSUMED] += len(block)
+        return block
+
+    def writer_status(self) -> WriterStatus:
+        """The writer's sign of life.
+
+        Raises:
+            TransportError: an unknown state.
+        """
+        state = self._words[_STATE]
+        if state not in WriterState._value2member_map_:
+            raise TransportError(f"ring {self.name}: got writer state {state}, want 0..{max(WriterState)}")
+        return WriterStatus(
+            pid=self._words[_PID],
+            state=WriterState(state),
+            heartbeat_ns=self._words[_HEARTBEAT_NS],
+            waited_for_space_s=self._words[_WAITED_NS] / 1e9,
+        )
+
+    def _copy(self, array: np.ndarray, first: int, count: int) -> np.ndarray:
+        """Owned copy of `count` entries from record number `first` on; at most two contiguous runs."""
+        start = first % self.capacity
+        before_wrap = min(count, self.capacity - start)
+        copy = np.empty((count, *array.shape[1:]), array.dtype)
+        copy[:before_wrap] = array[start : start + before_wrap]
+        copy[before_wrap:] = array[: count - before_wrap]
+        return copy
+
+
+class RingWriter(_Ring):
+    """The actor's end. `reserve`, fill the frame in place, `commit`."""
+
+    def __init__(self, segment: Segment, capacity: int, frame_shape: tuple[int, int, int]):
+        super().__init__(segment, capacity, frame_shape)
+        self._next = self._words[_PUBLISHED]
+        self._words[_PID] = os.getpid()
+
+    @classmethod
+    def attach(cls, name: str, capacity: int, frame_shape: tuple[int, int, int]) -> "RingWriter":
+        """Becomes the writer; goes on after the last record that a predecessor published.
+
+        Raises:
+            TransportError: no such ring, or it has another layout.
+        """
+        segment = Segment.attach(
+            name, ring_bytes(capacity, frame_shape), layout_hash=_layout_hash(capacity, frame_shape)
+        )
+        return cls(segment, capacity, frame_shape)
+
+    @property
+    def free(self) -> int:
+        """Records that fit without waiting."""
+        return self.capacity - self._num_unread()
+
+    def reserve(self) -> np.ndarray:
+        """View uint8[H, W, C] of the next slot's frame, to be filled."""
+        assert self.free > 0, f"ring {self.name}: full; wait_for_space first"
+        slot = self._next % self.capacity
+        self._sequence[slot] = _UNPUBLISHED
+        self._fence()
+        return self._frames[slot]
+
+    def commit(
+        self,
+        *,
+        episode: int,
+        params_version: int,
+        action: int,
+        reward: float,
+        lane: int,
+        task: int,
+        first: bool,
+        terminated: bool,
+        truncated: bool,
+    ) -> None:
+        """Publishes the reserved slot as the next record; the fields are those of STEP_DTYPE."""
+        ends = (first, terminated, truncated)
+        self._steps[self._next % self.capacity] = (
+            self._next,
+            episode,
+            params_version,
+            action,
+            reward,
+            lane,
+            task,
+            *ends,
+            _PAD,
+        )  # one assignment: 1 us
+        self._fence()
+        self._next += 1
+        self._words[_PUBLISHED] = self._next
+
+    def beat(self, state: WriterState) -> None:
+        """A sign of life."""
+        self._words[_STATE] = state
+        self._words[_HEARTBEAT_NS] = time.monotonic_ns()
+
+    def wait_for_space(
+        self, num_records: int, timeout_s: float, *, cancelled: Callable[[], bool] = lambda: False
+    ) -> bool:
+        """Waits until `num_records` fit, with the heart beating; the time is counted in the ring.
+
+        Returns:
+            False if `cancelled()` became true first.
+
+        Raises:
+            WaitTimeoutError: the reader made no room in time.
+        """
+        if self.free >= num_records:
+            return True
+        start_ns, sleep_s = time.monotonic_ns(), _FIRST_SLEEP_S
+        waited_before_ns = self._words[_WAITED_NS]
+        while not (done := self.free >= num_records) and not cancelled():
+            self.beat(WriterState.WAITING_FOR_SPACE)
+            time.sleep(sleep_s)
+            sleep_s = min(2 * sleep_s, _LONGEST_SLEEP_S)
+            waited_ns = time.monotonic_ns() - start_ns
+            self._words[_WAITED_NS] = waited_before_ns + waited_ns
+            if waited_ns > timeout_s * 1e9:
+                raise WaitTimeoutError(
+                    f"ring {self.name}: writer (pid {os.getpid()}) waited {waited_ns / 1e9:.1f} s for the learner to "
+                    f"read; {self.free} of {self.capacity} records are free, {num_records} are wanted"
+                )
+        return done
+
+
+def ring_bytes(capacity: int, frame_shape: tuple[int, int, int]) -> int:
+    """Bytes of shared memory of a ring, without the segment's header."""
+    return _offsets(capacity, frame_shape)[2]
+
+
+def _offsets(capacity: int, frame_shape: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Where in the payload the records start, where the frames start, and where all ends; bytes."""
+    steps_at = aligned(8 * _NUM_WORDS)
+    frames_at = steps_at + aligned(capacity * STEP_DTYPE.itemsize)
+    return steps_at, frames_at, frames_at + capacity * math.prod(frame_shape)
+
+
+def _layout_hash(capacity: int, frame_shape: tuple[int, int, int]) -> int:
+    return hash_layout("ring", STEP_DTYPE.descr, capacity, tuple(frame_shape))
