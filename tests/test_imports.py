@@ -9,13 +9,20 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 TIER_0 = ("gvz", "gvz.errors", "gvz.janitor", "gvz.specs", "gvz.registry", "gvz.transport")
-TIER_1 = (
-    "gvz.engine",
-    "gvz.engine_wrapper",
-    "gvz.env",
-    "gvz.tasks",
-    "gvz.scenarios",
-    "gvz.wad",
+TIER_3 = (
+    "configs",
+    "gvz.assemble",
+    "gvz.bill",
+    "gvz.config",
+    "gvz.evaluation",
+    "gvz.experiments",
+    "gvz.launch",
+    "gvz.progress",
+    "gvz.reports",
+    "gvz.rundir",
+    "gvz.stop",
+    "gvz.telemetry",
+    "gvz.train",
 )
 BENCHMARK_MUST_NOT = ("jax", "flax", "optax", "chex", "orbax", "actors", "learner")
 OURS = ("gvz", "actors", "learner", "configs")
