@@ -70,7 +70,7 @@ class Conv(nn.Module):
         k = self.kernel_size
         kernel = self.param("kernel", nn.initializers.he_uniform(), (k, k, x.shape[-1], self.features))
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
-        kernel, bias = kernel.astype(x.dtype), bias.astype(x.dtype)
+        kernel, bias = kernel.astype(x.dtype), bias.astype(x.dtype)[None, None, None]
         if self.form != "auto":
             return conv2d(x, kernel, self.stride, self.form) + bias
         y = jax.lax.platform_dependent(

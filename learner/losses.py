@@ -120,7 +120,7 @@ def categorical_q_learning(
     probabilities_t = jax.nn.softmax(logits_t_value)
     selector = expectation(probabilities_t, atoms) if q_t_selector is None else q_t_selector
     p_t = take_action(probabilities_t, jnp.argmax(selector, axis=-1))  # [B, N]
-    target = project(r_t[:, None] + discount_t[:, None] * atoms, p_t, atoms)
+    target = project(r_t[:, None] + discount_t[:, None] * atoms[None], p_t, atoms)
     target = jax.lax.stop_gradient(target)
     log_p_tm1 = jax.nn.log_softmax(take_action(logits_tm1, a_tm1))
     cross_entropy = -jnp.sum(target * log_p_tm1, axis=-1)
@@ -130,4 +130,4 @@ def categorical_q_learning(
 
 def expectation(probabilities: Float[Array, "*batch N"], atoms: Float[Array, "N"]) -> Float[Array, "*batch"]:
     """Mean of a distribution on the atoms: Q(s, a) = E[Z(s, a)]. Source: thesis 4.2.6."""
-    return jnp.sum(probabilities * atoms, axis=-1)
+    return jnp.einsum("...n,n->...", probabilities, atoms, precision=jax.lax.Precision.HIGHEST)

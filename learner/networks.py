@@ -48,19 +48,19 @@ class NoisyDense(nn.Module):
         """
         shape = (x.shape[-1], self.features)
         kernel = self.param("kernel", nn.initializers.he_uniform(), shape).astype(x.dtype)
-        bias = self.param("bias", nn.initializers.zeros, shape[1:]).astype(x.dtype)
+        bias = self.param("bias", nn.initializers.zeros, shape[1:]).astype(x.dtype)[None]
         y = x @ kernel + bias
         if self.noisy == "off":
             return y
         sigma = nn.initializers.constant(self.sigma)
         kernel_sigma = self.param("kernel_sigma", sigma, shape).astype(x.dtype)
-        bias_sigma = self.param("bias_sigma", sigma, shape[1:]).astype(x.dtype)
+        bias_sigma = self.param("bias_sigma", sigma, shape[1:]).astype(x.dtype)[None]
         if key is None:
             return y
         key_in, key_out = jax.random.split(key)
         if self.noisy == "independent":
             eps_w = jax.random.normal(key_in, shape, x.dtype)
-            eps_b = jax.random.normal(key_out, shape[1:], x.dtype)
+            eps_b = jax.random.normal(key_out, (1, self.features), x.dtype)
             return y + x @ (kernel_sigma * eps_w) + bias_sigma * eps_b
         rows = x.shape[0] if noise_per_sample else 1
         eps_in = _signed_sqrt(jax.random.normal(key_in, (rows, shape[0]), x.dtype))
