@@ -1,4 +1,4 @@
-"""What the installed engine brings along: its files and its actor classes.
+"""What the installed engine brings along: base maps, actor classes, textures.
 
 Read from the vizdoom package's data files; its compiled module is never imported.
 """
@@ -10,6 +10,8 @@ from pathlib import Path
 
 from gvz.errors import WadError
 from gvz.wad.decorate import declared_actors
+from gvz.wad.lumps import read_wad
+from gvz.wad.textures import flats, wall_textures
 
 
 @cache
@@ -25,6 +27,19 @@ def engine_directory() -> Path:
     return Path(spec.submodule_search_locations[0])
 
 
+def scenario_wad(file_name: str) -> bytes:
+    """The bytes of one of the engine's own scenarios, such as `defend_the_center.wad`.
+
+    Raises:
+        WadError: there is none of that name; lists those there are.
+    """
+    directory = engine_directory() / "scenarios"
+    known = sorted(path.name for path in directory.glob("*.wad"))
+    if file_name not in known:
+        raise WadError(f"scenario WAD: got {file_name!r}, want one of {', '.join(known)}")
+    return (directory / file_name).read_bytes()
+
+
 @cache
 def stock_actors() -> frozenset[str]:
     """Names of the actor classes the engine has for Doom, from the DECORATE text in its vizdoom.pk3.
@@ -38,3 +53,10 @@ def stock_actors() -> frozenset[str]:
             if name.startswith(("actors/doom/", "actors/shared/", "actors/actor.txt")) and name.endswith(".txt")
         ]
     return frozenset(name for text in texts for name in declared_actors(text))
+
+
+@cache
+def stock_textures() -> frozenset[str]:
+    """Upper-case names of all wall textures and flats of freedoom2.wad, the resources every game is played with."""
+    lumps = read_wad((engine_directory() / "freedoom2.wad").read_bytes())
+    return wall_textures(lumps) | flats(lumps)

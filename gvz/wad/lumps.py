@@ -1,0 +1,141 @@
+"""WAD files: a header, lumps of bytes, a directory of their names. Works on bytes, never on files.
+
+Written here in place of omgifol, because that library collapses lumps of one name, writes what is added to a map
+behind its ENDMAP (where the engine does not look), opens files for writing, and takes damaged bytes for good ones.
+Imports gvz.errors and the standard library.
+"""
+
+import re
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gvz.errors import WadError
+
+HEADER = struct.Struct("<4sii")
+ENTRY = struct.Struct("<ii8s")
+_NAME = re.compile(r"[!-~]{1,8}")
+
+
+@dataclass(frozen=True, slots=True)
+class Lump:
+    """A named piece of a WAD; names are upper case, and need not be unique."""
+
+    name: str
+    data: bytes
+
+
+def read_wad(data: bytes) -> list[Lump]:
+    """Reads the lumps of a WAD in directory order.
+
+    Raises:
+        WadError: the bytes are not a whole WAD; names the lump, the offset, and what is wrong there.
+    """
+    if len(data) < HEADER.size:
+        raise WadError(f"WAD: got {len(data)} bytes, want at least a header of {HEADER.size}")
+    magic, count, directory = HEADER.unpack_from(data)
+    if magic not in (b"IWAD", b"PWAD"):
+        raise WadError(f"WAD offset 0: got {magic!r}, want b'IWAD' or b'PWAD'")
+    if count < 0 or not HEADER.size <= directory <= len(data) - count * ENTRY.size:
+        raise WadError(
+            f"WAD offset 4: got a directory of {count} lumps at {directory}, want one inside the {len(data)} bytes"
+        )
+    lumps = [_read_lump(data, number, directory + number * ENTRY.size) for number in range(count)]
+    # Lumps that share bytes would let a small file name more data than fits into memory.
+    total = sum(len(lump.data) for lump in lumps)
+    if total > len(data):
+        raise WadError(f"WAD: got lumps of {total} bytes in a file of {len(data)}, want lumps that do not overlap")
+    return lumps
+
+
+def _read_lump(data: bytes, number: int, entry: int) -> Lump:
+    offset, size, raw_name = ENTRY.unpack_from(data, entry)
+    name = raw_name.split(b"\0")[0].decode("latin-1").upper()
+    if not _NAME.fullmatch(name):
+        raise WadError(f"WAD offset {entry}: got the name {raw_name!r} of lump {number}, want 1 to 8 ASCII characters")
+    if size < 0 or (size and not HEADER.size <= offset <= len(data) - size):
+        raise WadError(
+            f"WAD offset {entry}: got lump {number} ({name}) of {size} bytes at {offset}, "
+            f"want it inside the {len(data)} bytes"
+        )
+    return Lump(name, data[offset : offset + size])
+
+
+def write_wad(lumps: Sequence[Lump]) -> bytes:
+    """Writes a PWAD; the same lumps give the same bytes.
+
+    Raises:
+        WadError: a name that a directory cannot hold.
+    """
+    body, directory = bytearray(), bytearray()
+    for lump in lumps:
+        if not _NAME.fullmatch(lump.name) or lump.name != lump.name.upper():
+            raise WadError(f"lump name: got {lump.name!r}, want 1 to 8 upper-case ASCII characters")
+        directory += ENTRY.pack(HEADER.size + len(body), len(lump.data), lump.name.encode("ascii"))
+        body += lump.data
+    return HEADER.pack(b"PWAD", len(lumps), HEADER.size + len(body)) + bytes(body + directory)
+
+
+def read_maps(lumps: Sequence[Lump]) -> dict[str, dict[str, bytes]]:
+    """The UDMF maps of a WAD: map name -> lump name -> data.
+
+    Editors leave several lumps of one name behind; the engine takes the last one before ENDMAP, and so does this.
+
+    Raises:
+        WadError: a map has no ENDMAP (the engine would refuse to start), or its name stands twice.
+    """
+    maps: dict[str, dict[str, bytes]] = {}
+    for i, lump in enumerate(lumps[:-1]):
+        if lumps[i + 1].name != "TEXTMAP":
+            continue
+        end = next((j for j in range(i, len(lumps)) if lumps[j].name == "ENDMAP"), None)
+        if end is None:
+            raise WadError(f"map {lump.name}: got the end of the WAD, want an ENDMAP lump")
+        if lump.name in maps:
+            raise WadError(f"map {lump.name}: got it twice, want it once")
+        maps[lump.name] = {other.name: other.data for other in lumps[i + 1 : end]}
+    return maps
+
+
+def write_map_wad(
+    *,
+    textmap: str,
+    behavior: bytes,
+    scripts: str,
+    decorate: str = "",
+    mapinfo: str = "",
+    map_name: str = "MAP01",
+) -> bytes:
+    """Writes a WAD with one map; the same arguments give the same bytes.
+
+    There are no nodes (ZNODES): the engine builds them itself in a few milliseconds, and stale ones would be wrong.
+
+    Args:
+        textmap: UDMF text of the map.
+        behavior: compiled scripts.
+        scripts: their source, for whoever opens the map in an editor; the engine does not read it.
+        decorate: actor definitions; no lump if empty.
+        mapinfo: MAPINFO text; no lump if empty.
+        map_name: name of the map.
+
+    Raises:
+        WadError: a text holds a character beyond Latin-1, or `map_name` is no lump name.
+    """
+    lumps = [
+        *([Lump("DECORATE", _encode("DECORATE", decorate))] if decorate else []),
+        *([Lump("MAPINFO", _encode("MAPINFO", mapinfo))] if mapinfo else []),
+        Lump(map_name, b""),
+        Lump("TEXTMAP", _encode("TEXTMAP", textmap)),
+        Lump("BEHAVIOR", behavior),
+        Lump("SCRIPTS", _encode("SCRIPTS", scripts)),
+        Lump("ENDMAP", b""),
+    ]
+    return write_wad(lumps)
+
+
+def _encode(name: str, text: str) -> bytes:
+    try:
+        return text.encode("latin-1")
+    except UnicodeEncodeError as error:
+        line = text.count("\n", 0, error.start) + 1
+        raise WadError(f"{name} line {line}: got the character {text[error.start]!r}, want Latin-1") from error

@@ -1,0 +1,88 @@
+"""Names of textures: what a WAD has, what a map uses. Imports gvz.errors, gvz.wad.lumps, gvz.wad.udmf."""
+
+import difflib
+import struct
+from collections.abc import Collection, Sequence
+
+from gvz.errors import WadError
+from gvz.wad.lumps import Lump
+from gvz.wad.udmf import UdmfMap
+
+WALL_FIELDS = ("texturetop", "texturemiddle", "texturebottom")
+PLANE_FIELDS = ("texturefloor", "textureceiling")
+NO_TEXTURE = "-"
+
+
+def wall_textures(lumps: Sequence[Lump]) -> frozenset[str]:
+    """Names in the TEXTURE1 and TEXTURE2 lumps.
+
+    The first name of TEXTURE1 is left out: the engine takes it for "no texture" and shows nothing.
+
+    Raises:
+        WadError: a texture lump is damaged.
+    """
+    names: set[str] = set()
+    for lump in lumps:
+        if lump.name in ("TEXTURE1", "TEXTURE2"):
+            found = _texture_names(lump)
+            names.update(found[1:] if lump.name == "TEXTURE1" else found)
+    return frozenset(names)
+
+
+def _texture_names(lump: Lump) -> list[str]:
+    data = lump.data
+    count = struct.unpack_from("<i", data)[0] if len(data) >= 4 else -1
+    if not 0 <= 4 + 4 * count <= len(data):
+        raise WadError(f"{lump.name}: got {count} textures in {len(data)} bytes, want their offsets to fit")
+    names = []
+    for offset in struct.unpack_from(f"<{count}i", data, 4):
+        if not 0 <= offset <= len(data) - 8:
+            raise WadError(f"{lump.name}: got a texture at {offset}, want it inside the {len(data)} bytes")
+        names.append(data[offset : offset + 8].split(b"\0")[0].decode("latin-1").upper())
+    return names
+
+
+def flats(lumps: Sequence[Lump]) -> frozenset[str]:
+    """Names of the floor and ceiling textures: the lumps between F_START and F_END."""
+    names: set[str] = set()
+    inside = False
+    for lump in lumps:
+        if lump.name in ("F_START", "FF_START", "F_END", "FF_END"):
+            inside = lump.name.endswith("START")
+        elif inside and lump.data:  # an empty lump is a marker of a sub-section
+            names.add(lump.name)
+    return frozenset(names)
+
+
+def used_textures(udmf_map: UdmfMap) -> dict[str, str]:
+    """Every texture name of the map, upper case -> the first place it is used, such as `sidedef 3 texturemiddle`."""
+    used: dict[str, str] = {}
+    for kind, blocks, fields in (
+        ("sidedef", udmf_map.sidedefs, WALL_FIELDS),
+        ("sector", udmf_map.sectors, PLANE_FIELDS),
+    ):
+        for number, block in enumerate(blocks):
+            for name in fields:
+                texture = str(block.get(name, NO_TEXTURE)).upper()
+                if texture != NO_TEXTURE:
+                    used.setdefault(texture, f"{kind} {number} {name}")
+    return used
+
+
+def check_textures(udmf_map: UdmfMap, textures: Collection[str]) -> None:
+    """Refuses a map that uses a texture which is not there; the engine would show a checkerboard and go on.
+
+    Walls may use flats, floors and ceilings wall textures: the engine looks in both.
+
+    Args:
+        udmf_map: the map.
+        textures: upper-case names of all wall textures and flats.
+
+    Raises:
+        WadError: names the texture, its place, and the nearest name there is.
+    """
+    for texture, place in used_textures(udmf_map).items():
+        if texture not in textures:
+            near = difflib.get_close_matches(texture, textures, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise WadError(f"{place}: got the unknown texture {texture!r}, want a wall texture or flat{hint}")
