@@ -1,4 +1,4 @@
-"""What a scenario, an attribute and a task are. Imports gvz.errors, gvz.specs, gvz.scenarios.rewards, stdlib.
+"""What a scenario, an attribute and a task are. Imports gvz.wad, gvz.scenarios.rewards and tier 0.
 
 A scenario is data: a base map, a script template and what they hold by default (`Content`). An attribute is the
 `Content` it changes. A task is a scenario with a set of attributes. `gvz.scenarios.compiler` makes a map of it.
@@ -13,15 +13,25 @@ from typing import Any, Literal
 from gvz.errors import TaskError
 from gvz.scenarios.rewards import Reward, Rewarder
 from gvz.specs import Profile
+from gvz.wad.udmf import UdmfMap
 
-Value = int | float | str | tuple[float, float] | tuple[str, ...]
-"""A value in a script. int: ACS integer; float: fixed point; (low, high): drawn uniformly each time; str: verbatim
-ACS expression; a tuple of names: initializer of a string array."""
+
+@dataclass(frozen=True, slots=True)
+class Uniform:
+    """A number drawn uniformly, ends included, whenever the script comes to it."""
+
+    low: float
+    high: float
+
+
+Value = int | float | str | Uniform | tuple[str | float, ...]
+"""A value in a script. int: ACS integer; float: fixed point; str: verbatim ACS expression; tuple: initializer of an
+array, whose strings are quoted."""
 
 BOOKKEEPING: Mapping[str, str] = MappingProxyType(
     {
         "PLAYER_KILLS": "USER1",  # enemies killed by the agent itself; KILLCOUNT also counts infighting
-        "SPAWNED": "USER2",  # enemies, or kits, put on the map so far
+        "SPAWNED": "USER2",  # enemies or kits put on the map so far
         "KITS_TAKEN": "USER3",
         "POISONS_TAKEN": "USER4",
         "MAP_MAGIC": "USER60",  # `CompiledTask.map_magic`: proves that the right map runs
@@ -65,7 +75,7 @@ class Content:
     things: Mapping[str, tuple[Thing, ...]] = field(default_factory=dict)
     """things added, by base map (a coordinate means something on one map only)"""
     parameters: Mapping[str, Value] = field(default_factory=dict)
-    """values of the `$names` of the scenario's script"""
+    """values of the `$names` of the scenario's script; an array `x` also defines its length, `num_x`"""
     entity: Mapping[str, Value] = field(default_factory=dict)
     """APROP name -> value, set on every enemy or kit when it spawns"""
     agent: Mapping[str, Value] = field(default_factory=dict)
@@ -112,7 +122,7 @@ class Attribute:
     """the thesis's shorter names in combined tasks ("fast+flying")"""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Scenario:
     """A map, an objective, a reward and buttons; the first extension point of the benchmark."""
 
@@ -135,10 +145,12 @@ class Scenario:
     """the named tasks, in the thesis's order"""
     splits: Mapping[Split, tuple[str, ...]]
     """training sets of 1, 4 and 8 tasks, and the test set"""
-    draw_map: Callable[[Any], Any] | None = None
-    """changes the geometry of the base map's gvz.wad.udmf map"""
+    draw_map: Callable[[UdmfMap], None] | None = None
+    """changes the base map in place, before textures and things"""
 
     buttons: tuple[str, ...]
+    combination_buttons: tuple[str, ...] | None = None
+    """the buttons that action set `combinations` combines; default all of them"""
     game_variables: tuple[str, ...]
     """what the agent may see beside pixels"""
     metric: Literal["frames_alive", "kills"]
@@ -149,6 +161,9 @@ class Scenario:
     rewards: Mapping[str, Reward]
     return_range: Callable[[float], tuple[float, float]]
     """f(discount) -> (v_min, v_max): range of discounted returns with the default weights"""
+
+    def __repr__(self) -> str:
+        return f"Scenario({self.id!r})"
 
     @property
     def base_wad(self) -> str:

@@ -11,7 +11,7 @@ Metric: frames alive, at most the time-out.
 Attributes: thesis B.1, below. Tasks: thesis Table A.1.
 """
 
-from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing
+from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform
 from gvz.scenarios.rewards import Reward, death, fell, rose
 
 WAD = "defend_the_center.wad"
@@ -128,7 +128,7 @@ SCENARIO = Scenario(
         },
         actors={"MarineChainsawVzd": COUNTED_MARINE},
     ),
-    levdoom=Content(parameters={"respawn_angle": (0.0, 1.0)}),
+    levdoom=Content(parameters={"respawn_angle": Uniform(0.0, 1.0)}),
     attributes=(
         Attribute(name="gore", groups=("decorations",), content=Content(things={WAD: _gore()})),
         Attribute(
@@ -152,7 +152,7 @@ SCENARIO = Scenario(
             name="resized_enemies",
             groups=("entity_size",),
             aliases=("resized",),
-            content=Content(entity={"ScaleX": (0.3, 3.0), "ScaleY": (0.3, 3.0)}),
+            content=Content(entity={"ScaleX": Uniform(0.3, 3.0), "ScaleY": Uniform(0.3, 3.0)}),
             levdoom=SLOW_RESPAWN,
         ),
         Attribute(

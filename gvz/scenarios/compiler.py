@@ -1,0 +1,207 @@
+"""Task -> WAD file: content of a task, its map, script and classes, and the cache. Imports gvz.scenarios.base, gvz.wad.
+
+A WAD is always built anew (a tenth of a second) and kept in the user's cache directory under the hash of its
+bytes, so a cached file is either what this version of the code builds, or not found. Nothing here starts an engine.
+"""
+
+import hashlib
+import os
+import struct
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from string import Template
+
+from platformdirs import user_cache_path
+
+from gvz.errors import ResourceError, TaskError
+from gvz.scenarios.base import Content, Task, Textures, Uniform, Value, nearest
+from gvz.specs import Profile
+from gvz.wad.acs import compile_acs
+from gvz.wad.decorate import declared_actors
+from gvz.wad.lumps import read_maps, read_wad, write_map_wad
+from gvz.wad.stock import engine_directory
+from gvz.wad.udmf import UdmfMap, make_thing, parse_textmap, write_textmap
+
+MAP_NAME = "MAP01"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CompiledTask:
+    """A task's WAD file, ready to be loaded."""
+
+    task: Task
+    profile: Profile
+    wad_path: Path
+    map_magic: int
+    """what the running map's MAP_MAGIC variable must read"""
+    map_name: str = MAP_NAME
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class MapSource:
+    """The text of everything in a task's WAD."""
+
+    textmap: str
+    script: str
+    decorate: str
+    map_magic: int
+
+
+@cache
+def compile_task(task: Task, profile: Profile = "thesis") -> CompiledTask:
+    """Builds a task's WAD and puts it into the cache directory. Safe for many processes at once.
+
+    The directory is $GVZ_CACHE_DIR, or else the user's cache directory.
+
+    Raises:
+        TaskError: the task names a texture the game does not have.
+        AcsError, WadError: script or base map are not what they should be.
+        ResourceError: the cache directory cannot be written.
+    """
+    source = map_source(task, profile)
+    path = _cached(build_wad(source))
+    return CompiledTask(task=task, profile=profile, wad_path=path, map_magic=source.map_magic)
+
+
+def task_content(task: Task, profile: Profile) -> Content:
+    """What a task's map holds: the scenario's content, changed by each attribute in the scenario's order.
+
+    In profile levdoom every step is overlaid by its `levdoom`, and at last by the task's own exception.
+    """
+    scenario, levdoom = task.scenario, profile == "levdoom"
+    content = scenario.content.overlaid(scenario.levdoom) if levdoom else scenario.content
+    for attribute in scenario.attributes:
+        if attribute.name in task.attributes:
+            change = attribute.content.overlaid(attribute.levdoom) if levdoom else attribute.content
+            content = content.joined(change)
+    exception = scenario.levdoom_tasks.get(task.name) if levdoom else None
+    return content if exception is None else content.overlaid(exception)
+
+
+def map_source(task: Task, profile: Profile) -> MapSource:
+    """The texts of a task's WAD. The magic number is drawn from the hash of all of them."""
+    content = task_content(task, profile)
+    textmap = write_textmap(_draw(task, content))
+    decorate = "\n".join(content.actors.values())
+    template = Template(task.scenario.script)
+    names = _script_names(content)
+    everything = "\0".join((textmap, decorate, template.substitute(names, map_magic=0)))
+    digest = hashlib.sha256(everything.encode()).digest()
+    magic = int.from_bytes(digest[:4], "little") % (2**31 - 1) + 1
+    script = template.substitute(names, map_magic=magic)
+    return MapSource(textmap=textmap, script=script, decorate=decorate, map_magic=magic)
+
+
+def build_wad(source: MapSource) -> bytes:
+    """The bytes of a WAD file; the same source gives the same bytes.
+
+    Raises:
+        AcsError: the script does not compile.
+    """
+    behavior = compile_acs(source.script, actor_classes=declared_actors(source.decorate))
+    return write_map_wad(
+        textmap=source.textmap,
+        behavior=behavior,
+        scripts=source.script,
+        decorate=source.decorate,
+        map_name=MAP_NAME,
+    )
+
+
+def acs_value(value: Value) -> str:
+    """A value as ACS source text."""
+    match value:
+        case Uniform(low, high):
+            return f"Random({acs_value(low)}, {acs_value(high)})"
+        case float():
+            return f"{value:.6f}".rstrip("0").removesuffix(".") + ("" if value % 1 else ".0")
+        case tuple():
+            return "{" + ", ".join(f'"{v}"' if isinstance(v, str) else acs_value(v) for v in value) + "}"
+        case _:
+            return str(value)
+
+
+def _script_names(content: Content) -> dict[str, str]:
+    """Everything a script template may name, but the magic number."""
+    names = {name: acs_value(value) for name, value in content.parameters.items()}
+    sizes = {f"num_{n}": str(len(v)) for n, v in content.parameters.items() if isinstance(v, tuple)}
+    return {
+        **names,
+        **sizes,
+        "entity_properties": _set_properties("tid", content.entity),
+        "agent_properties": _set_properties("0", content.agent),
+    }
+
+
+def _set_properties(tid: str, properties: Mapping[str, Value]) -> str:
+    lines = (f"SetActorProperty({tid}, APROP_{name}, {acs_value(v)});" for name, v in properties.items())
+    return " ".join(lines)
+
+
+def _draw(task: Task, content: Content) -> UdmfMap:
+    """The base map with the content's textures and things, and the scenario's own changes."""
+    assert content.base_wad is not None
+    assert content.textures is not None
+    _check_textures(task, content.textures)
+    drawn = _base_map(content.base_wad)
+    if task.scenario.draw_map is not None:
+        task.scenario.draw_map(drawn)
+    for side in drawn.sidedefs:
+        side["texturemiddle"] = content.textures.wall
+    for sector in drawn.sectors:
+        sector["texturefloor"] = content.textures.floor
+        sector["textureceiling"] = content.textures.ceiling
+    drawn.things += [make_thing(t.type, t.x, t.y, tid=t.tid) for t in content.things.get(content.base_wad, ())]
+    return drawn
+
+
+def _base_map(base_wad: str) -> UdmfMap:
+    lumps = read_wad((engine_directory() / "scenarios" / base_wad).read_bytes())
+    return parse_textmap(read_maps(lumps)[MAP_NAME]["TEXTMAP"].decode("latin-1"))
+
+
+def _check_textures(task: Task, textures: Textures) -> None:
+    """Raises TaskError for a name the game lacks: the engine would only draw a checkerboard."""
+    known = _texture_names()
+    for name in (textures.wall, textures.floor, textures.ceiling):
+        if name not in known:
+            raise TaskError(f"task {task.id}: unknown texture {name!r}{nearest(name, sorted(known))}")
+
+
+@cache
+def _texture_names() -> frozenset[str]:
+    """Names of the wall textures and flats of freedoom2.wad; each can stand on walls, floors and ceilings."""
+    lumps = read_wad((engine_directory() / "freedoom2.wad").read_bytes())
+    names = [lump.name for lump in lumps]
+    flats = names[names.index("F_START") + 1 : names.index("F_END")]
+    table = lumps[names.index("TEXTURE1")].data
+    (count,) = struct.unpack_from("<i", table)
+    offsets = struct.unpack_from(f"<{count}i", table, 4)
+    walls = (table[offset : offset + 8].split(b"\0")[0].decode("latin-1") for offset in offsets)
+    return frozenset((*flats, *walls))
+
+
+def _cached(data: bytes) -> Path:
+    """The file in the cache directory that holds `data`, written if it is not there or damaged."""
+    directory = Path(os.environ.get("GVZ_CACHE_DIR") or user_cache_path("gvizdoom"))
+    path = directory / f"{hashlib.sha256(data).hexdigest()}.wad"
+    try:
+        if path.exists() and path.read_bytes() == data:
+            return path
+        directory.mkdir(parents=True, exist_ok=True)
+        descriptor, temporary = tempfile.mkstemp(dir=directory, suffix=".tmp")
+        try:
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(data)
+            Path(temporary).replace(path)  # readers see the old file or the whole new one
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise ResourceError(
+            f"map cache {directory}: {error}; make it writable, or set GVZ_CACHE_DIR to a directory that is"
+        ) from error
+    return path

@@ -1,0 +1,230 @@
+"""Dodge Projectiles: a shooting gallery with the agent as the target. Imports gvz.scenarios.base,
+rewards, gvz.wad.
+
+Ability tested: seeing what flies towards one, and stepping aside in time.
+Actions: SPEED, MOVE_LEFT, MOVE_RIGHT; the agent faces the enemies and cannot turn.
+Observation: the screen with HUD, no weapon; variable HEALTH.
+Reward (eq. 3.6): 0.01 - [health fell].
+Start: a strip 64 units wide at one end of a room; enemies that never move stand along the other end.
+    The agent's damage factor is set by enemy type, so that tasks of one level are alike.
+Termination: the agent dies. Truncation: after 2100 tics.
+Metric: frames alive, at most the time-out.
+Attributes: thesis B.4, below. Tasks: thesis Table A.4. Revenants stand for two attributes (their missiles home),
+    so does the Arachnotron (it fires rapidly).
+Differs: the enemies have their normal health, as in the author's maps; nobody has a weapon to use on them.
+"""
+
+from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform, Value
+from gvz.scenarios.rewards import Reward, fell, living
+from gvz.wad.udmf import UdmfMap
+
+WAD = "defend_the_line.wad"
+
+SCRIPT = """\
+#include "zcommon.acs"
+
+global int 2:num_spawned;
+global int 60:map_magic;
+
+str classes[$num_classes] = $classes;
+int xs[$num_xs] = $xs;
+int ys[$num_ys] = $ys;
+
+script 1 OPEN
+{
+    num_spawned = 0;
+    map_magic = $map_magic;
+    for (int i = 0; i < $num_classes; i++)
+    {
+        int tid = 100 + i;
+        num_spawned += Spawn(classes[i], xs[i], ys[i], 0.0, tid, 128);
+        $entity_properties
+    }
+}
+
+script 2 ENTER
+{
+    ClearInventory();
+    $agent_properties
+}
+"""
+
+
+def draw_cage(room: UdmfMap) -> None:
+    """Draws a line from wall to wall that walkers cannot cross, 64 units before the wall behind the agent.
+
+    Missiles fly over it. Without it hits would push the agent back and then let it be anywhere in the room.
+    """
+    back, north, south, front = -512.0, 512.0, 64.0, -448.0
+    corners = {(back, north), (back, south)}
+    assert corners < {(v["x"], v["y"]) for v in room.vertices}, "the base map is the room we know"
+    for y in (north, south):
+        room.vertices.append({"x": front, "y": y})
+        room.sidedefs.append({"sector": 0})
+    room.linedefs.append(
+        {
+            "v1": len(room.vertices) - 2,
+            "v2": len(room.vertices) - 1,
+            "sidefront": len(room.sidedefs) - 2,
+            "sideback": len(room.sidedefs) - 1,
+            "twosided": True,
+            "blocking": True,
+        }
+    )
+
+
+def _row(kind: str, count: int, x: float, first_y: float, last_y: float) -> dict[str, Value]:
+    """Script parameters of `count` enemies in a row, at equal distances."""
+    gap = (last_y - first_y) / max(count - 1, 1)
+    return {
+        "classes": (kind,) * count,
+        "xs": (x,) * count,
+        "ys": tuple(first_y + gap * place for place in range(count)),
+    }
+
+
+def _enemies(
+    name: str,
+    row: dict[str, Value],
+    damage_factor: float,
+    levdoom_damage_factor: float,
+    trait: str | None = None,
+) -> Attribute:
+    """An attribute that puts a row of other enemies in place of the imps."""
+    return Attribute(
+        name=name,
+        groups=("entity_type",) if trait is None else ("entity_type", trait),
+        content=Content(parameters=row, agent={"DamageFactor": damage_factor}),
+        levdoom=Content(agent={"DamageFactor": levdoom_damage_factor}),
+    )
+
+
+SKULLS = ((-192, 416), (-224, 320), (-256, 256), (-288, 96), (-288, 480), (-320, 192), (-288, 384))
+"""floating skulls (editor number 42); missiles pass over them"""
+
+
+def return_range(discount: float) -> tuple[float, float]:
+    """Range of discounted returns, per decision of four tics.
+
+    Upper: 0.01 for ever, unhurt. Lower: 25 hits of -1, one every fourth decision: an agent that stands still dies
+    after some 100 decisions at the earliest under weak hits (5 of 100 health: Arachnotron) and after some 60
+    under 11 harder ones (Imps).
+    """
+    return -sum(discount ** (4 * hit) for hit in range(25)), 0.01 / (1 - discount)
+
+
+SCENARIO = Scenario(
+    id="dodge_projectiles",
+    title="Dodge Projectiles",
+    script=SCRIPT,
+    draw_map=draw_cage,
+    content=Content(
+        base_wad=WAD,
+        textures=Textures("BRICK12", "CRATOP1", "CRATOP1"),
+        parameters=_row("DoomImp", 10, 96.0, 84.0, 492.0),
+        entity={"Speed": 0.0},
+        agent={"DamageFactor": 0.7},
+    ),
+    levdoom=Content(),
+    attributes=(
+        Attribute(
+            name="city",
+            groups=("textures",),
+            content=Content(textures=Textures("SKY2", "ROCKRED1", "CEIL4_1")),
+        ),
+        Attribute(
+            name="flames",
+            groups=("textures",),
+            content=Content(textures=Textures("SWATER1", "RROCK02", "CAVERN1")),
+        ),
+        Attribute(
+            name="flaming_skulls",
+            groups=("decorations",),
+            content=Content(things={WAD: tuple(Thing(42, x, y) for x, y in SKULLS)}),
+        ),
+        _enemies("mancubus", _row("Fatso", 2, 76.0, 114.0, 462.0), 0.5, 0.5),
+        _enemies("barons", _row("BaronOfHell", 5, 96.0, 100.0, 460.0), 0.4, 0.4),
+        _enemies("cacodemons", _row("Cacodemon", 5, 96.0, 100.0, 480.0), 0.5, 0.5),
+        _enemies("revenants", _row("Revenant", 3, 96.0, 84.0, 492.0), 0.3, 0.2, "homing"),
+        _enemies("arachnotron", _row("Arachnotron", 1, 56.0, 288.0, 288.0), 0.3, 0.2, "rapid_fire"),
+        Attribute(  # both traits at once, which `complete` needs and the thesis gives no single enemy for
+            name="revenants_and_arachnotron",
+            groups=("entity_type", "homing", "rapid_fire"),
+            content=Content(
+                parameters={
+                    "classes": ("Revenant", "Arachnotron", "Revenant", "Revenant"),
+                    "xs": (96.0, 56.0, 96.0, 96.0),
+                    "ys": (84.0, 220.0, 356.0, 492.0),
+                },
+                agent={"DamageFactor": 0.3},
+            ),
+        ),
+        Attribute(
+            name="resized_agent",
+            groups=("agent_height",),
+            content=Content(agent={"ViewHeight": Uniform(0.0, 100.0)}),
+        ),
+    ),
+    complete=("city", "flaming_skulls", "revenants_and_arachnotron", "resized_agent"),
+    levdoom_tasks={
+        "arachnotron+city": Content(agent={"DamageFactor": 0.4}),
+        "mancubus+resized_agent": Content(agent={"DamageFactor": 0.7}),
+        "resized_agent+revenants": Content(agent={"DamageFactor": 0.5}),
+        "flames+flaming_skulls+mancubus": Content(agent={"DamageFactor": 0.7}),
+        "complete": Content(parameters=_row("Arachnotron", 3, 56.0, 140.0, 440.0), agent={"DamageFactor": 0.5}),
+    },
+    tasks=(
+        "default",
+        "city",
+        "flames",
+        "flaming_skulls",
+        "mancubus",
+        "barons",
+        "cacodemons",
+        "resized_agent",
+        "revenants",
+        "city+resized_agent",
+        "arachnotron",
+        "barons+flaming_skulls",
+        "cacodemons+flames",
+        "mancubus+resized_agent",
+        "flames+flaming_skulls+mancubus",
+        "resized_agent+revenants",
+        "city+arachnotron",
+        "complete",
+    ),
+    splits={
+        "train1": ("default",),
+        "train4": ("default", "flames", "flaming_skulls", "barons"),
+        "train8": (
+            "default",
+            "city",
+            "flames",
+            "flaming_skulls",
+            "mancubus",
+            "barons",
+            "cacodemons",
+            "resized_agent",
+        ),
+        "test": (
+            "revenants",
+            "city+resized_agent",
+            "barons+flaming_skulls",
+            "flames+flaming_skulls+mancubus",
+            "resized_agent+revenants",
+            "city+arachnotron",
+            "complete",
+        ),
+    },
+    buttons=("SPEED", "MOVE_LEFT", "MOVE_RIGHT"),
+    game_variables=("HEALTH",),
+    metric="frames_alive",
+    render_weapon=False,
+    timeouts={"thesis": 2100, "levdoom": 2100},
+    upper_bounds={"thesis": 2100, "levdoom": 2100},
+    rewards={
+        "living": Reward(event=living, weight=0.01, levdoom=0.0),
+        "health_lost": Reward(event=fell("HEALTH"), weight=-1.0, levdoom=-0.1),
+    },
+    return_range=return_range,
+)

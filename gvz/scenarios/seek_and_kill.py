@@ -1,0 +1,309 @@
+"""Seek and Kill: a hunt through a maze. Imports gvz.scenarios.base, rewards, gvz.wad.
+
+Ability tested: exploring, telling enemies from everything else, aiming.
+Actions: ATTACK, SPEED, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT.
+Observation: the screen with weapon and HUD; variables KILLCOUNT, AMMO2, HEALTH, POSITION_X, POSITION_Y.
+Reward (eq. 3.5): [kill] - [death] - 0.1 [ammo fell] - 0.01 - 0.3 [health fell] + 0.005 |l_t - l_{t-5}|.
+    Differs: the equation penalizes health that rose, and squares the distance that the text calls linear.
+Start: one of 20 places (levdoom: 12) at a random angle, a pistol and 200 bullets. 20 Demons of 1 health stand
+    about, unable to walk; one more comes every 30 tics.
+Termination: the agent dies. Truncation: after 1200 tics (levdoom: 1250).
+Metric: kills (KILLCOUNT, which also counts enemies that enemies killed), 20 counted as the most.
+Attributes: thesis B.3, below. Tasks: thesis Table A.3.
+"""
+
+from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform
+from gvz.scenarios.rewards import Reward, death, fell, living, moved, rose
+from gvz.wad.udmf import UdmfMap
+
+WAD = "health_gathering_supreme.wad"
+MAP_SPOT = 9001
+
+SCRIPT = """\
+#include "zcommon.acs"
+
+global int 1:player_kills;
+global int 2:num_spawned;
+global int 60:map_magic;
+
+str classes[$num_classes] = $classes;
+int next_tid = 1000;
+
+// Tries to put an enemy at a random place of the map. Returns 0 if every try was blocked.
+function int SpawnEnemy(int kind)
+{
+    int tid = next_tid;
+    for (int tries = 0; tries < 100; tries++)
+    {
+        if (Spawn(classes[kind], Random(1.0, $map_size - 1.0), Random(1.0, $map_size - 1.0), 0.0, tid) != 0)
+        {
+            next_tid++;
+            num_spawned++;
+            SetActorProperty(tid, APROP_Health, 1);
+            $entity_properties
+            SetThingSpecial(tid, ACS_ExecuteAlways, 3, 0, tid);
+            return 1;
+        }
+    }
+    return 0;
+}
+
+script 1 OPEN
+{
+    player_kills = 0;
+    num_spawned = 0;
+    map_magic = $map_magic;
+    int kind;
+    for (int i = 0; i < $num_per_class; i++)
+    {
+        for (kind = 0; kind < $num_classes; kind++)
+        {
+            while (SpawnEnemy(kind) == 0)
+                Delay(1);
+        }
+    }
+    Delay($first_delay);
+    while (1)
+    {
+        for (kind = 0; kind < $num_classes; kind++)
+        {
+            while (SpawnEnemy(kind) == 0)
+                Delay(1);
+        }
+        Delay($spawn_delay);
+    }
+}
+
+script 2 ENTER
+{
+    ClearInventory();
+    GiveInventory("Pistol", 1);
+    SetWeapon("Pistol");
+    GiveInventory("Clip", 200);
+    int spot = Random(10, $last_spot);
+    while (SetActorPosition(0, GetActorX(spot), GetActorY(spot), 0.0, 0) == 0)
+        spot = Random(10, $last_spot); // an enemy stands on it
+    SetActorAngle(0, Random(0.0, 1.0));
+    $agent_properties
+}
+
+// An enemy died; the killer is the activator.
+script 3 (int tid)
+{
+    if (PlayerNumber() >= 0)
+        player_kills++;
+    Thing_Remove(tid);
+}
+
+// An enemy's enemy died that no script spawned.
+script 4 (void)
+{
+    if (PlayerNumber() >= 0)
+        player_kills++;
+}
+"""
+
+COUNTED_MARINE = """\
+ACTOR MarineChainsawVzd : MarineChainsaw
+{
+  +COUNTKILL
+}
+"""
+
+BORN_SOUL = """\
+ACTOR BornSoul : LostSoul replaces LostSoul
+{
+  Health 1
+  States
+  {
+  Spawn:
+    SKUL A 0
+    SKUL A 0 A_SetSpecial(226, 4)
+    Goto Super::Spawn
+  }
+}
+"""
+"""a soul spat out by a Pain Elemental: 1 health as every enemy has, and its killer is known like any other's"""
+
+SPOTS = ((640, 1728), (384, 1088), (1152, 1600), (1216, 1024), (1184, 352), (640, 192), (64, 864), (352, 656))
+"""ours: eight starts beside the base map's twelve; at least 130 units from those and from every obstacle"""
+
+TORCHES = {
+    44: (
+        *((800, 1632), (608, 1184), (32, 672), (544, 32), (1120, 160), (992, 672)),
+        *((96, 1696), (1568, 1632), (1600, 320)),
+    ),
+    45: (
+        *((480, 1376), (288, 864), (1440, 1248), (1344, 416), (224, 1056), (1056, 992)),
+        *((512, 608), (1760, 96)),
+    ),
+    46: (
+        *((1248, 1504), (1760, 1184), (1504, 928), (1184, 736), (224, 480), (864, 96)),
+        *((864, 1376), (672, 928)),
+    ),
+}
+"""editor number (blue, green, red torch) -> places"""
+
+MIXED = ("ZombieMan", "MarineChainsawVzd", "DoomImp", "Cacodemon", "LostSoul")
+STRONG = ("Arachnotron", "Fatso", "PainElemental", "Archvile", "Revenant")
+
+
+def drain_acid(maze: UdmfMap) -> None:
+    """Makes the floor harmless."""
+    for sector in maze.sectors:
+        del sector["special"]
+
+
+def return_range(discount: float) -> tuple[float, float]:
+    """Range of discounted returns, per decision of four tics.
+
+    Upper: walking straight on for ever (8.33 units a tic, so 167 in five decisions: 0.83 each, the bulk of it)
+    and a kill (1 - 0.1) every 15 decisions, 20 in an episode. Lower: standing still (-0.01), 28 misses in 98
+    decisions, the pistol's rate (-0.1 each), and dying of 15 hits (-0.3 each, then -1).
+    """
+    walking = (0.005 * 20 * 25 / 3 - 0.01) / (1 - discount)
+    kills = sum(0.9 * discount ** (15 * kill) for kill in range(20))
+    hits = sum(0.3 * discount ** (2 * hit) for hit in range(15)) + discount**30
+    misses = sum(0.1 * discount ** (3.5 * shot) for shot in range(28))
+    return -0.01 / (1 - discount) - misses - hits, walking + kills
+
+
+SCENARIO = Scenario(
+    id="seek_and_kill",
+    title="Seek and Kill",
+    script=SCRIPT,
+    draw_map=drain_acid,
+    content=Content(
+        base_wad=WAD,
+        textures=Textures("ICKWALL3", "AQF051", "FLAT19"),
+        things={WAD: tuple(Thing(MAP_SPOT, x, y, 22 + i) for i, (x, y) in enumerate(SPOTS))},
+        parameters={
+            "classes": ("Demon",),
+            "num_per_class": 20,
+            "first_delay": 30,
+            "spawn_delay": 30,
+            "map_size": 1856.0,
+            "last_spot": 29,
+        },
+        entity={"Speed": 0.0},
+    ),
+    levdoom=Content(things={WAD: ()}, parameters={"first_delay": 0, "last_spot": 21}),
+    attributes=(
+        Attribute(
+            name="blue",
+            groups=("textures",),
+            content=Content(textures=Textures("FIREBLU2", "FLAT14", "CEIL4_3")),
+        ),
+        Attribute(
+            name="red",
+            groups=("textures",),
+            content=Content(textures=Textures("FIREWALL", "CRACKLE4", "DORED")),
+        ),
+        Attribute(
+            name="obstacles",
+            groups=("decorations",),
+            content=Content(
+                things={WAD: tuple(Thing(kind, x, y) for kind, spots in TORCHES.items() for x, y in spots)}
+            ),
+        ),
+        Attribute(
+            name="resized_enemies",
+            groups=("entity_size",),
+            aliases=("resized",),
+            content=Content(entity={"ScaleX": Uniform(0.3, 3.0), "ScaleY": Uniform(0.3, 3.0)}),
+        ),
+        Attribute(
+            name="shadows",
+            groups=("entity_rendering",),
+            content=Content(entity={"RenderStyle": "STYLE_Shadow"}),
+        ),
+        Attribute(
+            name="mixed_enemies",
+            groups=("entity_type",),
+            aliases=("mixed",),
+            content=Content(
+                parameters={"classes": MIXED, "num_per_class": 3, "first_delay": 180, "spawn_delay": 180},
+                actors={"MarineChainsawVzd": COUNTED_MARINE},
+            ),
+            levdoom=Content(parameters={"first_delay": 0}),
+        ),
+        Attribute(
+            name="invulnerable",
+            groups=("entity_type",),
+            content=Content(
+                parameters={"classes": STRONG, "num_per_class": 3, "first_delay": 180, "spawn_delay": 180},
+                agent={"Invulnerable": "TRUE"},
+                actors={"BornSoul": BORN_SOUL},
+            ),
+            levdoom=Content(parameters={"first_delay": 0}),
+        ),
+    ),
+    complete=("blue", "obstacles", "resized_enemies", "shadows", "mixed_enemies"),
+    levdoom_tasks={
+        "complete": Content(
+            textures=Textures("ICKWALL3", "FLAT14", "CEIL4_3"),
+            parameters={"classes": MIXED + STRONG},
+            actors={"BornSoul": BORN_SOUL},
+        ),
+    },
+    tasks=(
+        "default",
+        "blue",
+        "red",
+        "obstacles",
+        "resized_enemies",
+        "shadows",
+        "mixed_enemies",
+        "invulnerable",
+        "blue+shadows",
+        "obstacles+resized",
+        "red+mixed",
+        "invulnerable+blue",
+        "resized+red",
+        "shadows+obstacles",
+        "blue+mixed+resized",
+        "red+obstacles+invulnerable",
+        "resized+shadows+invulnerable",
+        "complete",
+    ),
+    splits={
+        "train1": ("default",),
+        "train4": ("default", "red", "obstacles", "mixed_enemies"),
+        "train8": (
+            "default",
+            "blue",
+            "red",
+            "obstacles",
+            "resized_enemies",
+            "shadows",
+            "mixed_enemies",
+            "invulnerable",
+        ),
+        "test": (
+            "blue+shadows",
+            "obstacles+resized",
+            "red+mixed",
+            "blue+mixed+resized",
+            "red+obstacles+invulnerable",
+            "resized+shadows+invulnerable",
+            "complete",
+        ),
+    },
+    buttons=("ATTACK", "SPEED", "MOVE_FORWARD", "TURN_LEFT", "TURN_RIGHT"),
+    combination_buttons=("ATTACK", "MOVE_FORWARD", "TURN_LEFT", "TURN_RIGHT"),  # LevDoom's 12 sets: no SPEED
+    game_variables=("KILLCOUNT", "AMMO2", "HEALTH", "POSITION_X", "POSITION_Y"),
+    metric="kills",
+    render_weapon=True,
+    timeouts={"thesis": 1200, "levdoom": 1250},
+    upper_bounds={"thesis": 20, "levdoom": 20},
+    rewards={
+        "kill": Reward(event=rose("KILLCOUNT"), weight=1.0, levdoom=1.0),
+        "player_kill": Reward(event=rose("PLAYER_KILLS"), weight=0.0, levdoom=0.0),
+        "death": Reward(event=death, weight=-1.0, levdoom=0.0),
+        "ammo_spent": Reward(event=fell("AMMO2"), weight=-0.1, levdoom=0.0),
+        "living": Reward(event=living, weight=-0.01, levdoom=0.0),
+        "health_lost": Reward(event=fell("HEALTH"), weight=-0.3, levdoom=0.0),
+        "moved": Reward(event=moved, weight=0.005, levdoom=0.001),
+    },
+    return_range=return_range,
+)
