@@ -150,7 +150,8 @@ def _draw(task: Task, content: Content) -> UdmfMap:
     if task.scenario.draw_map is not None:
         task.scenario.draw_map(drawn)
     for side in drawn.sidedefs:
-        side["texturemiddle"] = content.textures.wall
+        if "texturemiddle" in side:  # the sides of a line between two open spaces have none
+            side["texturemiddle"] = content.textures.wall
     for sector in drawn.sectors:
         sector["texturefloor"] = content.textures.floor
         sector["textureceiling"] = content.textures.ceiling
