@@ -33,7 +33,7 @@ STEP_DTYPE = np.dtype(
         ("first", "u1"),  # o_t is the first of its episode
         ("terminated", "u1"),  # o_t is the last: the episode ended by the rules (discount 0)
         ("truncated", "u1"),  # o_t is the last: the episode was cut (time-out, crash); the discount stays
-        ("pad", "u1", (5,)),
+        ("pad", "u1", (9,)),  # to 48: every number stands aligned, so that a store is whole or not at all
     ]
 )
 """Everything of a step record but its frame, 48 bytes. Frames stand beside, uint8[H W C] each."""

@@ -1,0 +1,165 @@
+"""The parameter queue: whole versions only, and a writer that never waits."""
+
+import secrets
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gvz.errors import TransportError, WaitTimeoutError
+from gvz.transport import broadcast
+from gvz.transport.broadcast import BroadcastReader, BroadcastWriter, broadcast_bytes
+from gvz.transport.messages import ParamsHeader
+from gvz.transport.segment import HEADER_BYTES
+
+NUM_PARAMS, LAYOUT = 1000, 0xABCDEF
+
+
+@pytest.fixture
+def name() -> str:
+    return f"gvz-test-{secrets.token_hex(6)}"
+
+
+@pytest.fixture
+def writer(name: str) -> Iterator[BroadcastWriter]:
+    board = BroadcastWriter.create(name, NUM_PARAMS, LAYOUT)
+    yield board
+    board.close()
+
+
+@pytest.fixture
+def reader(writer: BroadcastWriter, name: str) -> BroadcastReader:
+    return BroadcastReader.attach(name, writer.num_params, LAYOUT)
+
+
+def header(version: int, *, epsilon: float = 0.0) -> ParamsHeader:
+    return ParamsHeader(version=version, num_updates=10 * version, epsilon=epsilon, layout_hash=LAYOUT)
+
+
+def publish(writer: BroadcastWriter, version: int) -> None:
+    writer.publish(np.full(writer.num_params, version, np.float32), header(version))
+
+
+def test_nothing_is_read_before_the_first_version(reader: BroadcastReader):
+    assert reader.read() is None
+
+
+def test_a_version_arrives_with_its_header_and_once(writer: BroadcastWriter, reader: BroadcastReader):
+    params = np.random.default_rng(0).normal(size=NUM_PARAMS).astype(np.float32)
+    sent = header(2**40, epsilon=0.1)
+    writer.publish(params, sent)
+    assert reader.read() == sent
+    np.testing.assert_array_equal(reader.params, params)
+    assert reader.read() is None
+
+
+def test_a_slow_reader_skips_to_the_newest(writer: BroadcastWriter, reader: BroadcastReader):
+    for version in range(11):
+        publish(writer, version)
+    assert reader.read() == header(10)
+    assert (reader.params == 10).all()
+
+
+def test_what_was_read_is_the_readers_own(writer: BroadcastWriter, reader: BroadcastReader):
+    publish(writer, 1)
+    reader.read()
+    for version in range(2, 10):
+        publish(writer, version)
+    assert (reader.params == 1).all()
+
+
+def test_every_reader_gets_every_version(writer: BroadcastWriter, reader: BroadcastReader, name: str):
+    late = BroadcastReader.attach(name, NUM_PARAMS, LAYOUT)
+    publish(writer, 3)
+    assert reader.read() == late.read() == header(3)
+
+
+@pytest.mark.parametrize("params", [np.zeros(999, np.float32), np.zeros((10, 100), np.float32), np.zeros(1000)])
+def test_other_parameters_are_refused(writer: BroadcastWriter, params: np.ndarray):
+    with pytest.raises(ValueError, match=r"got float\d\d\[.*\], want float32\[1000\]"):
+        writer.publish(params, header(0))
+
+
+def test_another_tree_is_refused(writer: BroadcastWriter):
+    with pytest.raises(ValueError, match="got layout hash 0x1, want 0xabcdef"):
+        writer.publish(np.zeros(NUM_PARAMS, np.float32), ParamsHeader(version=0, num_updates=0, layout_hash=1))
+
+
+@pytest.mark.usefixtures("writer")
+def test_a_reader_of_another_tree_is_refused(name: str):
+    with pytest.raises(TransportError, match="got layout hash"):
+        BroadcastReader.attach(name, NUM_PARAMS, LAYOUT + 1)
+    with pytest.raises(TransportError, match=r"got \d+ bytes"):
+        BroadcastReader.attach(name, NUM_PARAMS + 100, LAYOUT)
+
+
+def test_one_slot_is_refused(name: str):
+    with pytest.raises(ValueError, match="num_slots: got 1, want at least 2"):
+        BroadcastWriter.create(name, NUM_PARAMS, LAYOUT, num_slots=1)
+
+
+def test_a_version_that_never_becomes_whole_is_named(
+    writer: BroadcastWriter, reader: BroadcastReader, name: str, monkeypatch: pytest.MonkeyPatch
+):
+    publish(writer, 0)
+    words = np.memmap(Path("/dev/shm") / name, np.uint64, "r+", HEADER_BYTES + 64, (8,))
+    words[0] += 1  # as if the writer were for ever at this slot
+    monkeypatch.setattr(broadcast, "_READ_TIMEOUT_S", 0.05)
+    with pytest.raises(WaitTimeoutError, match="reader waited 0 s for a whole version; the writer overtook every"):
+        reader.read()
+
+
+def test_closing_removes_the_queue_and_can_be_repeated(writer: BroadcastWriter, reader: BroadcastReader, name: str):
+    path = Path("/dev/shm") / name
+    assert path.stat().st_size == HEADER_BYTES + broadcast_bytes(NUM_PARAMS)
+    reader.close()
+    assert path.exists()
+    writer.close()
+    writer.close()
+    assert not path.exists()
+
+
+_READER = """
+import sys
+import numpy as np
+from gvz.transport.broadcast import BroadcastReader
+name, num_params = sys.argv[1], int(sys.argv[2])
+reader = BroadcastReader.attach(name, num_params, 7, num_slots=2)
+last, count = -1, 0
+while count < 300:
+    header = reader.read()
+    if header is None:
+        continue
+    assert (reader.params == header.version % 10**6).all(), "torn"
+    assert header.num_updates == 2 * header.version and header.epsilon == 1 / (1 + header.version)
+    assert header.version >= last, "went back"
+    last, count = header.version, count + 1
+"""
+
+
+def test_readers_that_are_overtaken_never_see_half_a_version(name: str):
+    """Two slots and a writer at full speed: readers are overtaken all the time. One of them is stopped meanwhile."""
+    num_params = 200_000
+    writer = BroadcastWriter.create(name, num_params, 7, num_slots=2)
+    readers = [subprocess.Popen([sys.executable, "-c", _READER, name, str(num_params)]) for _ in range(3)]
+    try:
+        version, deadline = 0, time.monotonic() + 60.0
+        while any(process.poll() is None for process in readers):
+            assert time.monotonic() < deadline, "the readers read nothing"
+            params = np.full(num_params, version % 10**6, np.float32)
+            sent = ParamsHeader(version=version, num_updates=2 * version, epsilon=1 / (1 + version), layout_hash=7)
+            writer.publish(params, sent)
+            version += 1
+            if version % 50 == 0:
+                readers[0].send_signal(signal.SIGSTOP if version % 100 else signal.SIGCONT)
+        assert [process.returncode for process in readers] == [0, 0, 0]
+    finally:
+        for process in readers:
+            process.kill()
+            process.wait()
+        writer.close()

@@ -1,0 +1,107 @@
+"""Messages over a socket: whole, in order, and never trusted."""
+
+import socket
+import struct
+import threading
+import time
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvz.errors import TransportError, WaitTimeoutError
+from gvz.transport.channel import MAX_MESSAGE_BYTES, Channel
+from gvz.transport.messages import Fault, Ready, Stop, encode
+
+
+@pytest.fixture
+def pair():
+    left, right = socket.socketpair()
+    a, b = Channel(left, peer="B", timeout_s=0.2), Channel(right, peer="A", timeout_s=0.2)
+    yield a, b
+    a.close()
+    b.close()
+
+
+def fault(message: str) -> Fault:
+    return Fault(actor=1, lane=None, kind="exception", message=message)
+
+
+def test_messages_arrive_whole_and_in_order(pair: tuple[Channel, Channel]):
+    a, b = pair
+    sent = [Ready(actor=0, pid=5), fault("x" * 1000), Stop()]
+    for message in sent:
+        a.send(message)
+    assert b.receive() == sent
+    assert b.receive() == []
+
+
+def test_receiving_does_not_wait(pair: tuple[Channel, Channel]):
+    start = time.monotonic()
+    assert pair[0].receive() == []
+    assert time.monotonic() - start < 0.1
+
+
+def test_a_message_larger_than_the_sockets_buffer_passes(pair: tuple[Channel, Channel]):
+    a, b = pair
+    large = fault("y" * 3_000_000)
+    thread = threading.Thread(target=a.send, args=(large,))
+    thread.start()
+    assert b.wait_for_message() == large
+    thread.join()
+
+
+def test_a_peer_that_does_not_read_is_named(pair: tuple[Channel, Channel]):
+    with pytest.raises(WaitTimeoutError, match="waited 0 s for B to read a message of 3000"):
+        pair[0].send(fault("y" * 3_000_000))
+
+
+def test_a_peer_that_does_not_speak_is_named(pair: tuple[Channel, Channel]):
+    with pytest.raises(WaitTimeoutError, match="waited 0 s for a message from A"):
+        pair[1].wait_for_message()
+
+
+def test_a_closed_peer_is_noticed_after_what_it_said(pair: tuple[Channel, Channel]):
+    a, b = pair
+    a.send(Stop())
+    a.close()
+    assert b.receive() == [Stop()]
+    assert b.closed
+    assert b.receive() == []
+    with pytest.raises(TransportError, match="A closed it before the message"):
+        b.wait_for_message()
+
+
+def test_sending_to_a_closed_peer_is_noticed_not_raised(pair: tuple[Channel, Channel]):
+    a, b = pair
+    b.close()
+    a.send(Stop())
+    assert a.closed
+
+
+def test_an_absurd_length_is_refused():
+    left, right = socket.socketpair()
+    channel = Channel(right, peer="A")
+    left.sendall(struct.pack("<I", MAX_MESSAGE_BYTES + 1))
+    with pytest.raises(TransportError, match="A announced a message of 67108865 bytes, want at most 67108864"):
+        channel.receive()
+    left.close()
+    channel.close()
+
+
+@settings(max_examples=300, deadline=None)
+@given(data=st.binary(max_size=200), cut=st.integers(0, 200))
+def test_any_bytes_give_messages_or_a_named_error(data: bytes, cut: int):
+    left, right = socket.socketpair()
+    channel = Channel(right, peer="A")
+    whole = struct.pack("<I", len(encode(Stop()))) + encode(Stop())
+    try:
+        left.sendall(whole + data[:cut])
+        left.sendall(data[cut:])
+        left.close()
+        try:
+            assert channel.receive()[0] == Stop()
+        except TransportError:
+            assert len(data) >= 4
+    finally:
+        channel.close()

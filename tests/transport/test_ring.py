@@ -1,0 +1,304 @@
+"""The ring of step records: nothing lost, repeated or torn, whoever dies."""
+
+import os
+import secrets
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from gvz.errors import TransportError, WaitTimeoutError
+from gvz.transport.messages import STEP_DTYPE, StepBlock
+from gvz.transport.ring import RingReader, RingWriter, WriterState, ring_bytes
+from gvz.transport.segment import HEADER_BYTES
+
+CAPACITY, SHAPE = 8, (4, 5, 3)
+
+
+@pytest.fixture
+def name() -> str:
+    return f"gvz-test-{secrets.token_hex(6)}"
+
+
+@pytest.fixture
+def reader(name: str) -> Iterator[RingReader]:
+    ring = RingReader.create(name, CAPACITY, SHAPE)
+    yield ring
+    ring.close()
+
+
+@pytest.fixture
+def writer(reader: RingReader, name: str) -> Iterator[RingWriter]:
+    ring = RingWriter.attach(name, reader.capacity, SHAPE)
+    yield ring
+    ring.close()
+
+
+def write(writer: RingWriter, number: int) -> None:
+    """A record all of whose content follows from `number`."""
+    writer.reserve()[...] = number % 251
+    writer.commit(
+        episode=number * 3,
+        params_version=number * 5,
+        action=number % 7,
+        reward=number / 2,
+        lane=number % 11,
+        task=number % 13,
+        first=number % 2 == 0,
+        terminated=number % 3 == 0,
+        truncated=number % 5 == 0,
+    )
+
+
+def check(block: StepBlock, numbers: list[int]) -> None:
+    n = np.array(numbers, np.int64)
+    assert block.steps.dtype == STEP_DTYPE
+    assert block.frames.shape == (len(n), *SHAPE)
+    np.testing.assert_array_equal(block.frames, np.broadcast_to((n % 251)[:, None, None, None], block.frames.shape))
+    for field, wanted in {
+        "episode": n * 3,
+        "params_version": n * 5,
+        "action": n % 7,
+        "reward": n / 2,
+        "lane": n % 11,
+        "task": n % 13,
+        "first": n % 2 == 0,
+        "terminated": n % 3 == 0,
+        "truncated": n % 5 == 0,
+        "pad": np.zeros((len(n), 9)),
+    }.items():
+        np.testing.assert_array_equal(block.steps[field], wanted, err_msg=field)
+
+
+class RingMachine(RuleBasedStateMachine):
+    """Any order of writes, reads, half-written records and dead writers against a deque."""
+
+    def __init__(self):
+        super().__init__()
+        self.reader = RingReader.create(f"gvz-test-{secrets.token_hex(6)}", CAPACITY, SHAPE)
+        self.writer = self.attach()
+        self.unread: deque[int] = deque()
+        self.written = 0
+        self.num_read = 0
+
+    def attach(self) -> RingWriter:
+        assert self.reader.name is not None
+        return RingWriter.attach(self.reader.name, CAPACITY, SHAPE)
+
+    @rule(count=st.integers(1, CAPACITY))
+    def write(self, count: int):
+        for _ in range(min(count, self.writer.free)):
+            write(self.writer, self.written)
+            self.unread.append(self.written)
+            self.written += 1
+
+    @rule(count=st.integers(0, 2 * CAPACITY))
+    def read(self, count: int):
+        wanted = [self.unread.popleft() for _ in range(min(count, len(self.unread)))]
+        block = self.reader.read(count)
+        check(block, wanted)
+        expected = np.arange(self.num_read, self.num_read + len(wanted))
+        np.testing.assert_array_equal(block.steps["sequence"], expected)
+        self.num_read += len(wanted)
+
+    @rule(count=st.integers(0, 2 * CAPACITY))
+    def peek(self, count: int):
+        check(self.reader.peek(count), list(self.unread)[:count])
+
+    @rule(half_written=st.booleans())
+    def writer_dies(self, half_written: bool):
+        if half_written and self.writer.free:
+            self.writer.reserve()[...] = 252
+        self.writer = self.attach()
+
+    @invariant()
+    def check_valid(self):
+        assert self.reader.num_unread == len(self.unread)
+        assert self.writer.free == CAPACITY - len(self.unread)
+
+    def teardown(self):
+        self.reader.close()
+
+
+TestRingMachine = RingMachine.TestCase
+TestRingMachine.settings = settings(max_examples=40, stateful_step_count=40, deadline=None)
+
+
+def test_blocks_are_copies(reader: RingReader, writer: RingWriter):
+    write(writer, 0)
+    block = reader.read(1)
+    for number in range(1, 1 + CAPACITY):
+        write(writer, number)
+    check(block, [0])
+    block.frames[...] = 255
+    check(reader.read(CAPACITY), list(range(1, 1 + CAPACITY)))
+
+
+def test_reserving_in_a_full_ring_is_a_bug(reader: RingReader, writer: RingWriter):
+    for number in range(reader.capacity):
+        write(writer, number)
+    with pytest.raises(AssertionError, match="full; wait_for_space first"):
+        writer.reserve()
+
+
+@pytest.mark.usefixtures("reader")
+def test_a_full_ring_makes_the_writer_wait_and_says_for_whom(writer: RingWriter):
+    for number in range(CAPACITY - 2):
+        write(writer, number)
+    assert writer.wait_for_space(2, timeout_s=0.0)
+    with pytest.raises(
+        WaitTimeoutError, match=r"waited 0\.\d s for the learner to read; 2 of 8 records are free, 3 are"
+    ):
+        writer.wait_for_space(3, timeout_s=0.05)
+
+
+def test_waiting_ends_when_the_reader_reads_and_is_counted(reader: RingReader, writer: RingWriter):
+    for number in range(CAPACITY):
+        write(writer, number)
+    seen: list[WriterState] = []
+
+    def read_later():
+        time.sleep(0.1)
+        seen.append(reader.writer_status().state)
+        reader.read(3)
+
+    thread = threading.Thread(target=read_later)
+    thread.start()
+    assert writer.wait_for_space(3, timeout_s=10.0)
+    thread.join()
+    assert seen == [WriterState.WAITING_FOR_SPACE]
+    assert 0.05 < reader.writer_status().waited_for_space_s < 5.0
+    assert reader.writer_status().heartbeat_ns > 0
+
+
+@pytest.mark.usefixtures("reader")
+def test_waiting_can_be_cancelled(writer: RingWriter):
+    for number in range(CAPACITY):
+        write(writer, number)
+    assert not writer.wait_for_space(1, timeout_s=10.0, cancelled=lambda: True)
+
+
+def test_the_writer_shows_its_state(reader: RingReader, writer: RingWriter):
+    assert reader.writer_status().state == WriterState.ABSENT
+    for state in WriterState:
+        before = time.monotonic_ns()
+        writer.beat(state)
+        status = reader.writer_status()
+        assert (status.state, status.pid) == (state, os.getpid())
+        assert before <= status.heartbeat_ns <= time.monotonic_ns()
+
+
+def test_closing_removes_the_ring_and_can_be_repeated(reader: RingReader, writer: RingWriter, name: str):
+    writer.close()
+    assert (Path("/dev/shm") / name).exists()
+    reader.close()
+    reader.close()
+    assert not (Path("/dev/shm") / name).exists()
+
+
+@pytest.mark.usefixtures("reader")
+@pytest.mark.parametrize(("capacity", "shape"), [(CAPACITY, (5, 4, 3)), (CAPACITY, (4, 15, 1)), (CAPACITY, (2, 2, 1))])
+def test_another_layout_is_refused(name: str, capacity: int, shape: tuple[int, int, int]):
+    with pytest.raises(TransportError, match=r"layout hash|bytes"):
+        RingWriter.attach(name, capacity, shape)
+
+
+# ---- damage: what a broken writer, or anything else with access, may have done to the memory
+
+
+def words_of(name: str) -> np.memmap:
+    return np.memmap(Path("/dev/shm") / name, np.uint64, "r+", HEADER_BYTES, (16,))
+
+
+def steps_of(name: str) -> np.memmap:
+    return np.memmap(Path("/dev/shm") / name, STEP_DTYPE, "r+", HEADER_BYTES + 128, (CAPACITY,))
+
+
+@pytest.mark.parametrize(("slot", "wrong"), [(2, 1), (1, 2), (0, 8), (3, 2**64 - 1)])
+def test_a_lost_repeated_or_torn_record_is_found(
+    reader: RingReader, writer: RingWriter, name: str, slot: int, wrong: int
+):
+    for number in range(5):
+        write(writer, number)
+    steps_of(name)["sequence"][slot] = wrong
+    with pytest.raises(TransportError, match=f"got record {wrong} where {slot} should be; records were lost"):
+        reader.read(5)
+    with pytest.raises(TransportError, match="records were lost, repeated or torn"):
+        reader.read(5)  # and it stays found
+
+
+@settings(max_examples=100, deadline=None)
+@given(published=st.integers(0, 2**64 - 1), consumed=st.integers(0, 2**64 - 1))
+def test_impossible_indices_are_found(published: int, consumed: int):
+    reader = RingReader.create(f"gvz-test-{secrets.token_hex(6)}", CAPACITY, SHAPE)
+    assert reader.name is not None
+    words = words_of(reader.name)
+    words[0], words[8] = published, consumed
+    try:
+        if published == consumed:
+            assert len(reader.read(5)) == 0
+        else:  # too far apart, or records that were never written
+            with pytest.raises(TransportError, match=r"control words are damaged|records were lost"):
+                reader.read(5)
+    finally:
+        reader.close()
+
+
+def test_an_unknown_writer_state_is_found(reader: RingReader, name: str):
+    words_of(name)[2] = 77
+    with pytest.raises(TransportError, match=r"got writer state 77, want 0\.\.5"):
+        reader.writer_status()
+
+
+# ---- real processes
+
+_WRITER = """
+import sys
+from gvz.transport.ring import RingWriter
+name, capacity = sys.argv[1], int(sys.argv[2])
+writer = RingWriter.attach(name, capacity, (84, 84, 3))
+while True:
+    writer.wait_for_space(1, 60.0)
+    number = writer._next  # a counting game: all content follows from the record's number
+    writer.reserve()[...] = number % 251
+    writer.commit(episode=number, params_version=0, action=number % 1000, reward=0.0, lane=0, task=0, first=False,
+                  terminated=False, truncated=False)
+"""
+
+
+def test_killed_writers_lose_duplicate_and_tear_nothing(name: str):
+    """Writers are killed at random moments, most of them within a frame; each successor attaches to the same ring."""
+    reader = RingReader.create(name, 64, (84, 84, 3))
+    rng = np.random.default_rng(0)
+    count = 0
+    try:
+        for _ in range(6):
+            process = subprocess.Popen([sys.executable, "-c", _WRITER, name, "64"])
+            before, deadline = count, time.monotonic() + float(rng.uniform(0.05, 0.4)) + 30
+            while count < before + 200 + int(rng.integers(1000)):
+                assert time.monotonic() < deadline, "the writer delivers nothing"
+                block = reader.read(int(rng.integers(1, 64)))
+                numbers = np.arange(count, count + len(block))
+                np.testing.assert_array_equal(block.steps["episode"], numbers)
+                assert (block.frames == (numbers % 251).astype(np.uint8)[:, None, None, None]).all()
+                count += len(block)
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+    finally:
+        reader.close()
+    assert count > 1200
+
+
+def test_the_size_is_what_it_says(reader: RingReader, name: str):
+    size = (Path("/dev/shm") / name).stat().st_size
+    assert size == HEADER_BYTES + ring_bytes(reader.capacity, SHAPE)
