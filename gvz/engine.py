@@ -150,6 +150,10 @@ class Engine:
 
         return self._game.get_game_variable(getattr(vizdoom.GameVariable, name))
 
+    def variables(self) -> list[float]:
+        """Values of the configured variables, in their order, now; after the player's death too."""
+        return [self.variable(name) for name in self.config.variables]
+
     def tic(self) -> int:
         """Tics of the map so far, those before the episode's start included. Stands still once the player is dead."""
         return self._game.get_episode_time()
@@ -189,6 +193,11 @@ class Engine:
     @property
     def _name(self) -> str:
         return f"{self.instance_id} (pid {self.pid}, {self.config.wad.name})"
+
+
+def check_config(config: EngineConfig) -> None:
+    """Raises ConfigError for a button, variable or screen resolution that ViZDoom does not have."""
+    _make_game(config)
 
 
 def screen_resolutions() -> tuple[tuple[int, int], ...]:

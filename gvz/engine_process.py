@@ -15,15 +15,15 @@ import tempfile
 import threading
 import time
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO, Protocol
 
 from gvz import janitor
 from gvz.errors import EngineError, ResourceError
 
-_MAX_STARTING = 8
-"""engines of one user that start at the same time, over all processes; many at once fail (ViZDoom #355)"""
+_START_LOCKS = tuple(f"start-{place}" for place in range(min(8, max(2, os.cpu_count() or 1))))
+"""so many engines of one user start at the same time, over all processes; many at once fail (ViZDoom #355)"""
 _SHM_BYTES = 16 * 2**20
 """free shared memory a start needs: the three files of one engine take 10.8 MB"""
 _WATCH_PERIOD_S = 0.5
@@ -89,7 +89,7 @@ def start(game: Startable, directory: Path, log: Path, timeout_s: float) -> None
             "enlarge it (docker run --shm-size=1g, or mount -o remount,size=1g /dev/shm)"
         )
     attempt = _Attempt(game, directory)
-    with start_slot(deadline):
+    with one_of(_START_LOCKS, deadline):
         attempt.thread.start()
         try:
             attempt.thread.join(max(0.0, deadline - time.monotonic()))
@@ -137,20 +137,17 @@ class _Attempt:
 
 
 @contextlib.contextmanager
-def start_slot(deadline: float) -> Iterator[None]:
-    """Holds one of the machine's few start-up places: a locked file, given back even by a SIGKILL.
+def one_of(lock_names: Sequence[str], deadline: float) -> Iterator[None]:
+    """Holds one of the named locks, which all processes of this user share; a SIGKILL gives it back too.
 
     Raises:
         EngineError: none became free before `deadline` (monotonic seconds).
     """
-    num_slots = min(_MAX_STARTING, max(2, os.cpu_count() or 1))
     with contextlib.ExitStack() as stack:
-        files = [
-            stack.enter_context((janitor.runtime_dir() / f"start-{slot}.lock").open("w")) for slot in range(num_slots)
-        ]
+        files = [stack.enter_context((janitor.runtime_dir() / f"{name}.lock").open("w")) for name in lock_names]
         while not any(_try_lock(file) for file in files):
             if time.monotonic() > deadline:
-                raise EngineError(f"engine: none of {num_slots} start-up places became free in time")
+                raise EngineError(f"engine: other processes held {', '.join(lock_names)} for the whole time-out")
             time.sleep(0.005)
         yield
 
@@ -178,9 +175,12 @@ def end_if_ours(game: Startable, directory: Path, owner_pid: int) -> None:
 
 def log_tail(log: Path, num_lines: int = 8) -> str:
     """The last lines of an engine's log, ready to be put behind an error message."""
-    if not log.exists():
-        return "; it printed nothing"
-    lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    text = ""
+    if log.exists():
+        with log.open("rb") as file:
+            file.seek(max(0, log.stat().st_size - 4096))
+            text = file.read().decode(errors="replace")
+    lines = [line for line in text.splitlines() if line.strip()]
     return "; its last lines:\n  " + "\n  ".join(lines[-num_lines:]) if lines else "; it printed nothing"
 
 

@@ -1,12 +1,14 @@
 """The vocabulary of sizes that game, actors and learner share. Imports numpy and the standard library only."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from gvz.errors import ConfigError
 
 ActionSet = Literal["buttons", "combinations", "unified"]
 Profile = Literal["thesis", "levdoom"]
+Buffer = Literal["depth", "labels", "automap"]
+Interpolation = Literal["linear", "area"]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -33,6 +35,10 @@ class EnvConfig:
     """buttons: one button held an action; combinations: all non-contradictory sets; unified: one space for all"""
     profile: Profile = "thesis"
     """whose numbers where they differ: the thesis's text, or LevDoom's maps and settings"""
+    interpolation: Interpolation = "linear"
+    """how the rendered screen is shrunk; linear is ten times cheaper and loses nothing that matters (see env.py)"""
+    buffers: tuple[Buffer, ...] = ()
+    """more than the screen: observations become a dict of `screen` and these"""
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -45,6 +51,11 @@ class EnvConfig:
             value = getattr(self, name)
             if not low <= value <= high:
                 raise ConfigError(f"env.{name}: got {value}, want {low}..{high}")
+        for name, kind in (("action_set", ActionSet), ("profile", Profile), ("interpolation", Interpolation)):
+            if getattr(self, name) not in get_args(kind):
+                raise ConfigError(f"env.{name}: got {getattr(self, name)!r}, want one of {', '.join(get_args(kind))}")
+        if not set(self.buffers) <= set(get_args(Buffer)):
+            raise ConfigError(f"env.buffers: got {self.buffers!r}, want some of {', '.join(get_args(Buffer))}")
 
     @property
     def channels(self) -> int:

@@ -1,0 +1,93 @@
+"""Loads a scenario file in a sub-process, where an engine that cannot start does no harm. Imports gvz.engine.
+
+An engine that fails before its first frame takes its client with it, and ViZDoom plays another map without a word
+when it finds none in the file. So a file is loaded here once before it is trusted. `python -m gvz.probe` is the
+sub-process.
+"""
+
+import re
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+from gvz import janitor
+from gvz.engine import Engine, EngineConfig
+from gvz.engine_process import log_tail, one_of
+from gvz.errors import EngineError
+
+_FAULTS = re.compile(r"unknown|tried to register|script error|no map|not found|execution could not continue", re.I)
+"""what ZDoom prints, and then goes on as if nothing was wrong"""
+_MEMORY_BYTES = 4 * 2**30
+_TICS = 70
+
+
+def probe_wad(wad: Path, map_name: str = "MAP01", timeout_s: float = 60.0) -> str:
+    """Starts an engine on a file, plays two seconds of its map, reads the log.
+
+    Args:
+        wad: scenario file.
+        map_name: the map that must be in it.
+        timeout_s: for the whole of it.
+
+    Returns:
+        The engine's log.
+
+    Raises:
+        EngineError: it crashed, did not finish in time, or its log shows a fault; the message has the log's lines.
+    """
+    with tempfile.TemporaryDirectory(prefix="gvz-probe-") as directory:
+        log = Path(directory) / "engine.log"
+        command = [sys.executable, "-m", "gvz.probe", str(wad), map_name, str(log), str(timeout_s)]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
+        except subprocess.TimeoutExpired as error:
+            raise EngineError(f"{wad}: not loaded within {timeout_s:g} s{log_tail(log)}") from error
+        finally:
+            janitor.clean_dead_instances()  # a crashed client cleans up nothing
+        text = log.read_text(errors="replace") if log.exists() else ""
+        faults = [line for line in text.splitlines() if _FAULTS.search(line)]
+        if done.returncode != 0 or faults:
+            what = f"the engine crashed (exit code {done.returncode})" if done.returncode < 0 else "cannot be played"
+            lines = faults[:8] or done.stderr.strip().splitlines()[-1:]
+            raise EngineError(f"{wad}: {what}: {'; '.join(lines)}{log_tail(log)}")
+        return text
+
+
+def ensure_loads(wad: Path, timeout_s: float = 60.0) -> None:
+    """`probe_wad`, once for each content-addressed file and version of ViZDoom: success leaves a marker beside it.
+
+    Raises:
+        EngineError: as probe_wad.
+    """
+    marker = wad.with_suffix(f".loads-{version('vizdoom')}")
+    if marker.exists():
+        return
+    with one_of([f"probe-{wad.stem[:64]}"], time.monotonic() + timeout_s):
+        if not marker.exists():
+            probe_wad(wad, timeout_s=timeout_s)
+            marker.touch()
+
+
+def _main(wad: str, map_name: str, log: str, timeout_s: float) -> None:
+    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
+    resource.setrlimit(resource.RLIMIT_CPU, (int(timeout_s) + 1, int(timeout_s) + 1))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    config = EngineConfig(
+        wad=Path(wad), map_name=map_name, buttons=(), variables=(), log=Path(log), step_timeout_s=timeout_s / 4
+    )
+    engine = Engine(config)
+    try:
+        engine.new_episode(seed=0)
+        engine.step([], _TICS)
+    except EngineError as error:
+        sys.exit(str(error).splitlines()[0])
+    finally:
+        engine.close()
+
+
+if __name__ == "__main__":
+    _main(sys.argv[1], sys.argv[2], sys.argv[3], float(sys.argv[4]))
