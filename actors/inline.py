@@ -64,15 +64,13 @@ class InlinePool:
             self._published = (params.copy(), header)
             self._loop.set_params(*self._published)
 
-    def wait_for_records(self, timeout_s: float) -> None:
-        """Returns at once: `drain` plays until it has what it is asked for."""
-
-    def drain(self, max_records: int) -> list[StepBlock]:
-        """Plays until there are `max_records` records and returns exactly so many.
+    def drain(self, max_records: int, wait_s: float = 0.0) -> list[StepBlock]:
+        """Plays until there are `max_records` records and returns exactly so many; there is nothing to wait for.
 
         Raises:
             ValueError: no parameters were published.
         """
+        assert wait_s >= 0.0
         if self._needs_params and self._published is None:
             raise ValueError("drain: publish parameters first")
         blocks: list[StepBlock] = []

@@ -30,8 +30,6 @@ class Game:
     """uint8[H, W, stack_size * C], a view of the batch that the policy sees"""
     episode: int
     """number within the lane"""
-    num_recycled: int = 0
-    """episodes since the engine started"""
     seed: int = 0
     frame: np.ndarray = field(default_factory=lambda: np.empty(0, np.uint8))
     """uint8[H, W, C], o_t"""
@@ -121,7 +119,6 @@ class ActorLoop:
                 "episode": game.episode,
                 "actions": list(game.actions),
                 "params_version": game.params_version,
-                "num_recycled": game.num_recycled,
                 "frame_crc": zlib.crc32(game.frame.tobytes()),
             }
             for game in self.games
@@ -185,11 +182,6 @@ class ActorLoop:
             )
         )
         game.episode += 1
-        game.num_recycled += 1
-        if 0 < self._spec.recycle_episodes <= game.num_recycled:
-            self._ring.beat(WriterState.RESETTING)
-            game.env.close()
-            game.env, game.num_recycled = self._make_env(game.task), 0
         self._reset(game)
 
     def _reset(self, game: Game) -> None:
@@ -209,7 +201,6 @@ class ActorLoop:
     def _replay(self, game: Game, state: dict[str, Any]) -> None:
         """Brings a game to where `state` left it: same episode, same seed, same actions."""
         game.episode, game.params_version = state["episode"], state["params_version"]
-        game.num_recycled = state["num_recycled"]
         self._reset(game)
         for action in state["actions"]:
             self._ring.beat(WriterState.RESETTING)

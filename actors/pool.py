@@ -1,8 +1,7 @@
 """The pool of actor processes: starts them, watches them, takes their records. Imports gvz (tier 0) and actors.
 
-`ActorPool` and `actors.inline.InlinePool` have one interface: `publish`, `wait_for_records`, `drain`, `poll`,
-`state`, `statistics`, `close`. Neither starts a thread: all watching happens in `poll`, which the learner calls in
-every round.
+`ActorPool` and `actors.inline.InlinePool` have one interface: `publish`, `drain`, `poll`, `state`, `statistics`,
+`close`. Neither starts a thread: all watching happens in `poll`, which the learner calls in every round.
 """
 
 import os
@@ -21,7 +20,7 @@ from gvz import janitor
 from gvz.errors import ConfigError, ResumeError, WorkerError
 from gvz.transport.broadcast import BroadcastWriter, broadcast_bytes
 from gvz.transport.messages import ActorSpec, EpisodeStats, Fault, Message, ParamsHeader, Ready, StepBlock
-from gvz.transport.ring import RingReader, WriterStatus, ring_bytes
+from gvz.transport.ring import RingReader, WriterState, WriterStatus, ring_bytes
 
 STOP_TIMEOUT_S = 5.0
 """how long actors may take over their last step, and then over SIGTERM"""
@@ -46,7 +45,7 @@ class PoolConfig:
     env_entry_point: str
     """`module:callable`, called as f(task_id, env_config) -> gymnasium.Env"""
     env_config: dict[str, Any]
-    """of plain types: it travels as msgpack"""
+    """of plain types: it travels as msgpack; `recycle_episodes` is added to it"""
     frame_shape: tuple[int, int, int]
     """(H, W, C)"""
     stack_size: int
@@ -98,7 +97,7 @@ class PoolConfig:
                     first_episodes=[first_episodes[lane] for lane in lanes],
                     seed=self.seed,
                     env_entry_point=self.env_entry_point,
-                    env_config=self.env_config,
+                    env_config={**self.env_config, "recycle_episodes": self.actors.recycle_episodes},
                     frame_shape=list(self.frame_shape),
                     stack_size=self.stack_size,
                     num_actions=self.num_actions,
@@ -109,7 +108,6 @@ class PoolConfig:
                     num_params=self.num_params,
                     layout_hash=self.layout_hash,
                     work_dir=str(self.work_dir.absolute()),
-                    recycle_episodes=self.actors.recycle_episodes,
                 )
             )
         return specs
@@ -128,7 +126,7 @@ class PoolStatistics:
     waited_for_space_s: float
     """seconds actors waited for the learner to read, summed over actors"""
     waited_for_records_s: float
-    """seconds the learner spent in `wait_for_records`"""
+    """seconds the learner waited in `drain`"""
 
 
 @dataclass(kw_only=True, slots=True)
@@ -201,19 +199,21 @@ class ActorPool:
         if self._board is not None:
             self._board.publish(params, header)
 
-    def wait_for_records(self, timeout_s: float) -> None:
-        """Waits until some actor has written a record, at most `timeout_s`; the time is counted."""
-        start = time.monotonic()
-        while not any(actor.ring.num_unread for actor in self._actors) and time.monotonic() - start < timeout_s:
-            time.sleep(_WAIT_SLEEP_S)
-        self._waited_s += time.monotonic() - start
+    def drain(self, max_records: int, wait_s: float = 0.0) -> list[StepBlock]:
+        """Takes up to `max_records` records, an equal share from every actor as far as it has them.
 
-    def drain(self, max_records: int) -> list[StepBlock]:
-        """Takes up to `max_records` records, an equal share from every actor as far as it has them. Never waits.
+        Args:
+            max_records: bound on the sum of the blocks' lengths.
+            wait_s: how long to wait if there is no record at all; the time is counted, the result may be empty.
 
         Raises:
             TransportError: a record was lost, repeated or torn.
         """
+        start = time.monotonic()
+        while not any(actor.ring.num_unread for actor in self._actors) and time.monotonic() - start < wait_s:
+            time.sleep(_WAIT_SLEEP_S)
+        if wait_s > 0.0:
+            self._waited_s += time.monotonic() - start
         first = self._first_drained
         self._first_drained = (first + 1) % len(self._actors)
         # the emptiest first: what they leave of their share goes to the others
@@ -317,20 +317,21 @@ class ActorPool:
         self._messages.append(message)
 
     def _is_stuck(self, actor: _Actor, watched_s: float) -> bool:
-        heartbeat_ns = actor.ring.writer_status().heartbeat_ns
-        if actor.ready_at is not None and heartbeat_ns != actor.heartbeat_ns:
+        status, limits = actor.ring.writer_status(), self._config.actors
+        if actor.ready_at is not None and status.heartbeat_ns != actor.heartbeat_ns:
             actor.silent_s = 0.0
         else:
             actor.silent_s += watched_s
-        actor.heartbeat_ns = heartbeat_ns
-        limits = self._config.actors
-        return actor.silent_s > (limits.start_timeout_s if actor.ready_at is None else limits.heartbeat_timeout_s)
+        actor.heartbeat_ns = status.heartbeat_ns
+        # to start an engine takes its time, also when it is started again in the middle of a run
+        acting = actor.ready_at is not None and status.state != WriterState.RESETTING
+        return actor.silent_s > (limits.heartbeat_timeout_s if acting else limits.start_timeout_s)
 
     def _silence(self, actor: _Actor) -> str:
         state = actor.ring.writer_status().state.name.lower()
         if actor.ready_at is None:
             return f"had not started its games after {actor.silent_s:.1f} s (actors.start_timeout_s)"
-        return f"gave no sign of life for {actor.silent_s:.1f} s (actors.heartbeat_timeout_s) while {state}"
+        return f"gave no sign of life for {actor.silent_s:.1f} s while {state} (actors.heartbeat_timeout_s)"
 
     def _replace(self, actor: _Actor, now: float, kind: str, what: str) -> None:
         """Ends what is left of an actor's process and plans the next, if the budget allows."""

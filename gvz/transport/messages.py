@@ -145,8 +145,6 @@ class ActorSpec:
     """hash of the parameter tree, as in ParamsHeader"""
     work_dir: str
     """private directory for the engines' files and the worker's logs"""
-    recycle_episodes: int = 0
-    """restart an engine after so many episodes (0: never); ViZDoom has leaked memory over hours"""
 
 
 Message = EpisodeStats | Ready | Fault | Stop | ActorSpec
