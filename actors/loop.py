@@ -95,7 +95,7 @@ class ActorLoop:
             self._policy.num_calls = state["num_calls"]
 
     def set_params(self, params: np.ndarray, header: ParamsHeader) -> None:
-        """Acts by `params` float32[P] (copied) from now on."""
+        """Acts by `params` float32[P] from now on, which nobody may change any more."""
         self._policy.set_params(params, header)
         self._params_version = header.version
 

@@ -16,7 +16,7 @@ class Policy(Protocol):
     """acting steps so far; with the seed it determines every random choice"""
 
     def set_params(self, params: np.ndarray, header: ParamsHeader) -> None:
-        """Acts by these parameters from now on. `params` float32[P] is copied."""
+        """Acts by `params` float32[P] from now on, which nobody may change any more."""
         ...
 
     def act(self, obs: np.ndarray, task: np.ndarray, /) -> np.ndarray:
@@ -68,9 +68,8 @@ class ExportedPolicy:
         self.num_calls = 0
 
     def set_params(self, params: np.ndarray, header: ParamsHeader) -> None:
-        self._params = self._jax.device_put(params, self._cpu, may_alias=False)
+        self._params = self._jax.device_put(params, self._cpu)  # no copy if aligned, whatever may_alias says
         self._epsilon = self._jax.device_put(np.float32(header.epsilon), self._cpu)
-        self._params.block_until_ready()  # the caller reuses its buffer
 
     def act(self, obs: np.ndarray, task: np.ndarray, /) -> np.ndarray:
         num_calls = np.uint32(self.num_calls % 2**32)

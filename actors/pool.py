@@ -17,13 +17,12 @@ import numpy as np
 from actors.config import ActorsConfig
 from actors.process import ActorProcess
 from gvz import janitor
-from gvz.errors import ConfigError, ResumeError, WorkerError
+from gvz.errors import ConfigError, ResumeError, TransportError, WorkerError
 from gvz.transport.broadcast import BroadcastWriter, broadcast_bytes
 from gvz.transport.messages import ActorSpec, EpisodeStats, Fault, Message, ParamsHeader, Ready, StepBlock
 from gvz.transport.ring import RingReader, WriterState, WriterStatus, ring_bytes
 
 STOP_TIMEOUT_S = 5.0
-"""how long actors may take over their last step, and then over SIGTERM"""
 _DUMP_S = 0.5
 """time given to a stuck actor to write its stacks before it is killed"""
 _STABLE_S = 10.0
@@ -268,23 +267,28 @@ class ActorPool:
         """What each actor is at, in order."""
         return [actor.ring.writer_status() for actor in self._actors]
 
-    def close(self) -> None:
-        """Ends every process within bounded time and removes every segment. Can be repeated."""
+    def close(self, *, grace_s: float = STOP_TIMEOUT_S) -> None:
+        """Ends every process and removes every segment. Can be repeated.
+
+        Args:
+            grace_s: how long actors may take over their last step, and as long again over SIGTERM before SIGKILL.
+        """
         processes = [actor.process for actor in self._actors if actor.process is not None]
-        for process in processes:
-            process.ask_to_stop()
-        deadline = time.monotonic() + STOP_TIMEOUT_S
-        for process in processes:
-            process.wait(max(0.0, deadline - time.monotonic()))
-        deadline = time.monotonic() + STOP_TIMEOUT_S
-        for actor in self._actors:
-            if actor.process is not None:
-                actor.process.end(grace_s=max(0.0, deadline - time.monotonic()))
+        try:
+            for process in processes:
+                process.ask_to_stop()
+            deadline = time.monotonic() + grace_s
+            for process in processes:
+                process.wait(max(0.0, deadline - time.monotonic()))
+        finally:  # also when a second Ctrl-C ends the wait
+            deadline = time.monotonic() + grace_s
+            for process in processes:
+                process.end(grace_s=max(0.0, deadline - time.monotonic()))
+            for actor in self._actors:
                 actor.process, actor.ready_at = None, None
-            actor.ring.close()
-        if self._board is not None:
-            self._board.close()
-        if processes:
+                actor.ring.close()
+            if self._board is not None:
+                self._board.close()
             janitor.clean_dead_instances()
 
     def _start(self, actor: _Actor) -> None:
@@ -298,8 +302,11 @@ class ActorPool:
                 self._start(actor)
             return
         exit_text = actor.process.exit_text()  # first: what it said before its end is then all there
-        for message in actor.process.receive():
-            self._take(actor, message, now)
+        try:
+            for message in actor.process.receive():
+                self._take(actor, message, now)
+        except TransportError as error:  # its process is beside itself, the others are not
+            exit_text = f"sent something else than a message ({error})"
         if exit_text is not None:
             self._replace(actor, now, "died", exit_text)
         elif actor.kill_at is not None:
@@ -317,21 +324,23 @@ class ActorPool:
         self._messages.append(message)
 
     def _is_stuck(self, actor: _Actor, watched_s: float) -> bool:
-        status, limits = actor.ring.writer_status(), self._config.actors
+        status = actor.ring.writer_status()
         if actor.ready_at is not None and status.heartbeat_ns != actor.heartbeat_ns:
             actor.silent_s = 0.0
         else:
             actor.silent_s += watched_s
         actor.heartbeat_ns = status.heartbeat_ns
-        # to start an engine takes its time, also when it is started again in the middle of a run
-        acting = actor.ready_at is not None and status.state != WriterState.RESETTING
-        return actor.silent_s > (limits.heartbeat_timeout_s if acting else limits.start_timeout_s)
+        return actor.silent_s > getattr(self._config.actors, self._patience(actor))
+
+    def _patience(self, actor: _Actor) -> str:
+        """Which setting bounds the actor's silence: to start an engine takes its time, also in mid-run."""
+        acting = actor.ready_at is not None and actor.ring.writer_status().state != WriterState.RESETTING
+        return "heartbeat_timeout_s" if acting else "start_timeout_s"
 
     def _silence(self, actor: _Actor) -> str:
+        what = "had not started its games after" if actor.ready_at is None else "gave no sign of life for"
         state = actor.ring.writer_status().state.name.lower()
-        if actor.ready_at is None:
-            return f"had not started its games after {actor.silent_s:.1f} s (actors.start_timeout_s)"
-        return f"gave no sign of life for {actor.silent_s:.1f} s while {state} (actors.heartbeat_timeout_s)"
+        return f"{what} {actor.silent_s:.1f} s (actors.{self._patience(actor)}); it was {state}"
 
     def _replace(self, actor: _Actor, now: float, kind: str, what: str) -> None:
         """Ends what is left of an actor's process and plans the next, if the budget allows."""

@@ -70,11 +70,10 @@ class Worker:
 
     def _take_params(self) -> bool:
         """Acts by the newest parameters from now on; False if there are none newer."""
-        header = self._board.read() if self._board else None
-        if self._board is None or header is None:
-            return False
-        self._loop.set_params(self._board.params, header)
-        return True
+        newest = self._board.read() if self._board else None
+        if newest is not None:
+            self._loop.set_params(*newest)
+        return newest is not None
 
     def _wait_for_params(self) -> bool:
         """Waits for the first version; False if told to stop first."""

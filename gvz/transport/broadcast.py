@@ -14,7 +14,7 @@ import numpy as np
 
 from gvz.errors import WaitTimeoutError
 from gvz.transport.messages import ParamsHeader
-from gvz.transport.segment import Fence, Segment, aligned, hash_layout
+from gvz.transport.segment import ALIGN_BYTES, Fence, Segment, aligned, hash_layout
 
 _TICKET, _VERSION, _NUM_UPDATES, _EPSILON_BITS, _NUM_WORDS = 0, 1, 2, 3, 8
 """u64 words before each slot's vector; the payload starts with as many, of which the first counts publications"""
@@ -101,11 +101,10 @@ class BroadcastWriter(_Board):
 
 
 class BroadcastReader(_Board):
-    """An actor's end. Takes whole versions into `params`, a buffer of its own."""
+    """An actor's end."""
 
     def __init__(self, segment: Segment, num_params: int, num_slots: int, layout_hash: int):
         super().__init__(segment, num_params, num_slots, layout_hash)
-        self.params = np.empty(num_params, np.float32)
         self._seen = 0  # publications
 
     @classmethod
@@ -122,20 +121,25 @@ class BroadcastReader(_Board):
         )
         return cls(segment, num_params, num_slots, layout_hash)
 
-    def read(self) -> ParamsHeader | None:
-        """Copies the newest version into `params` if it is newer than the last one read; None if there is none.
+    def read(self) -> tuple[np.ndarray, ParamsHeader] | None:
+        """The newest version, float32[P] and its header, if it is newer than the last one read; else None.
+
+        The vector is the caller's own and aligned such that XLA on a CPU takes it without another copy.
 
         Raises:
             WaitTimeoutError: overtaken by the writer again and again.
         """
-        start = time.monotonic()
-        while (count := self._count[0]) != self._seen:
+        if self._count[0] == self._seen:
+            return None
+        params, start = _empty_aligned(self.num_params), time.monotonic()
+        while True:
+            count = self._count[0]
             slot = (count - 1) % len(self._words)
             words = self._words[slot]
             self._fence()
             ticket = words[_TICKET]
             self._fence()
-            np.copyto(self.params, self._vectors[slot])
+            params[:] = self._vectors[slot]
             epsilon = struct.unpack("<d", struct.pack("<Q", words[_EPSILON_BITS]))[0]
             header = ParamsHeader(
                 version=words[_VERSION],
@@ -146,13 +150,12 @@ class BroadcastReader(_Board):
             self._fence()
             if ticket % 2 == 0 and words[_TICKET] == ticket:
                 self._seen = count
-                return header
+                return params, header
             if time.monotonic() - start > _READ_TIMEOUT_S:
                 raise WaitTimeoutError(
                     f"broadcast {self.name}: reader waited {_READ_TIMEOUT_S:.0f} s for a whole version; the writer "
                     "overtook every copy: raise learner.publish_period_updates"
                 )
-        return None
 
 
 def broadcast_bytes(num_params: int, num_slots: int = 3) -> int:
@@ -162,3 +165,10 @@ def broadcast_bytes(num_params: int, num_slots: int = 3) -> int:
 
 def _slot_bytes(num_params: int) -> int:
     return 8 * _NUM_WORDS + aligned(4 * num_params)
+
+
+def _empty_aligned(num_params: int) -> np.ndarray:
+    spare = ALIGN_BYTES // 4
+    array = np.empty(num_params + spare, np.float32)
+    start = -array.ctypes.data % ALIGN_BYTES // 4
+    return array[start : start + num_params]

@@ -1,7 +1,7 @@
-"""A game that counts, for faults of the pool itself: everything in its frames can be predicted.
+"""A game that counts, for faults of the pool itself, and what its records must look like.
 
-Bytes 0..3 of a frame are the seed, bytes
-4..7 the number of steps since reset, the rest (seed + steps) mod 251. The reward of step t is t.
+Bytes 0..3 of a frame are the episode's seed, bytes 4..7 the decisions since it began, all others (seed + decisions)
+mod 251. The reward of the t-th decision is t, the score the sum of the actions.
 """
 
 import os
@@ -12,6 +12,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+
+from actors.config import ActorsConfig
+from actors.loop import derive_seed
+from actors.pool import PoolConfig
+from gvz.transport.messages import StepBlock
 
 FRAME_SHAPE = (12, 10, 3)
 
@@ -24,10 +29,11 @@ def frame(seed: int, num_steps: int) -> np.ndarray:
 
 
 class CountingEnv(gymnasium.Env[np.ndarray, int]):
-    """Options: length (decisions an episode), end ("terminated" or "truncated"), step_s (sleep), fault and fault_at.
+    """A game made of options.
 
-    A fault strikes at the `fault_at`-th step of the process's life, once in the life of the file `fault_file` (each
-    time if it is not given): raise, segfault, hang (in Python), crash (the engine's own way), no_reset.
+    length: decisions an episode. end: "terminated" or "truncated". step_s: seconds a decision takes.
+    fault: raise, segfault, hang, crash (the engine's own way) at decision `fault_at` of the process's life, or
+    no_start; each time, or once if there is a `fault_file`; in all tasks, or in `fault_task`.
     """
 
     def __init__(self, task: str, options: dict[str, Any]):
@@ -36,7 +42,7 @@ class CountingEnv(gymnasium.Env[np.ndarray, int]):
         self.task = task
         self.options = options
         self.seed_, self.num_steps, self.life_steps, self.action_sum = 0, 0, 0, 0
-        if options.get("fault") == "no_start":
+        if options.get("fault") == "no_start" and self.strike():
             raise RuntimeError("no engine today")
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
@@ -51,7 +57,7 @@ class CountingEnv(gymnasium.Env[np.ndarray, int]):
         self.num_steps += 1
         self.life_steps += 1
         self.action_sum += action
-        crashed = self.life_steps == self.options.get("fault_at") and self.strike()
+        crashed = self.life_steps == self.options.get("fault_at") and self.strike() and self.options["fault"] == "crash"
         over = self.num_steps >= self.options["length"]
         terminated = over and self.options.get("end", "terminated") == "terminated"
         info = self.info({"count": float(self.num_steps), "action": 0.0})
@@ -70,9 +76,10 @@ class CountingEnv(gymnasium.Env[np.ndarray, int]):
         }
 
     def strike(self) -> bool:
-        """Does the fault, unless it has struck before; True if the engine is to look crashed."""
-        file = self.options.get("fault_file")
-        if file is not None:
+        """Does the fault if it is this task's and has not struck before."""
+        if self.options.get("fault_task", self.task) != self.task:
+            return False
+        if (file := self.options.get("fault_file")) is not None:
             try:
                 os.close(os.open(file, os.O_CREAT | os.O_EXCL))
             except FileExistsError:
@@ -83,10 +90,74 @@ class CountingEnv(gymnasium.Env[np.ndarray, int]):
             case "segfault":
                 os.kill(os.getpid(), signal.SIGSEGV)
             case "hang":
-                Path(self.options["work_dir"], "hanging").touch()
                 time.sleep(3600)
-        return self.options["fault"] == "crash"
+        return True
 
 
 def make(task: str, options: dict[str, Any]) -> CountingEnv:
     return CountingEnv(task, options)
+
+
+def config(
+    work_dir: Path, options: dict[str, Any], *, actors: ActorsConfig | None = None, **changes: Any
+) -> PoolConfig:
+    """A pool of 2 actors with 2 games each of tasks a and b, that play at random."""
+    defaults: dict[str, Any] = {
+        "tasks": ("a", "b"),
+        "num_actors": 2,
+        "games_per_actor": 2,
+        "seed": 1,
+        "stack_size": 4,
+        "policy": b"",
+        "num_params": 0,
+        "layout_hash": 0,
+    }
+    return PoolConfig(
+        env_entry_point="fake_env:make",
+        env_config={"length": 10, **options},
+        frame_shape=FRAME_SHAPE,
+        num_actions=5,
+        actors=ActorsConfig() if actors is None else actors,
+        work_dir=work_dir,
+        **{**defaults, **changes},
+    )
+
+
+class Checker:
+    """Follows every lane's stream of records and counts; anything lost, repeated, torn or mixed up fails."""
+
+    def __init__(self, config: PoolConfig):
+        self.config = config
+        self.num_records = 0
+        self.num_cuts = 0
+        """episodes whose stream stopped before its last record"""
+        self._last: dict[int, np.void] = {}
+
+    def add(self, blocks: list[StepBlock]) -> None:
+        for block in blocks:
+            for step, picture in zip(block.steps, block.frames, strict=True):
+                self._add(step, picture)
+
+    def _add(self, step: np.void, picture: np.ndarray) -> None:
+        lane, task, episode = int(step["lane"]), int(step["task"]), int(step["episode"])
+        assert task == lane % len(self.config.tasks)
+        last = self._last.get(lane)
+        t = int(step["reward"])
+        seed = derive_seed(self.config.seed, task, lane, episode)
+        np.testing.assert_array_equal(picture, frame(seed, t))
+        over = t == self.config.env_config["length"]
+        assert bool(step["first"]) == (t == 0)
+        assert bool(step["terminated"]) == (over and self.config.env_config.get("end") != "truncated")
+        if self.config.env_config.get("fault") != "crash":
+            assert bool(step["truncated"]) == (over and self.config.env_config.get("end") == "truncated")
+        assert 0 <= step["action"] < self.config.num_actions
+        if last is not None and not step["first"]:
+            assert episode == last["episode"]
+            assert t == last["reward"] + 1
+        elif last is not None:
+            assert episode > last["episode"]
+            self.num_cuts += not (last["terminated"] or last["truncated"])
+        else:
+            assert step["first"]
+        self._last[lane] = step.copy()
+        self.num_records += 1
