@@ -34,8 +34,8 @@ from gvz.wad.acs.syntax import (
     Variable,
 )
 
-MAX_NESTING = 32
-"""statements and parentheses inside each other; keeps every recursion over a tree far from Python's limit"""
+MAX_NESTING = 64
+"""statements and operands inside each other; keeps every recursion over a tree far from Python's limit"""
 
 TYPES = ("int", "str", "bool")
 SCRIPT_TYPES = ("open", "enter", "respawn", "death", "disconnect")
@@ -357,26 +357,25 @@ class _Parser:
 
     def _expression(self, lowest: int = 1) -> Expression:
         """Binary operators of level `lowest` and above, by precedence climbing."""
+        self._enter(self.token.at)
         left = self._unary()
         while self.token.kind == "symbol" and PRECEDENCE.get(self.token.text, 0) >= lowest:
             operator = self._advance()
             right = self._expression(PRECEDENCE[operator.text] + 1)
             left = Binary(operator.at, operator.text, left, right)
+        self._depth -= 1
         return left
 
     def _unary(self) -> Expression:
         start = self.token
+        if self._accept("++", "--"):
+            return Increment(start.at, start.text, self._target(), is_prefix=True)
+        if not self._accept("-", "+", "!", "~"):
+            return self._primary()
         self._enter(start.at)
-        if self._accept("-", "!", "~"):
-            expression: Expression = Unary(start.at, start.text, self._unary())
-        elif self._accept("+"):
-            expression = self._unary()
-        elif self._accept("++", "--"):
-            expression = Increment(start.at, start.text, self._target(), is_prefix=True)
-        else:
-            expression = self._primary()
+        operand = self._unary()
         self._depth -= 1
-        return expression
+        return operand if start.text == "+" else Unary(start.at, start.text, operand)
 
     def _primary(self) -> Expression:
         token = self.token

@@ -10,8 +10,8 @@ from gvz.wad.acs.intrinsics import Intrinsic, constants, intrinsics
 from gvz.wad.acs.lexer import Position, error
 from gvz.wad.acs.syntax import Function
 
-MAX_LOCALS = 256
-"""variables, or arrays, of one script or function: their numbers are one byte in the code"""
+MAX_LOCALS = 255
+"""variables, or arrays, of one script or function: numbers and counts are one byte in the object file"""
 MAX_MAP_VARIABLES = 128
 MAX_FUNCTIONS = 256
 MAX_STRINGS = 32768
