@@ -71,7 +71,7 @@ class Rewarder:
     def reset(self, variables: Variables) -> None:
         """Starts an episode with the variables that came with its first observation."""
         self._history.clear()
-        self._history.append(dict(variables))
+        self._history.append(variables)
 
     def step(self, variables: Variables, terminated: bool) -> dict[str, float]:
         """Rewards of one decision, by component, weights applied; the reward is their sum.
@@ -81,6 +81,6 @@ class Rewarder:
             terminated: the episode ended by the rules (a time-out is not).
         """
         assert self._history, "Rewarder.step before reset"
-        self._history.append(dict(variables))
-        history = tuple(self._history)
+        self._history.append(variables)
+        history = self._history
         return {name: self.weights[name] * event(history, terminated) for name, event in self._events.items()}

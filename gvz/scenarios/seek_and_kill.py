@@ -110,20 +110,24 @@ ACTOR MarineChainsawVzd : MarineChainsaw
 }
 """
 
-BORN_SOUL = """\
+
+def _born_soul(health: int) -> dict[str, str]:
+    """The soul a Pain Elemental spits out: a class whose death is counted like that of any other enemy."""
+    definition = f"""\
 ACTOR BornSoul : LostSoul replaces LostSoul
-{
-  Health 1
+{{
+  Health {health}
   States
-  {
+  {{
   Spawn:
     SKUL A 0
     SKUL A 0 A_SetSpecial(226, 4)
     Goto Super::Spawn
-  }
-}
+  }}
+}}
 """
-"""a soul spat out by a Pain Elemental: 1 health as every enemy has, and its killer is known like any other's"""
+    return {"BornSoul": definition}
+
 
 SPOTS = ((640, 1728), (384, 1088), (1152, 1600), (1216, 1024), (1184, 352), (640, 192), (64, 864), (352, 656))
 """ours: eight starts beside the base map's twelve; at least 130 units from those and from every obstacle"""
@@ -233,9 +237,9 @@ SCENARIO = Scenario(
             content=Content(
                 parameters={"classes": STRONG, "num_per_class": 3, "first_delay": 180, "spawn_delay": 180},
                 agent={"Invulnerable": "TRUE"},
-                actors={"BornSoul": BORN_SOUL},
+                actors=_born_soul(1),
             ),
-            levdoom=Content(parameters={"first_delay": 0}),
+            levdoom=Content(parameters={"first_delay": 0}, actors=_born_soul(100)),
         ),
     ),
     complete=("blue", "obstacles", "resized_enemies", "shadows", "mixed_enemies"),
@@ -243,7 +247,7 @@ SCENARIO = Scenario(
         "complete": Content(
             textures=Textures("ICKWALL3", "FLAT14", "CEIL4_3"),
             parameters={"classes": MIXED + STRONG},
-            actors={"BornSoul": BORN_SOUL},
+            actors=_born_soul(100),
         ),
     },
     tasks=(
