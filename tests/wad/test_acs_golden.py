@@ -52,8 +52,7 @@ def pairs_in(package: str, folder: str) -> list[Pair]:
         texts = [lump.data.decode("latin-1") for lump in lumps if lump.name == "DECORATE"]
         actors = [name for text in texts for name in declared_actors(text)]
         pairs += [
-            Pair(file, name, level["SCRIPTS"], level["BEHAVIOR"], actors)
-            for name, level in read_maps(lumps).items()
+            Pair(file, name, level["SCRIPTS"], level["BEHAVIOR"], actors) for name, level in read_maps(lumps).items()
         ]
     return pairs
 

@@ -16,10 +16,11 @@ SOURCES = [
     read_maps(read_wad(scenario_wad(f"{name}.wad")))["MAP01"]["SCRIPTS"].decode("latin-1")
     for name in ("defend_the_center", "defend_the_line", "basic_notifications", "predict_position")
 ]
-WORDS = sorted({token.text for source in SOURCES for token in tokenize(source)} - {""}) + [
-    *("switch", "case", "default", "do", "until", "continue", "break", "return", "terminate", "#define", "static"),
-    *("0x7fffffff", "2147483647", "0.0", '"', '"x"', "'", "/*", "*/", "//", "\n", "\\", "??", "<<=", "DISCONNECT"),
-]
+WORDS = sorted(
+    {token.text for source in SOURCES for token in tokenize(source) if token.text}
+    | set("switch case default do until continue break return terminate #define static DISCONNECT".split())
+    | {"0x7fffffff", "2147483647", "0.0", '"', '"x"', "'", "/*", "*/", "//", "\n", "\\", "??", "<<="}
+)
 
 
 def compile_or_refuse(source: str) -> bool:
@@ -27,12 +28,14 @@ def compile_or_refuse(source: str) -> bool:
     try:
         behavior = compile_acs(source, actor_classes=["MarineChainsawVzd"])
     except AcsError as error:
-        lines = source.split("\n")
-        assert 1 <= error.line <= len(lines)
-        assert 1 <= error.column <= len(lines[error.line - 1]) + 1
-        return False
-    assert behavior.startswith(b"ACS\0")
-    return True
+        refusal = error
+    else:
+        assert behavior.startswith(b"ACS\0")
+        return True
+    lines = source.split("\n")
+    assert 1 <= refusal.line <= len(lines)
+    assert 1 <= refusal.column <= len(lines[refusal.line - 1]) + 1
+    return False
 
 
 @settings(max_examples=300, deadline=None)

@@ -60,7 +60,8 @@ def error_of(source: str, **options) -> AcsError:
         ("int x = -1;", "a7 01 4e 19 00"),
         ("int x = 0.5;", "03 00800000 19 00"),
         ("int x = 0xFF, y = x;", "a7 ff 19 00 1c 00 19 01"),
-        ("int x; x += 1; x -= 2; x *= 3; x /= 4; x %= 5;", "a7 01 1f 00 a7 02 22 00 a7 03 25 00 a7 04 28 00 a7 05 2b 00"),
+        ("int x; x += 1; x -= 2; x *= 3;", "a7 01 1f 00 a7 02 22 00 a7 03 25 00"),
+        ("int x; x /= 4; x %= 5;", "a7 04 28 00 a7 05 2b 00"),
         ("int x; x++; ++x; x--; --x;", "2e 00 2e 00 31 00 31 00"),
         ("int x; x = x++ + --x;", "1c 00 2e 00 31 00 1c 00 0e 19 00"),
         ("int x = 1 + 2 * 3 - 4 % 2;", "b1 01 02 03 10 0e b0 04 02 12 0f 19 00"),
@@ -158,18 +159,18 @@ def test_switch_jumps_through_a_sorted_table():
     table = position + 2 + -(position + 2) % 4
     count, first, address_of_first, second, address_of_second = struct.unpack_from("<IiIiI", behavior, table)
     assert (count, first, second) == (2, -2, 7)
-    assert behavior[address_of_first :].startswith(bytes.fromhex("a702 1900"))
-    assert behavior[address_of_second :].startswith(bytes.fromhex("a701 1900"))
+    assert behavior[address_of_first:].startswith(bytes.fromhex("a702 1900"))
+    assert behavior[address_of_second:].startswith(bytes.fromhex("a701 1900"))
     assert behavior[table + 20] == 54  # DROP, then on to default
 
 
 def test_break_and_continue_leave_and_repeat_the_innermost_loop():
     # do { continue; break; } while (x):  GOTO test, GOTO end, test: PUSH x, IFGOTO top, end:
-    assert body("int x; do { continue; break; } while (x);").hex() == "3412000000" "3419000000" "1c00" "3508000000"
+    assert body("int x; do { continue; break; } while (x);").hex() == "341200000034190000001c003508000000"
     # while (x) { break; }:  top: PUSH x, IFNOTGOTO end, GOTO end, GOTO top, end:
-    assert body("int x; while (x) { break; }").hex() == "1c00" "4f19000000" "3419000000" "3408000000"
-    assert body("int x; until (x);").hex() == "1c00" "3514000000" "3408000000"
-    assert body("int x; do ; until (x);").hex() == "1c00" "4f08000000"
+    assert body("int x; while (x) { break; }").hex() == "1c004f1900000034190000003408000000"
+    assert body("int x; until (x);").hex() == "1c0035140000003408000000"
+    assert body("int x; do ; until (x);").hex() == "1c004f08000000"
 
 
 def test_a_chain_of_else_if_may_be_long():
@@ -210,7 +211,7 @@ def test_arithmetic_of_constants_wraps_at_32_bits():
 
 
 def test_a_source_without_scripts_is_the_empty_object_file():
-    assert compile_acs('#include "zcommon.acs"').hex() == "41435300" "10000000" "08000000" "41435365" + "00" * 8
+    assert compile_acs('#include "zcommon.acs"').hex() == "41435300100000000800000041435365" + "00" * 8
 
 
 def test_no_dummy_script_stands_for_a_number_beyond_255():
@@ -252,11 +253,11 @@ def test_no_dummy_script_stands_for_a_number_beyond_255():
         ("script 1 OPEN { else ; }", 1, 17, "got name 'else', want a statement"),
         ("script 1 OPEN { int x; x 5; }", 1, 26, "got number '5', want '='"),
         ("script 1 OPEN { switch (1) { case 1 } }", 1, 37, "got symbol '}', want ':'"),
-        ("script 1 OPEN { switch (1) {", 1, 29, "got the end of the source, want 'case', 'default', a statement or '}'"),
+        ("script 1 OPEN { switch (1) {", 1, 29, "got the end of the source, want 'case', 'default', a"),
         ("script 1 OPEN { Log(x:1); }", 1, 21, "got name 'x', want 's' or 'd' or 'i' or 'c' or 'f'"),
         ("script 1 OPEN { case 1: ; }", 1, 17, "got name 'case', want a statement"),
         # names
-        ("script 1 OPEN { Dely(1); }", 1, 17, "got the undeclared name 'dely', want a declared one; did you mean 'delay'?"),
+        ("script 1 OPEN { Dely(1); }", 1, 17, "undeclared name 'dely', want a declared one; did you mean 'delay'?"),
         ("script 1 OPEN { zzqq = 1; }", 1, 17, "got the undeclared name 'zzqq', want a declared one"),
         ("int x; int X;", 1, 12, "got 'x' again, want a name that is not yet in use"),
         ("int x; script 1 OPEN { int x; }", 1, 28, "got 'x' again"),
@@ -290,8 +291,8 @@ def test_no_dummy_script_stands_for_a_number_beyond_255():
         ("script 1 OPEN { f(1); } function void f(str s) { }", 1, 19, "value of 's': got a number, want a string"),
         ("function str f(void) { return 1; }", 1, 31, "result of 'f': got a number, want a string"),
         ("str s = 5;", 1, 9, "start value of 's': got a number, want a string"),
-        ("script 1 OPEN { int x = Delay(1); }", 1, 25, "value of 'x': got a function that returns nothing, want a value"),
-        ("script 1 OPEN { int x = f(); } function void f(void) { }", 1, 25, "got a function that returns nothing"),
+        ("script 1 OPEN { int x = Delay(1); }", 1, 25, "value of 'x': got a function that returns nothing"),
+        ("script 1 OPEN { int x = f(); } function void f(void) { }", 1, 25, "nothing, want a value"),
         ("script 1 OPEN { Log(s:1); }", 1, 23, "log of 's': got a number, want a string"),
         (
             "script 1 OPEN { SetActorProperty(0, APROP_Speed, 20); }", 1, 50,
@@ -313,9 +314,10 @@ def test_no_dummy_script_stands_for_a_number_beyond_255():
         ("script 1 OPEN { switch (1) { case 1: case 1: } }", 1, 38, "got case 1 again, want it once"),
         ("script 1 OPEN { switch (1) { default: default: } }", 1, 39, "got default again, want it once"),
         # constants and limits
-        ("int x; int y = x;", 1, 16, "start value of 'y': got a value known only when the script runs, want a constant"),
+        ("int x; int y = x;", 1, 16, "start value of 'y': got a value known only when the script"),
         ("int x = 1 / 0;", 1, 11, "got a division by zero on the right of '/', want another constant"),
         ("int x = 1 % 0;", 1, 11, "got a division by zero on the right of '%'"),
+        ("int x = Timer();", 1, 9, "got a value known only when the script runs, want a constant"),
         ('int x = 1 + "a";', 1, 13, "start value of 'x': got a string, want a number"),
         ("int a[0];", 1, 5, "size of 'a': got 0, want 1 to 65536"),
         ("int a[65537];", 1, 5, "size of 'a': got 65537, want 1 to 65536"),

@@ -71,8 +71,6 @@ INSTRUCTIONS = """
 332 void SetActorPitch int fixed
 334 int SetActorState int str int?
 335 int Thing_Damage2 int int str
-336 int UseInventory class
-337 int UseActorInventory int class
 348 int ClassifyActor int
 """
 """Functions with an instruction of their own: opcode, result, name, parameters. Left-out ones are passed as 0."""
@@ -86,8 +84,6 @@ FUNCTIONS = """
 14 int GetActorViewHeight int
 22 int CheckActorProperty int int any
 23 int SetActorVelocity int fixed fixed fixed int int
-24 int SetUserVariable int str any
-25 any GetUserVariable int str
 27 int CheckActorClass int class
 35 int CheckSight int int int
 36 int SpawnForced class fixed fixed fixed int? int?
@@ -109,35 +105,23 @@ FUNCTIONS = """
 SPECIALS = """
  17 int Thing_Raise int int?
  19 int Thing_Stop int
- 70 int Teleport int int? int?
- 71 int Teleport_NoFog int int? int? int?
  72 int ThrustThing int int int? int?
  73 int DamageThing int int?
  80 int ACS_Execute int int? any? any? any?
- 81 int ACS_Suspend int int
  82 int ACS_Terminate int int
  84 int ACS_ExecuteWithResult int any? any? any? any?
-112 int Light_ChangeToValue int int
-113 int Light_Fade int int int
 119 int Thing_Damage int int int?
-120 int Radius_Quake int int int int int
 125 int Thing_Move int int int?
-127 int Thing_SetSpecial int int int int int
 128 int ThrustThingZ int int int int
 130 int Thing_Activate int
 131 int Thing_Deactivate int
 132 int Thing_Remove int
 133 int Thing_Destroy int int? int?
-173 int NoiseAlert int int
 176 int Thing_ChangeTID int int
 177 int Thing_Hate int int int?
-180 int Thing_SetTranslation int int
-191 int SetPlayerProperty int int int
-214 int Sector_SetDamage int int int int? int?
 226 int ACS_ExecuteAlways int int? any? any? any?
 229 int Thing_SetGoal int int int int?
 243 int Exit_Normal int
-244 int Exit_Secret int
 248 int HealThing int int?
 """
 """Line specials: number, result, name, parameters. Without parentheses the name means the number."""
@@ -162,10 +146,6 @@ MOD_SSHOTGUN 11 MOD_WATER 12 MOD_SLIME 13 MOD_LAVA 14 MOD_CRUSH 15 MOD_TELEFRAG 
 MOD_SUICIDE 18 MOD_BARREL 19 MOD_EXIT 20 MOD_SPLASH 21 MOD_HIT 22
 
 SKILL_VERY_EASY 0 SKILL_EASY 1 SKILL_NORMAL 2 SKILL_HARD 3 SKILL_VERY_HARD 4
-
-PROP_FROZEN 0 PROP_NOTARGET 1 PROP_INSTANTWEAPONSWITCH 2 PROP_FLY 3 PROP_TOTALLYFROZEN 4 PROP_INVULNERABILITY 5
-PROP_STRENGTH 6 PROP_INVISIBILITY 7 PROP_RADIATIONSUIT 8 PROP_ALLMAP 9 PROP_INFRARED 10 PROP_WEAPONLEVEL2 11
-PROP_FLIGHT 12 PROP_SPEED 15 PROP_BUDDHA 16
 
 CHAN_AUTO 0 CHAN_WEAPON 1 CHAN_VOICE 2 CHAN_ITEM 3 CHAN_BODY 4
 ATTN_NONE 0 ATTN_NORM 65536 ATTN_STATIC 196608
