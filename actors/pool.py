@@ -171,7 +171,6 @@ class ActorPool:
         self._actors: list[_Actor] = []
         self._board: BroadcastWriter | None = None
         self._messages: list[Message] = []
-        self._first_drained = 0  # the actor that is served first in the next drain
         self._polled_at = time.monotonic()
         self._env_steps = self._episodes = self._restarts = 0
         self._waited_s = 0.0
@@ -213,13 +212,11 @@ class ActorPool:
             time.sleep(_WAIT_SLEEP_S)
         if wait_s > 0.0:
             self._waited_s += time.monotonic() - start
-        first = self._first_drained
-        self._first_drained = (first + 1) % len(self._actors)
         # the emptiest first: what they leave of their share goes to the others
-        actors = sorted(self._actors[first:] + self._actors[:first], key=lambda actor: actor.ring.num_unread)
+        actors = sorted(self._actors, key=lambda actor: actor.ring.num_unread)
         blocks = []
         for index, actor in enumerate(actors):
-            share = -(-max_records // (len(actors) - index))
+            share = max_records // (len(actors) - index)
             block = actor.ring.read(share)
             if len(block):
                 max_records -= len(block)
@@ -307,11 +304,11 @@ class ActorPool:
                 self._take(actor, message, now)
         except TransportError as error:  # its process is beside itself, the others are not
             exit_text = f"sent something else than a message ({error})"
-        if exit_text is not None:
-            self._replace(actor, now, "died", exit_text)
-        elif actor.kill_at is not None:
-            if now >= actor.kill_at:
+        if actor.kill_at is not None:
+            if exit_text is not None or now >= actor.kill_at:
                 self._replace(actor, now, "stuck", self._silence(actor))
+        elif exit_text is not None:
+            self._replace(actor, now, "died", exit_text)
         elif self._is_stuck(actor, watched_s):
             actor.process.dump_stacks()
             actor.kill_at = now + _DUMP_S

@@ -131,7 +131,8 @@ class Checker:
         self.num_records = 0
         self.num_cuts = 0
         """episodes whose stream stopped before its last record"""
-        self._last: dict[int, np.void] = {}
+        self.last: dict[int, np.void] = {}
+        """the newest record of each lane"""
 
     def add(self, blocks: list[StepBlock]) -> None:
         for block in blocks:
@@ -141,7 +142,7 @@ class Checker:
     def _add(self, step: np.void, picture: np.ndarray) -> None:
         lane, task, episode = int(step["lane"]), int(step["task"]), int(step["episode"])
         assert task == lane % len(self.config.tasks)
-        last = self._last.get(lane)
+        last = self.last.get(lane)
         t = int(step["reward"])
         seed = derive_seed(self.config.seed, task, lane, episode)
         np.testing.assert_array_equal(picture, frame(seed, t))
@@ -159,5 +160,5 @@ class Checker:
             self.num_cuts += not (last["terminated"] or last["truncated"])
         else:
             assert step["first"]
-        self._last[lane] = step.copy()
+        self.last[lane] = step.copy()
         self.num_records += 1
