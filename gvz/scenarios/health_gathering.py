@@ -205,6 +205,24 @@ SCENARIO = Scenario(
         actors=_poison(1),
     ),
     attributes=(
+        Attribute(  # first: it sets what textures and stimpacks change
+            name="supreme",
+            groups=("map",),
+            content=Content(
+                base_wad=SUPREME_WAD,
+                textures=Textures("STONE2", "NUKAGE1", "CEIL4_1"),
+                parameters={
+                    "even_kit": '"CustomMedikit"',
+                    "odd_kit": '"CustomMedikit"',
+                    "map_size": 1856.0,
+                    "num_kits": 30,
+                    "kit_delay": 25,
+                    "last_spot": 21,
+                    "start_angle": Uniform(0.0, 1.0),
+                },
+                actors=_health("CustomMedikit", "MEDI A -1\n    Stop", 20),
+            ),
+        ),
         Attribute(
             name="obstacles",
             groups=("decorations",),
@@ -229,23 +247,6 @@ SCENARIO = Scenario(
             name="water",
             groups=("textures",),
             content=Content(textures=Textures("AQSECT09", "FWATER1", "AQF052")),
-        ),
-        Attribute(
-            name="supreme",
-            groups=("map",),
-            content=Content(
-                base_wad=SUPREME_WAD,
-                parameters={
-                    "even_kit": '"CustomMedikit"',
-                    "odd_kit": '"CustomMedikit"',
-                    "map_size": 1856.0,
-                    "num_kits": 30,
-                    "kit_delay": 25,
-                    "last_spot": 21,
-                    "start_angle": Uniform(0.0, 1.0),
-                },
-                actors=_health("CustomMedikit", "MEDI A -1\n    Stop", 20),
-            ),
         ),
         Attribute(
             name="stimpacks",

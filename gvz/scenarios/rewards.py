@@ -65,11 +65,11 @@ class Rewarder:
         if unknown := sorted(weights.keys() - events.keys()):
             raise ConfigError(f"reward weights: unknown components {unknown}, want some of {sorted(events)}")
         self.weights = {name: weights.get(name, 0.0) for name in events}
-        self._events = dict(events)
+        self._terms = [(name, self.weights[name], event) for name, event in events.items()]
         self._history: deque[Variables] = deque(maxlen=HISTORY_STEPS + 1)
 
     def reset(self, variables: Variables) -> None:
-        """Starts an episode with the variables that came with its first observation."""
+        """Starts an episode with the variables that came with its first observation. They are kept, not copied."""
         self._history.clear()
         self._history.append(variables)
 
@@ -77,10 +77,10 @@ class Rewarder:
         """Rewards of one decision, by component, weights applied; the reward is their sum.
 
         Args:
-            variables: the variables after the decision. When the agent died, the last that could be read.
+            variables: the variables after the decision; kept, not copied. When the agent died, the last that could
+                be read.
             terminated: the episode ended by the rules (a time-out is not).
         """
         assert self._history, "Rewarder.step before reset"
         self._history.append(variables)
-        history = self._history
-        return {name: self.weights[name] * event(history, terminated) for name, event in self._events.items()}
+        return {name: weight * event(self._history, terminated) for name, weight, event in self._terms}
