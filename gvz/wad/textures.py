@@ -32,7 +32,7 @@ def wall_textures(lumps: Sequence[Lump]) -> frozenset[str]:
 def _texture_names(lump: Lump) -> list[str]:
     data = lump.data
     count = struct.unpack_from("<i", data)[0] if len(data) >= 4 else -1
-    if not 0 <= 4 + 4 * count <= len(data):
+    if count < 0 or 4 + 4 * count > len(data):
         raise WadError(f"{lump.name}: got {count} textures in {len(data)} bytes, want their offsets to fit")
     names = []
     for offset in struct.unpack_from(f"<{count}i", data, 4):

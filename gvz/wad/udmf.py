@@ -7,7 +7,6 @@ fields are checked when a map is read and again when it is written.
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from decimal import Decimal
 from typing import NoReturn
 
 from gvz.errors import WadError
@@ -244,9 +243,9 @@ def _write_value(where: str, value: Value) -> str:
         case int() if -(2**31) <= value < 2**31:
             return str(value)
         case float() if abs(value) < float("inf"):
-            # The shortest digits that read back the same; UDMF wants a point, Python may leave it out.
-            digits = format(Decimal(repr(value)), "f")
-            return digits if "." in digits else digits + ".0"
+            # The shortest digits that read back the same; Python leaves the point out of 1e-05, UDMF wants it.
+            digits, exponent_mark, exponent = repr(value).partition("e")
+            return (digits if "." in digits else digits + ".0") + exponent_mark + exponent
         case str() if _STRING.fullmatch(value):
             return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
         case _:

@@ -1,0 +1,134 @@
+"""WAD files: reading, writing, and what damaged bytes are answered with."""
+
+import contextlib
+import random
+import struct
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvz.errors import WadError
+from gvz.wad.lumps import ENTRY, HEADER, Lump, read_maps, read_wad, write_map_wad, write_wad
+from gvz.wad.stock import scenario_wad
+
+NAMES = st.from_regex(r"[A-Z0-9_\[\]\\]{1,8}", fullmatch=True)
+
+
+def wad(*lumps: tuple[str, bytes]) -> bytes:
+    return write_wad([Lump(name, data) for name, data in lumps])
+
+
+@given(st.lists(st.builds(Lump, NAMES, st.binary(max_size=40)), max_size=8))
+def test_what_was_written_is_read_back(lumps: list[Lump]):
+    assert read_wad(write_wad(lumps)) == lumps
+    assert write_wad(lumps) == write_wad(list(lumps))
+
+
+def test_the_layout_is_header_lumps_directory():
+    assert wad(("A", b"xyz"), ("MAP01", b"")) == (
+        b"PWAD" + struct.pack("<ii", 2, 15) + b"xyz"
+        + struct.pack("<ii8s", 12, 3, b"A") + struct.pack("<ii8s", 15, 0, b"MAP01")
+    )  # fmt: skip
+
+
+def test_names_are_read_up_to_their_first_zero_and_in_upper_case():
+    data = b"IWAD" + HEADER.pack(b"", 1, 12)[4:] + ENTRY.pack(12, 0, b"map01\0?!")
+    assert read_wad(data) == [Lump("MAP01", b"")]
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"PWAD", "WAD: got 4 bytes, want at least a header of 12"),
+        (b"ZWAD" + bytes(8), "WAD offset 0: got b'ZWAD', want b'IWAD' or b'PWAD'"),
+        (HEADER.pack(b"PWAD", 1, 12), "WAD offset 4: got a directory of 1 lumps at 12, want one inside the 12 bytes"),
+        (HEADER.pack(b"PWAD", -1, 12), "WAD offset 4: got a directory of -1 lumps at 12"),
+        (HEADER.pack(b"PWAD", 0, 4), "WAD offset 4: got a directory of 0 lumps at 4"),
+        (
+            HEADER.pack(b"PWAD", 1, 12) + ENTRY.pack(12, 17, b"A"),
+            "WAD offset 12: got lump 0 (A) of 17 bytes at 12, want it inside the 28 bytes",
+        ),
+        (HEADER.pack(b"PWAD", 1, 12) + ENTRY.pack(-8, 4, b"A"), "WAD offset 12: got lump 0 (A) of 4 bytes at -8"),
+        (HEADER.pack(b"PWAD", 1, 12) + ENTRY.pack(12, -1, b"A"), "WAD offset 12: got lump 0 (A) of -1 bytes at 12"),
+        (HEADER.pack(b"PWAD", 1, 12) + ENTRY.pack(12, 0, b""), "WAD offset 12: got the name b'\\x00\\x00"),
+        (HEADER.pack(b"PWAD", 1, 12) + ENTRY.pack(12, 0, b"\xff"), "of lump 0, want 1 to 8 ASCII characters"),
+        (
+            HEADER.pack(b"PWAD", 4, 12) + ENTRY.pack(12, 60, b"A") * 4,
+            "WAD: got lumps of 240 bytes in a file of 76, want lumps that do not overlap",
+        ),
+    ],
+)  # fmt: skip
+def test_a_damaged_wad_is_refused_by_offset_and_lump(data: bytes, message: str):
+    with pytest.raises(WadError) as caught:
+        read_wad(data)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["", "NINECHARS", "lower", "WITH SP", "\u00c4"])
+def test_a_name_the_directory_cannot_hold_is_refused(name: str):
+    with pytest.raises(WadError, match="want 1 to 8 upper-case ASCII characters"):
+        write_wad([Lump(name, b"")])
+
+
+def test_of_lumps_with_one_name_the_last_before_endmap_counts():
+    lumps = read_wad(
+        wad(
+            ("DECORATE", b"d"), ("MAP01", b""), ("TEXTMAP", b"t"), ("BEHAVIOR", b"stale"), ("BEHAVIOR", b"fresh"),
+            ("ENDMAP", b""), ("BEHAVIOR", b"outside"), ("MAP02", b""), ("TEXTMAP", b"u"), ("ENDMAP", b""),
+        )
+    )  # fmt: skip
+    assert read_maps(lumps) == {"MAP01": {"TEXTMAP": b"t", "BEHAVIOR": b"fresh"}, "MAP02": {"TEXTMAP": b"u"}}
+
+
+def test_a_map_without_end_is_refused():
+    with pytest.raises(WadError, match="map MAP01: got the end of the WAD, want an ENDMAP lump"):
+        read_maps(read_wad(wad(("MAP01", b""), ("TEXTMAP", b""))))
+
+
+def test_a_map_that_stands_twice_is_refused():
+    level = (("MAP01", b""), ("TEXTMAP", b""), ("ENDMAP", b""))
+    with pytest.raises(WadError, match="map MAP01: got it twice, want it once"):
+        read_maps(read_wad(wad(*level, *level)))
+
+
+def test_a_map_wad_has_its_lumps_in_the_fixed_order():
+    data = write_map_wad(textmap="t", behavior=b"b", scripts="s\u00e9", decorate="d", mapinfo="m")
+    assert read_wad(data) == [
+        Lump("DECORATE", b"d"), Lump("MAPINFO", b"m"), Lump("MAP01", b""), Lump("TEXTMAP", b"t"),
+        Lump("BEHAVIOR", b"b"), Lump("SCRIPTS", b"s\xe9"), Lump("ENDMAP", b""),
+    ]  # fmt: skip
+    assert data == write_map_wad(textmap="t", behavior=b"b", scripts="s\u00e9", decorate="d", mapinfo="m")
+
+
+def test_a_map_wad_has_no_lumps_for_empty_texts():
+    data = write_map_wad(textmap="t", behavior=b"b", scripts="s", map_name="E1M1")
+    assert [lump.name for lump in read_wad(data)] == ["E1M1", "TEXTMAP", "BEHAVIOR", "SCRIPTS", "ENDMAP"]
+
+
+def test_a_character_beyond_latin_1_is_refused_by_line():
+    with pytest.raises(WadError, match="SCRIPTS line 2: got the character '\u20ac', want Latin-1"):
+        write_map_wad(textmap="", behavior=b"", scripts="a\n\u20ac")
+
+
+@settings(max_examples=300)
+@given(st.binary(max_size=120))
+def test_random_bytes_are_read_or_refused(data: bytes):
+    for prefix in (b"", b"PWAD" + struct.pack("<i", 2)):
+        with contextlib.suppress(WadError):
+            read_maps(read_wad(prefix + data))
+
+
+def test_damaged_wads_are_read_or_refused():
+    rng = random.Random(3)
+    whole = scenario_wad("defend_the_center.wad")
+    num_refused = 0
+    for _ in range(400):
+        data = bytearray(whole)
+        for _ in range(rng.randint(1, 4)):
+            data[rng.choice((rng.randrange(12), rng.randrange(len(data) - 200, len(data))))] = rng.randrange(256)
+        try:
+            read_maps(read_wad(bytes(data[: rng.choice((len(data), len(data), rng.randrange(len(data))))])))
+        except WadError:
+            num_refused += 1
+    assert 100 < num_refused < 400

@@ -1,0 +1,47 @@
+"""What is read from the installed engine."""
+
+import importlib.util
+import subprocess
+import sys
+
+import pytest
+
+from gvz.errors import WadError
+from gvz.wad.stock import engine_directory, scenario_wad, stock_actors
+
+
+def test_dooms_actors_are_known_and_other_games_are_not():
+    wanted = """ZombieMan MarineChainsaw DoomImp Cacodemon LostSoul Arachnotron Fatso PainElemental Archvile Revenant
+        BaronOfHell Demon Medikit Stimpack Clip ClipBox Pistol Fist RocketLauncher RocketAmmo DoomPlayer HeadsOnAStick
+        LiveStick HeadCandles TallGreenColumn TallRedColumn HeartColumn BlueTorch GreenTorch RedTorch MapSpot Health"""
+    assert set(wanted.split()) <= stock_actors()
+    assert not {"HereticImp", "Mummy", "Ettin", "StrifePlayer", "FlemoidusCommonus", "actor"} & stock_actors()
+
+
+def test_a_scenario_is_read_by_its_file_name():
+    assert scenario_wad("basic.wad").startswith(b"PWAD")
+
+
+@pytest.mark.parametrize("name", ["nosuch.wad", "../freedoom2.wad", "basic.cfg", ""])
+def test_a_scenario_that_is_not_there_is_answered_with_those_that_are(name: str):
+    with pytest.raises(WadError, match=r"scenario WAD: got .*, want one of basic\.wad, .*take_cover\.wad"):
+        scenario_wad(name)
+
+
+def test_without_the_engine_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    engine_directory.cache_clear()
+    with pytest.raises(WadError, match="vizdoom: got no installed package, want one; run `pip install vizdoom`"):
+        engine_directory()
+    monkeypatch.undo()
+    assert engine_directory().is_dir()
+
+
+def test_compiling_a_script_loads_neither_the_engine_nor_jax():
+    program = (
+        "import sys; from gvz.wad.acs import compile_acs; from gvz.wad.stock import stock_textures;"
+        "compile_acs('script 1 OPEN { }'); stock_textures();"
+        "print([m for m in sys.modules if m.split('.')[0] in ('vizdoom', 'jax', 'omg', 'cv2')])"
+    )
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    assert result.stdout.strip() == "[]"

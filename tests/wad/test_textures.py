@@ -1,0 +1,80 @@
+"""Texture names of WADs and maps."""
+
+import struct
+
+import pytest
+
+from gvz.errors import WadError
+from gvz.wad.lumps import Lump, read_maps, read_wad
+from gvz.wad.stock import scenario_wad, stock_textures
+from gvz.wad.textures import check_textures, flats, used_textures, wall_textures
+from gvz.wad.udmf import UdmfMap, parse_textmap
+
+
+def texture_lump(name: str, *textures: bytes) -> Lump:
+    first = 4 + 4 * len(textures)
+    offsets = struct.pack(f"<{len(textures)}i", *(first + 8 * i for i in range(len(textures))))
+    return Lump(name, struct.pack("<i", len(textures)) + offsets + b"".join(t.ljust(8, b"\0") for t in textures))
+
+
+def walls_and_floor(wall: str, floor: str) -> UdmfMap:
+    return UdmfMap(
+        sidedefs=[{"sector": 0, "texturetop": "-"}, {"sector": 0, "texturemiddle": wall}],
+        sectors=[{"texturefloor": floor, "textureceiling": floor}],
+    )
+
+
+def test_wall_textures_are_listed_without_the_one_that_means_none():
+    lumps = [texture_lump("TEXTURE1", b"NOTHING", b"Brick", b"EIGHTLET"), texture_lump("TEXTURE2", b"STONE")]
+    assert wall_textures(lumps) == {"BRICK", "EIGHTLET", "STONE"}
+
+
+def test_flats_are_the_lumps_between_their_markers():
+    names = ("PATCH", "F_START", "F1_START", "FLOOR", "F1_END", "F_END", "SOUND", "FF_START", "LAVA", "FF_END")
+    lumps = [Lump(name, b"" if name.endswith(("START", "END")) else b"pixels") for name in names]
+    assert flats(lumps) == {"FLOOR", "LAVA"}
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "TEXTURE1: got -1 textures in 0 bytes, want their offsets to fit"),
+        (struct.pack("<i", 2) + bytes(4), "TEXTURE1: got 2 textures in 8 bytes"),
+        (struct.pack("<i", -2) + bytes(4), "TEXTURE1: got -2 textures in 8 bytes"),
+        (struct.pack("<ii", 1, 4), "TEXTURE1: got a texture at 4, want it inside the 8 bytes"),
+        (struct.pack("<iii", 1, -4, 0), "TEXTURE1: got a texture at -4, want it inside the 12 bytes"),
+    ],
+)
+def test_a_damaged_texture_lump_is_refused(data: bytes, message: str):
+    with pytest.raises(WadError, match=message):
+        wall_textures([Lump("TEXTURE1", data)])
+
+
+def test_freedoom_has_every_texture_of_the_benchmark_as_wall_or_flat():
+    wanted = """A-MOSBRI A-CAMO3 AQCONC14 AQSECT09 ICKWALL3 FIREBLU2 FIREWALL SKY2 TANROCK2 BRICK12 GSTONE1 STONE2
+        CRACKLE4 DORED CAVERN1 ROCKRED1 FLOOR4_6 CEIL5_1 FLOOR1_6 CEIL3_3 SLIME04 GRASS2 LAVA1 CEIL1_1 FWATER1 AQF052
+        AQF051 FLAT19 FLAT14 CEIL4_3 CEIL4_1 RROCK02 NUKAGE1 CRATOP1 FLOOR0_5 FLAT5_7 SWATER1"""
+    assert set(wanted.split()) <= stock_textures()
+    assert len(stock_textures()) > 1000
+
+
+def test_textures_are_listed_with_the_first_place_of_their_use():
+    assert used_textures(walls_and_floor("brick", "Lava")) == {
+        "BRICK": "sidedef 1 texturemiddle",
+        "LAVA": "sector 0 texturefloor",
+    }
+
+
+def test_an_unknown_texture_is_refused_with_its_place_and_the_nearest_name():
+    check_textures(walls_and_floor("lava1", "BRICK12"), stock_textures())  # a flat on the wall and the reverse
+    with pytest.raises(WadError) as caught:
+        check_textures(walls_and_floor("BRICK12", "LAVAA1"), stock_textures())
+    assert str(caught.value) == (
+        "sector 0 texturefloor: got the unknown texture 'LAVAA1', want a wall texture or flat; did you mean 'LAVA1'?"
+    )
+
+
+def test_the_base_maps_use_no_unknown_texture():
+    for name in ("defend_the_center", "health_gathering", "health_gathering_supreme", "defend_the_line"):
+        textmap = read_maps(read_wad(scenario_wad(f"{name}.wad")))["MAP01"]["TEXTMAP"]
+        check_textures(parse_textmap(textmap.decode("latin-1")), stock_textures())
