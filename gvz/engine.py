@@ -25,7 +25,8 @@ from gvz import engine_process, janitor
 from gvz.errors import ConfigError, EngineError
 
 if TYPE_CHECKING:
-    import vizdoom
+    from vizdoom import DoomGame, GameState, Label
+
 
 _START_ATTEMPTS = 3
 _LOG_BYTES = 2**20
@@ -105,7 +106,7 @@ class Engine:
         self.pid, _, self.instance_id = instance
         engine_process.watch(self)
 
-    def new_episode(self, seed: int) -> "vizdoom.GameState":
+    def new_episode(self, seed: int) -> "GameState":
         """Starts an episode that depends on nothing but the map, `seed` in [0, 2^32) and the actions.
 
         Raises:
@@ -121,7 +122,7 @@ class Engine:
             raise EngineError(f"engine {self._name}: the episode of seed {seed} ended before it began")
         return state
 
-    def step(self, buttons: Sequence[float], tics: int) -> "vizdoom.GameState | None":
+    def step(self, buttons: Sequence[float], tics: int) -> "GameState | None":
         """Holds the buttons for so many tics.
 
         Args:
@@ -138,7 +139,7 @@ class Engine:
         self.deadline = time.monotonic() + self.config.step_timeout_s
         try:
             self._game.make_action(buttons, tics)
-            return self._game.get_state() if not self._game.is_episode_finished() else None
+            return self._game.get_state()
         except _vizdoom_errors() as error:
             raise self._dead("step", error) from error
         finally:
@@ -209,7 +210,7 @@ def screen_resolutions() -> tuple[tuple[int, int], ...]:
     return tuple(sorted((width, height) for width, height in sizes))
 
 
-def _make_game(config: EngineConfig) -> "vizdoom.DoomGame":
+def _make_game(config: EngineConfig) -> "DoomGame":
     """A game that is configured but not started. Nothing of it depends on the working directory or the user."""
     import vizdoom
 
@@ -246,7 +247,7 @@ def _make_game(config: EngineConfig) -> "vizdoom.DoomGame":
     return game
 
 
-def _start(config: EngineConfig) -> "tuple[vizdoom.DoomGame, Path, Path]":
+def _start(config: EngineConfig) -> "tuple[DoomGame, Path, Path]":
     """(a running game, its private directory, its log), after at most _START_ATTEMPTS."""
     import vizdoom
 

@@ -26,7 +26,7 @@ from gvz.specs import EnvConfig
 from gvz.tasks import parse_task
 
 if TYPE_CHECKING:
-    import vizdoom
+    from gvz.engine import GameState, Label
 
 TICS_PER_SECOND = 35
 _WEAPON_UP_TIC = 10
@@ -107,13 +107,14 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         self._rewarder = scenario.make_rewarder(reward_weights, config.profile)
         self.action_meanings = action_buttons(scenario, config.action_set)
         self._actions = [[button in held for button in scenario.buttons] for held in self.action_meanings]
+        bookkeeping = {name: user for name, user in BOOKKEEPING.items() if name != "MAP_MAGIC"}
         own = tuple(dict.fromkeys((*scenario.game_variables, "KILLCOUNT")))
-        self._names = (*own, *BOOKKEEPING)
+        self._names = (*own, *bookkeeping)
         self._engine_config = EngineConfig(
             wad=self._compiled.wad_path,
             map_name=self._compiled.map_name,
             buttons=scenario.buttons,
-            variables=(*own, *BOOKKEEPING.values()),
+            variables=(*own, *bookkeeping.values()),
             width=config.render_width,
             height=config.render_height,
             render_weapon=scenario.render_weapon,
@@ -131,8 +132,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         self._engine: Engine | None = None
         self._engine_episodes = 0
         self._crashes = 0
-        self._state: vizdoom.GameState | None = None
-        self._observation: Observation | None = None
+        self._state: GameState | None = None
         self._playing = False
 
     def reset(
@@ -162,13 +162,11 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         self._state = state = self._begin()
         self._engine_episodes += 1
         self._start_tic = state.tic
-        self._frames = 0
-        self._variables = dict(zip(self._names, _values(state), strict=True))
+        self._note(_values(state), state.tic)
         self._rewarder.reset(self._variables)
-        self._observation = self._observe(state)
         self._playing = True
         self._next_frame_s = time.monotonic()
-        return self._observation, self._info(dict.fromkeys(self._rewarder.weights, 0.0), False, False)
+        return self._observe(), self._info(dict.fromkeys(self._rewarder.weights, 0.0), False, False)
 
     def step(self, action: int | np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Holds the action's buttons for `frame_skip` tics, or what is left until the time-out.
@@ -178,41 +176,31 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             ValueError: no such action.
             EngineError: the engine crashed again and again.
         """
-        if not self._playing or self._engine is None or self._observation is None:
+        if not self._playing or self._engine is None:
             raise ResetNeeded("DoomEnv.step: no episode is running; call reset first")
         if not 0 <= action < len(self._actions):
             raise ValueError(f"DoomEnv.step: action {action!r}, want 0..{len(self._actions) - 1}")
         tics = min(self.config.frame_skip, self._timeout_frames - self._frames)
         try:
             state = self._engine.step(self._actions[action], tics)
-            if state is None:
-                terminated, values = True, self._engine.variables()
-                self._frames = self._engine.tic() - self._start_tic
+            if state is not None:
+                self._state = state
+                values, tic = _values(state), state.tic
             else:
-                terminated, values = False, _values(state)
-                self._frames = state.tic - self._start_tic
+                values, tic = self._engine.variables(), self._engine.tic()
         except EngineError as error:
             return self._crashed(error)
-        self._variables = dict(zip(self._names, values, strict=True))
-        components = self._rewarder.step(self._variables, terminated)
+        self._note(values, tic)
+        terminated = state is None
         truncated = not terminated and self._frames >= self._timeout_frames
-        if state is None:
-            observation = _copy(self._observation)
-        else:
-            self._state = state
-            self._observation = observation = self._observe(state)
         if terminated or truncated:
             self._playing = False
             self._crashes = 0
         if self.render_mode == "human":
             self._pace(tics)
-        return (
-            observation,
-            sum(components.values()),
-            terminated,
-            truncated,
-            self._info(components, terminated, truncated),
-        )
+        components = self._rewarder.step(self._variables, terminated)
+        info = self._info(components, terminated, truncated)
+        return self._observe(), sum(components.values()), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         """The screen as it was last rendered, uint8 [render_height, render_width, 3]; None in mode human."""
@@ -222,7 +210,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             raise ResetNeeded("DoomEnv.render: nothing was rendered yet; call reset first")
         return self._state.screen_buffer.copy()
 
-    def labels(self) -> "Sequence[vizdoom.Label]":
+    def labels(self) -> "Sequence[Label]":
         """What was in sight at the last observation, with name and place on the rendered screen.
 
         Needs "labels" among `config.buffers`. What hangs on the agent's screen (the weapon) is not among them.
@@ -236,23 +224,36 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         self._stop_engine()
         self._playing = False
 
-    def _begin(self) -> "vizdoom.GameState":
+    def _begin(self) -> "GameState":
         """Starts the episode, on a new engine if there is none or the old one has died."""
         while True:
             try:
                 if self._engine is None:
                     self._engine = Engine(self._engine_config)
-                return self._engine.new_episode(self._episode_seed)
+                state = self._engine.new_episode(self._episode_seed)
             except EngineError as error:
                 self._note_crash(error)
+                continue
+            magic = self._engine.variable(BOOKKEEPING["MAP_MAGIC"])
+            if magic != self._compiled.map_magic:  # where a file has no such map, ViZDoom plays another one
+                self._stop_engine()
+                raise EngineError(
+                    f"{self.task.id}: {self._compiled.wad_path} runs a map with magic number {magic:.0f}, "
+                    f"want {self._compiled.map_magic}"
+                )
+            return state
+
+    def _note(self, values: list[float], tic: int) -> None:
+        """Keeps what the game says after a decision."""
+        self._variables = dict(zip(self._names, values, strict=True))
+        self._frames = tic - self._start_tic
 
     def _crashed(self, error: EngineError) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """The engine died: what the episode was up to the last decision stands, cut off there."""
-        assert self._observation is not None
         self._note_crash(error)
         self._playing = False
         info = self._info(dict.fromkeys(self._rewarder.weights, 0.0), False, True)
-        return _copy(self._observation), 0.0, False, True, {**info, "engine_crash": True, "engine_error": str(error)}
+        return self._observe(), 0.0, False, True, {**info, "engine_crash": True, "engine_error": str(error)}
 
     def _note_crash(self, error: EngineError) -> None:
         self._stop_engine()
@@ -268,7 +269,10 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         self._engine = None
         self._engine_episodes = 0
 
-    def _observe(self, state: "vizdoom.GameState") -> Observation:
+    def _observe(self) -> Observation:
+        """The last state the engine gave, as a fresh observation."""
+        state = self._state
+        assert state is not None
         screen = self._shrunk(state.screen_buffer)
         if not self.config.buffers:
             return screen
@@ -345,12 +349,6 @@ def _observation_space(config: EnvConfig) -> spaces.Space:
     return spaces.Dict({"screen": box(config.channels), **{name: box(channels[name]) for name in config.buffers}})
 
 
-def _values(state: "vizdoom.GameState") -> list[float]:
+def _values(state: "GameState") -> list[float]:
     assert state.game_variables is not None, "the engine has variables configured"
     return state.game_variables.tolist()
-
-
-def _copy(observation: Observation) -> Observation:
-    if isinstance(observation, np.ndarray):
-        return observation.copy()
-    return {name: value.copy() for name, value in observation.items()}

@@ -55,8 +55,10 @@ def under(name: str, packages: tuple[str, ...]) -> bool:
 
 def tier(module: str) -> int:
     """Every other module of gvz is the benchmark's, tier 1."""
-    if under(module, TIER_0[1:]) or module == "gvz":
+    if under(module, TIER_0[1:]):
         return 0
+    if module == "gvz":  # the front door: it opens tier 1 when called
+        return 1
     if under(module, TIER_3):
         return 3
     return 2 if under(module, ("actors", "learner")) else 1
