@@ -1,0 +1,167 @@
+"""Names, levels and splits of tasks, against the thesis's appendix A."""
+
+import dataclasses
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gvz.errors import TaskError
+from gvz.scenarios.base import Attribute, Content, Task, Textures
+from gvz.scenarios.compiler import task_content
+from gvz.tasks import named_tasks, parse_task, scenario_named, scenarios
+
+LEVELS = {  # tasks of level 0, 1, 2, 3, 4
+    "defend_the_center": (1, 7, 6, 3, 1),
+    "health_gathering": (1, 10, 7, 3, 1),
+    "seek_and_kill": (1, 7, 6, 3, 1),
+    "dodge_projectiles": (1, 7, 6, 3, 1),
+}
+TEST_SETS = {
+    "defend_the_center": "gore+mossy_bricks, resized+fuzzy, stone_wall+flying, resized+flying+mossy_bricks, "
+    "gore+stone_wall+fuzzy, fast+resized+gore, complete",
+    "health_gathering": "slime+obstacles, shaded+stimpacks, supreme+poison, lava+supreme+short_agent, "
+    "obstacles+slime+stimpacks, poison+resized+shaded_kits, complete",
+    "seek_and_kill": "blue+shadows, obstacles+resized, red+mixed, blue+mixed+resized, red+obstacles+invulnerable, "
+    "resized+shadows+invulnerable, complete",
+    "dodge_projectiles": "revenants, city+resized_agent, barons+flaming_skulls, flames+flaming_skulls+mancubus, "
+    "resized_agent+revenants, city+arachnotron, complete",
+}
+
+
+@st.composite
+def attribute_sets(draw: st.DrawFn) -> tuple[str, list[str]]:
+    """A scenario and some of its attributes, at most one of a group, in any order."""
+    scenario = draw(st.sampled_from(sorted(scenarios().values(), key=lambda one: one.id)))
+    chosen: list[str] = []
+    taken: set[str] = set()
+    for attribute in draw(st.permutations(scenario.attributes)):
+        if not taken.intersection(attribute.groups) and draw(st.booleans()):
+            chosen.append(draw(st.sampled_from((attribute.name, *attribute.aliases))))
+            taken.update(attribute.groups)
+    return scenario.id, chosen
+
+
+def test_there_are_76_named_tasks_with_the_levels_of_the_thesis():
+    assert len(named_tasks()) == 76
+    assert len({task.id for task in named_tasks()}) == 76
+    for scenario, counts in LEVELS.items():
+        assert tuple(len(named_tasks(scenario, level=level)) for level in range(5)) == counts
+
+
+def test_revenants_and_arachnotron_are_level_2_though_one_attribute():
+    assert parse_task("dodge_projectiles/revenants").level == 2
+    assert parse_task("dodge_projectiles/arachnotron").level == 2
+    assert parse_task("dodge_projectiles/city+arachnotron").level == 3
+
+
+def test_four_and_more_attributes_are_level_4():
+    assert parse_task("seek_and_kill/blue+obstacles+shadows+mixed_enemies").level == 4
+    for scenario in scenarios():
+        assert parse_task(f"{scenario}/complete").level == 4
+
+
+def test_complete_has_exactly_one_attribute_of_every_group():
+    for scenario in scenarios().values():
+        groups = [group for name in scenario.complete for group in scenario.attribute(name).groups]
+        assert sorted(groups) == sorted({group for one in scenario.attributes for group in one.groups})
+
+
+@given(attribute_sets())
+def test_any_set_with_at_most_one_attribute_a_group_is_a_task_in_any_order(chosen: tuple[str, list[str]]):
+    scenario, names = chosen
+    task = parse_task(f"{scenario}/{'+'.join(names) or 'default'}")
+    assert parse_task(task.id) == task
+    assert task.attributes == tuple(sorted(scenario_named(scenario).attribute(name).name for name in names))
+    assert task == parse_task(f"{scenario}/{'+'.join(reversed(names)) or 'default'}")
+    assert str(task) == task.id
+    for profile in ("thesis", "levdoom"):
+        content = task_content(task, profile)
+        assert content.textures is not None
+
+
+def test_ids_are_canonical():
+    task = parse_task("defend_the_center/mossy_bricks+gore")
+    assert task.id == "defend_the_center/gore+mossy_bricks"
+    assert parse_task("defend_the_center/fast+flying").id == "defend_the_center/fast_enemies+flying_enemies"
+    assert parse_task("health_gathering/resized+shaded_kits").attributes == ("resized_kits", "shaded_kits")
+    assert parse_task("seek_and_kill/default").attributes == ()
+
+
+def test_all_of_complete_spelled_out_is_complete():
+    names = "+".join(reversed(scenario_named("seek_and_kill").complete))
+    assert parse_task(f"seek_and_kill/{names}").id == "seek_and_kill/complete"
+
+
+def test_training_sets_grow_and_share_nothing_with_the_test_set():
+    for scenario in scenarios():
+        one, four, eight = (
+            set(named_tasks(scenario, split="train1")),
+            set(named_tasks(scenario, split="train4")),
+            set(named_tasks(scenario, split="train8")),
+        )
+        test = set(named_tasks(scenario, split="test"))
+        assert (len(one), len(four), len(eight), len(test)) == (1, 4, 8, 7)
+        assert one < four < eight
+        assert not eight & test
+        assert test == {parse_task(f"{scenario}/{name}") for name in TEST_SETS[scenario].split(", ")}
+
+
+def test_the_main_job_trains_on_default_gore_stone_wall_and_fast_enemies():
+    names = [task.name for task in named_tasks("defend_the_center", split="train4")]
+    assert names == ["default", "gore", "stone_wall", "fast_enemies"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("defend_the_center", "want '<scenario>/<task>'.*scenarios: defend_the_center, dodge_projectiles"),
+        ("defend_the_center/", "want '<scenario>/<task>'"),
+        ("defend_center/gore", r"unknown scenario 'defend_center' \(did you mean 'defend_the_center'\?\); want one"),
+        ("defend_the_center/goer", r"unknown attribute 'goer' \(did you mean 'gore'\?\); want default, complete"),
+        ("defend_the_center/lava", "unknown attribute 'lava'; want .*textures: mossy_bricks, stone_wall"),
+        ("health_gathering/lava+slime", "lava and slime are both of group textures"),
+        ("health_gathering/lava+lava", "lava and lava are both of group textures"),
+        ("health_gathering/complete+lava", "unknown attribute 'complete'"),
+        ("dodge_projectiles/revenants+arachnotron", "both of group entity_type"),
+        ("health_gathering/lava++slime", "unknown attribute ''"),
+    ],
+)
+def test_what_is_no_task_is_refused_with_what_is_possible(text: str, message: str):
+    with pytest.raises(TaskError, match=message):
+        parse_task(text)
+
+
+def test_unknown_selections_of_named_tasks_are_refused():
+    with pytest.raises(TaskError, match=r"level 5, want 0\.\.4"):
+        named_tasks(level=5)
+    with pytest.raises(TaskError, match="split 'train2', want one of train1, train4, train8, test"):
+        named_tasks(split="train2")
+    with pytest.raises(TaskError, match="unknown scenario 'seek'"):
+        named_tasks("seek")
+
+
+def test_attributes_of_different_groups_do_not_fight_over_a_value():
+    """In profile thesis, what a task is does not depend on the order its attributes stand in."""
+    for scenario in scenarios().values():
+        for one in scenario.attributes:
+            for other in scenario.attributes:
+                if one is other or set(one.groups) & set(other.groups) or "supreme" in (one.name, other.name):
+                    continue  # the map `supreme` comes with textures and kits that others then change
+                both = one.content.overlaid(other.content)
+                assert both == dataclasses.replace(other.content.overlaid(one.content), things=both.things)
+
+
+def test_a_new_attribute_is_one_line_of_data():
+    """The worked example of the documentation."""
+    scenario = scenario_named("defend_the_center")
+    ice = Attribute(
+        name="ice", groups=("textures",), content=Content(textures=Textures("FLAT14", "FWATER1", "CEIL4_3"))
+    )
+    with_ice = dataclasses.replace(scenario, attributes=(*scenario.attributes, ice))
+    task = Task(with_ice, ("ice", "gore"))
+    assert task.id == "defend_the_center/gore+ice"
+    assert task.level == 2
+    assert task_content(task, "thesis").textures == Textures("FLAT14", "FWATER1", "CEIL4_3")
+    with pytest.raises(TaskError, match="ice and stone_wall are both of group textures"):
+        Task(with_ice, ("ice", "stone_wall"))
