@@ -25,7 +25,8 @@ from gvz import engine_process, janitor
 from gvz.errors import ConfigError, EngineError
 
 if TYPE_CHECKING:
-    from vizdoom import DoomGame, GameState, Label
+    from vizdoom import DoomGame, GameState
+    from vizdoom import Label as Label
 
 
 _START_ATTEMPTS = 3
@@ -61,8 +62,6 @@ class EngineConfig:
     """fill state.automap_buffer, u8[H W 3]"""
     objects: bool = False
     """fill state.objects"""
-    window: bool = False
-    """show the game in a window of its own"""
     start_tic: int = 1
     """the tic at which an episode starts; those before it pass without an action"""
     skill: int = 3
@@ -112,9 +111,9 @@ class Engine:
         Raises:
             EngineError: the engine died or did not answer, or the player is dead at once.
         """
-        if self.log.stat().st_size > _LOG_BYTES:
-            os.truncate(self.log, 0)
         with self._answering("new_episode"):
+            if self.log.stat().st_size > _LOG_BYTES:
+                os.truncate(self.log, 0)
             self._game.set_seed(seed)
             self._game.new_episode()
             state = self._game.get_state()
@@ -149,7 +148,8 @@ class Engine:
         """Value of any game variable, now; after the player's death too."""
         import vizdoom
 
-        return self._game.get_game_variable(getattr(vizdoom.GameVariable, name))
+        with self._answering(f"variable {name}"):
+            return self._game.get_game_variable(_member(vizdoom.GameVariable, name))
 
     def variables(self) -> list[float]:
         """Values of the configured variables, in their order, now; after the player's death too."""
@@ -157,11 +157,13 @@ class Engine:
 
     def tic(self) -> int:
         """Tics of the map so far, those before the episode's start included. Stands still once the player is dead."""
-        return self._game.get_episode_time()
+        with self._answering("tic"):
+            return self._game.get_episode_time()
 
     def command(self, text: str) -> None:
         """Sends a console command; it takes effect with the next step."""
-        self._game.send_game_command(text)
+        with self._answering("command"):
+            self._game.send_game_command(text)
 
     def kill(self) -> None:
         """Ends the engine's process at once, as a crash would. The object stays, to be closed."""
@@ -179,6 +181,8 @@ class Engine:
 
     @contextlib.contextmanager
     def _answering(self, what: str) -> Iterator[None]:
+        if not self._game.is_running():  # some calls of the library would read a null pointer
+            raise EngineError(f"engine {self._name}: {what}: it was closed, or died before")
         self.deadline = time.monotonic() + self.config.step_timeout_s
         try:
             yield
@@ -232,8 +236,7 @@ def _make_game(config: EngineConfig) -> "DoomGame":
     game.set_labels_buffer_enabled(config.labels)
     game.set_automap_buffer_enabled(config.automap)
     game.set_objects_info_enabled(config.objects)
-    game.set_window_visible(config.window)
-    game.set_render_all_frames(config.window)
+    game.set_window_visible(False)
     game.set_render_hud(True)
     game.set_render_weapon(config.render_weapon)
     game.set_render_crosshair(False)

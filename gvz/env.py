@@ -1,29 +1,28 @@
 """A task as a Gymnasium environment: observation, actions, reward, time-out, seeds, an engine that may crash.
 
-Imports gvz.engine, gvz.scenarios, gvz.tasks, gvz.actions, cv2, gymnasium, numpy. No jax; vizdoom only by way of
-the engine.
+Imports gymnasium, numpy and all of tier 1; no jax, and vizdoom only by way of gvz.engine.
 """
 
 import dataclasses
-import os
 import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
-import cv2
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Discrete
 
 from gvz.actions import action_buttons, num_actions
 from gvz.engine import Engine, EngineConfig, check_config
 from gvz.errors import ConfigError, EngineError
+from gvz.observation import Observation, observation_space, observe
 from gvz.probe import ensure_loads
 from gvz.scenarios.base import BOOKKEEPING, Task
 from gvz.scenarios.compiler import compile_task
 from gvz.specs import EnvConfig
 from gvz.tasks import parse_task
+from gvz.viewer import Window
 
 if TYPE_CHECKING:
     from gvz.engine import GameState, Label
@@ -35,14 +34,6 @@ _SOLVED_EPISODES = 10
 _MAX_CRASHES = 3
 """engines of one environment that may crash with no whole episode between before it gives up"""
 _EPISODE_SEEDS = 2**31
-
-# Shrinking 256x144 to 84x84 (one core of an EPYC 7003): linear 21 us, area 224 us. Linear looks at 2 of 3 columns.
-# Over 216 sightings of the farthest enemies of Defend the Center (4-8 pixels wide before) they stood out from the
-# wall by 40 grey levels with linear and 29 with area, and by 6.3 (at worst 3.0) and 7.0 (4.5) times the wall's own
-# variation: coarser walls, stronger enemies, none lost.
-_INTERPOLATIONS = {"linear": cv2.INTER_LINEAR, "area": cv2.INTER_AREA}
-
-Observation = np.ndarray | dict[str, np.ndarray]
 
 
 class DoomEnv(gymnasium.Env[Observation, np.int64]):
@@ -89,14 +80,12 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         Raises:
             TaskError: no such task.
             ConfigError: an unknown field or reward component, a value out of range, an impossible render size.
-            EngineError: the map does not load, or there is no display to show it on.
+            EngineError: the map does not load.
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode: got {render_mode!r}, want None or one of {self.metadata['render_modes']}")
         if recycle_episodes < 0:
             raise ValueError(f"recycle_episodes: got {recycle_episodes}, want 0 or more")
-        if render_mode == "human" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-            raise EngineError("render_mode human: no display (DISPLAY is not set); use rgb_array")
         self.task = parse_task(task) if isinstance(task, str) else task
         self.config = config = _with_fields(EnvConfig() if config is None else config, fields)
         self.render_mode = render_mode
@@ -121,14 +110,15 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             depth="depth" in config.buffers,
             labels="labels" in config.buffers,
             automap="automap" in config.buffers,
-            window=render_mode == "human",
             start_tic=_WEAPON_UP_TIC if scenario.render_weapon else 1,
         )
         check_config(self._engine_config)
         ensure_loads(self._compiled.wad_path)
-        self.action_space = spaces.Discrete(num_actions(scenario, config.action_set))
-        self.observation_space = _observation_space(config)
+        self.action_space = Discrete(num_actions(scenario, config.action_set))
+        self.observation_space = observation_space(config)
         self._recycle_episodes = recycle_episodes
+        self._window: Window | None = None
+        self._show_at_s = 0.0
         self._engine: Engine | None = None
         self._engine_episodes = 0
         self._crashes = 0
@@ -147,6 +137,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         Raises:
             ValueError: an unknown option, or an episode seed outside [0, 2^31).
             EngineError: the engine cannot be started, or does not run the task's map.
+            ResourceError: render_mode human without a display, or too little shared memory.
         """
         super().reset(seed=seed)
         if unknown := (options or {}).keys() - {"episode_seed"}:
@@ -165,7 +156,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         self._note(_values(state), state.tic)
         self._rewarder.reset(self._variables)
         self._playing = True
-        self._next_frame_s = time.monotonic()
+        if self.render_mode == "human":
+            self._show(tics=0)
         return self._observe(), self._info(dict.fromkeys(self._rewarder.weights, 0.0), False, False)
 
     def step(self, action: int | np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -197,7 +189,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             self._playing = False
             self._crashes = 0
         if self.render_mode == "human":
-            self._pace(tics)
+            self._show(tics)
         components = self._rewarder.step(self._variables, terminated)
         info = self._info(components, terminated, truncated)
         return self._observe(), sum(components.values()), terminated, truncated, info
@@ -213,23 +205,27 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
     def labels(self) -> "Sequence[Label]":
         """What was in sight at the last observation, with name and place on the rendered screen.
 
-        Needs "labels" among `config.buffers`. What hangs on the agent's screen (the weapon) is not among them.
+        Raises:
+            ValueError: "labels" is not among `config.buffers`.
         """
         if "labels" not in self.config.buffers:
             raise ValueError("DoomEnv.labels: want 'labels' among the buffers of the EnvConfig")
         return () if self._state is None or self._state.labels is None else self._state.labels
 
     def close(self) -> None:
-        """Ends the engine. May be called again; `reset` would start another one."""
+        """Ends the engine and its window. May be called again; `reset` would start another one."""
         self._stop_engine()
+        if self._window is not None:
+            self._window.close()
+            self._window = None
         self._playing = False
 
     def _begin(self) -> "GameState":
         """Starts the episode, on a new engine if there is none or the old one has died."""
         while True:
+            if self._engine is None:
+                self._engine = Engine(self._engine_config)
             try:
-                if self._engine is None:
-                    self._engine = Engine(self._engine_config)
                 state = self._engine.new_episode(self._episode_seed)
             except EngineError as error:
                 self._note_crash(error)
@@ -271,31 +267,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
 
     def _observe(self) -> Observation:
         """The last state the engine gave, as a fresh observation."""
-        state = self._state
-        assert state is not None
-        screen = self._shrunk(state.screen_buffer)
-        if not self.config.buffers:
-            return screen
-        found = {"screen": screen}
-        if state.depth_buffer is not None:
-            found["depth"] = self._nearest(state.depth_buffer)
-        if state.labels_buffer is not None:
-            found["labels"] = self._nearest(state.labels_buffer)
-        if state.automap_buffer is not None:
-            found["automap"] = self._shrunk(state.automap_buffer)
-        return found
-
-    def _shrunk(self, picture: np.ndarray) -> np.ndarray:
-        """u8[H W 3] -> u8[frame_height frame_width C]."""
-        config = self.config
-        size = (config.frame_width, config.frame_height)
-        frame = cv2.resize(picture, size, interpolation=_INTERPOLATIONS[config.interpolation])
-        return cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)[:, :, None] if config.grayscale else frame
-
-    def _nearest(self, values: np.ndarray) -> np.ndarray:
-        """u8[H W] -> u8[frame_height frame_width 1], without making new values up."""
-        size = (self.config.frame_width, self.config.frame_height)
-        return cv2.resize(values, size, interpolation=cv2.INTER_NEAREST)[:, :, None]
+        assert self._state is not None
+        return observe(self._state, self.config)
 
     def _info(self, components: dict[str, float], terminated: bool, truncated: bool) -> dict[str, Any]:
         variables, scenario = self._variables, self.task.scenario
@@ -316,10 +289,15 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             info["solved_episode"] = scenario.metric == "frames_alive" and self._frames >= self._timeout_frames
         return info
 
-    def _pace(self, tics: int) -> None:
-        """Waits until so many tics have passed on the viewer's clock."""
-        self._next_frame_s = max(self._next_frame_s, time.monotonic() - 1.0) + tics / TICS_PER_SECOND
-        time.sleep(max(0.0, self._next_frame_s - time.monotonic()))
+    def _show(self, tics: int) -> None:
+        """Draws the last state in the window, when so many tics have passed on the viewer's clock."""
+        assert self._state is not None
+        if self._window is None:
+            self._window = Window(self.task.id, self.config.render_width, self.config.render_height)
+        now = time.monotonic()
+        self._show_at_s = max(self._show_at_s + tics / TICS_PER_SECOND, now)
+        time.sleep(self._show_at_s - now)
+        self._window.show(self._state.screen_buffer)
 
 
 def make_env(task_id: str, env_config: Mapping[str, Any], **options: Any) -> DoomEnv:
@@ -337,16 +315,6 @@ def _with_fields(config: EnvConfig, fields: Mapping[str, Any]) -> EnvConfig:
     if unknown := sorted(fields.keys() - set(known)):
         raise ConfigError(f"env: unknown options {unknown}, want some of {', '.join(known)}")
     return dataclasses.replace(config, **fields)
-
-
-def _observation_space(config: EnvConfig) -> spaces.Space:
-    def box(channels: int) -> spaces.Box:
-        return spaces.Box(0, 255, (config.frame_height, config.frame_width, channels), np.uint8)
-
-    if not config.buffers:
-        return box(config.channels)
-    channels = {"depth": 1, "labels": 1, "automap": config.channels}
-    return spaces.Dict({"screen": box(config.channels), **{name: box(channels[name]) for name in config.buffers}})
 
 
 def _values(state: "GameState") -> list[float]:

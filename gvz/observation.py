@@ -1,0 +1,61 @@
+"""From what the engine renders to what the agent observes: sizes, colours, buffers. Imports cv2, gymnasium, numpy."""
+
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from gymnasium import spaces
+
+from gvz.specs import EnvConfig
+
+if TYPE_CHECKING:
+    from gvz.engine import GameState
+
+Observation = np.ndarray | dict[str, np.ndarray]
+"""uint8 [H, W, C]; with `EnvConfig.buffers` a dict of `screen` and those."""
+
+# Shrinking 256x144 to 84x84 (one core of an EPYC 7003): linear 20 us, area 224 us. Linear looks at 2 of 3 columns.
+# Over 216 sightings of the farthest enemies of Defend the Center (4-8 pixels wide before) they stood out from the
+# wall by 40 grey levels with linear and 29 with area, and by 6.3 (at worst 3.0) and 7.0 (4.5) times the wall's own
+# variation: coarser walls, stronger enemies, none lost.
+_INTERPOLATIONS = {"linear": cv2.INTER_LINEAR, "area": cv2.INTER_AREA}
+
+
+def observation_space(config: EnvConfig) -> spaces.Space[Any]:
+    """The Gymnasium space of what `observe` returns."""
+
+    def box(channels: int) -> spaces.Box:
+        return spaces.Box(0, 255, (config.frame_height, config.frame_width, channels), np.uint8)
+
+    if not config.buffers:
+        return box(config.channels)
+    channels = {"depth": 1, "labels": 1, "automap": config.channels}
+    return spaces.Dict({"screen": box(config.channels), **{name: box(channels[name]) for name in config.buffers}})
+
+
+def observe(state: "GameState", config: EnvConfig) -> Observation:
+    """The observation of a state; new arrays with each call."""
+    screen = _picture(state.screen_buffer, config)
+    if not config.buffers:
+        return screen
+    found = {"screen": screen}
+    if state.depth_buffer is not None:
+        found["depth"] = _values(state.depth_buffer, config)
+    if state.labels_buffer is not None:
+        found["labels"] = _values(state.labels_buffer, config)
+    if state.automap_buffer is not None:
+        found["automap"] = _picture(state.automap_buffer, config)
+    return found
+
+
+def _picture(pixels: np.ndarray, config: EnvConfig) -> np.ndarray:
+    """u8[H W 3] -> u8[frame_height frame_width C]."""
+    size = (config.frame_width, config.frame_height)
+    frame = cv2.resize(pixels, size, interpolation=_INTERPOLATIONS[config.interpolation])
+    return cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)[:, :, None] if config.grayscale else frame
+
+
+def _values(pixels: np.ndarray, config: EnvConfig) -> np.ndarray:
+    """u8[H W] -> u8[frame_height frame_width 1], without making new values up."""
+    size = (config.frame_width, config.frame_height)
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST)[:, :, None]
