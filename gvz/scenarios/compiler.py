@@ -1,28 +1,27 @@
 """Task -> WAD file: content of a task, its map, script and classes, and the cache. Imports gvz.scenarios.base, gvz.wad.
 
-A WAD is always built anew (a tenth of a second) and kept in the user's cache directory under the hash of its
+A WAD is always built anew (some 20 ms) and kept in the user's cache directory under the hash of its
 bytes, so a cached file is either what this version of the code builds, or not found. Nothing here starts an engine.
 """
 
 import hashlib
 import os
-import struct
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from string import Template
 
 from platformdirs import user_cache_path
 
-from gvz.errors import ResourceError, TaskError
-from gvz.scenarios.base import Content, Task, Textures, Uniform, Value, nearest
+from gvz.errors import ResourceError, TaskError, WadError
+from gvz.scenarios.base import Content, Task, Uniform, Value
 from gvz.specs import Profile
 from gvz.wad.acs import compile_acs
 from gvz.wad.decorate import declared_actors
 from gvz.wad.lumps import read_maps, read_wad, write_map_wad
-from gvz.wad.stock import engine_directory
+from gvz.wad.stock import scenario_wad, stock_textures
+from gvz.wad.textures import check_textures
 from gvz.wad.udmf import UdmfMap, make_thing, parse_textmap, write_textmap
 
 MAP_NAME = "MAP01"
@@ -50,15 +49,14 @@ class MapSource:
     map_magic: int
 
 
-@cache
 def compile_task(task: Task, profile: Profile = "thesis") -> CompiledTask:
     """Builds a task's WAD and puts it into the cache directory. Safe for many processes at once.
 
     The directory is $GVZ_CACHE_DIR, or else the user's cache directory.
 
     Raises:
-        TaskError: the task names a texture the game does not have.
-        AcsError, WadError: script or base map are not what they should be.
+        TaskError, WadError: as map_source.
+        AcsError: the script does not compile.
         ResourceError: the cache directory cannot be written.
     """
     source = map_source(task, profile)
@@ -82,12 +80,22 @@ def task_content(task: Task, profile: Profile) -> Content:
 
 
 def map_source(task: Task, profile: Profile) -> MapSource:
-    """The texts of a task's WAD. The magic number is drawn from the hash of all of them."""
+    """The texts of a task's WAD. The magic number is drawn from the hash of all of them.
+
+    Raises:
+        TaskError: the parameters of scenario and attributes are not those that the script names.
+        WadError: an unknown texture or base map.
+    """
     content = task_content(task, profile)
     textmap = write_textmap(_draw(task, content))
     decorate = "\n".join(content.actors.values())
     template = Template(task.scenario.script)
     names = _script_names(content)
+    if (given := {*names, "map_magic"}) != (used := set(template.get_identifiers())):
+        raise TaskError(
+            f"task {task.id}: the script uses {sorted(used - given)}, which nothing sets; "
+            f"set but not used: {sorted(given - used)}; want `content.parameters` to fit the script's $names"
+        )
     everything = "\0".join((textmap, decorate, template.substitute(names, map_magic=0)))
     digest = hashlib.sha256(everything.encode()).digest()
     magic = int.from_bytes(digest[:4], "little") % (2**31 - 1) + 1
@@ -145,8 +153,8 @@ def _draw(task: Task, content: Content) -> UdmfMap:
     """The base map with the content's textures and things, and the scenario's own changes."""
     assert content.base_wad is not None
     assert content.textures is not None
-    _check_textures(task, content.textures)
-    drawn = _base_map(content.base_wad)
+    base = read_maps(read_wad(scenario_wad(content.base_wad)))[MAP_NAME]
+    drawn = parse_textmap(base["TEXTMAP"].decode("latin-1"))
     if task.scenario.draw_map is not None:
         task.scenario.draw_map(drawn)
     for side in drawn.sidedefs:
@@ -155,34 +163,12 @@ def _draw(task: Task, content: Content) -> UdmfMap:
     for sector in drawn.sectors:
         sector["texturefloor"] = content.textures.floor
         sector["textureceiling"] = content.textures.ceiling
+    try:
+        check_textures(drawn, stock_textures())
+    except WadError as error:
+        raise WadError(f"task {task.id}: {error}") from error
     drawn.things += [make_thing(t.type, t.x, t.y, tid=t.tid) for t in content.things.get(content.base_wad, ())]
     return drawn
-
-
-def _base_map(base_wad: str) -> UdmfMap:
-    lumps = read_wad((engine_directory() / "scenarios" / base_wad).read_bytes())
-    return parse_textmap(read_maps(lumps)[MAP_NAME]["TEXTMAP"].decode("latin-1"))
-
-
-def _check_textures(task: Task, textures: Textures) -> None:
-    """Raises TaskError for a name the game lacks: the engine would only draw a checkerboard."""
-    known = _texture_names()
-    for name in (textures.wall, textures.floor, textures.ceiling):
-        if name not in known:
-            raise TaskError(f"task {task.id}: unknown texture {name!r}{nearest(name, sorted(known))}")
-
-
-@cache
-def _texture_names() -> frozenset[str]:
-    """Names of the wall textures and flats of freedoom2.wad; each can stand on walls, floors and ceilings."""
-    lumps = read_wad((engine_directory() / "freedoom2.wad").read_bytes())
-    names = [lump.name for lump in lumps]
-    flats = names[names.index("F_START") + 1 : names.index("F_END")]
-    table = lumps[names.index("TEXTURE1")].data
-    (count,) = struct.unpack_from("<i", table)
-    offsets = struct.unpack_from(f"<{count}i", table, 4)
-    walls = (table[offset : offset + 8].split(b"\0")[0].decode("latin-1") for offset in offsets)
-    return frozenset((*flats, *walls))
 
 
 def _cached(data: bytes) -> Path:
