@@ -134,24 +134,28 @@ class RunConfig:
 
     @property
     def num_actors(self) -> int:
-        """Actor processes; sync mode plays all games in one place."""
-        if self.mode == "sync":
-            return 1
-        return self.actors.num_actors if self.actors.num_actors is not None else len(os.sched_getaffinity(0))
+        """Actor processes, one per core by default. In sync mode 1: all games are played in one place."""
+        return 1 if self.mode == "sync" else self._configured_actors
+
+    @property
+    def _configured_actors(self) -> int:
+        if self.actors.num_actors is not None:
+            return self.actors.num_actors
+        # a synchronous run must not depend on the machine it is on
+        return 1 if self.mode == "sync" else len(os.sched_getaffinity(0))
 
     @property
     def games_per_actor(self) -> int:
-        num_tasks = len(self.resolved_tasks())
-        if self.actors.games_per_actor is not None:
-            games = self.actors.games_per_actor
-            if games * self.num_actors < num_tasks:
-                raise ConfigError(
-                    f"actors.games_per_actor: got {games} games for each of {self.num_actors} actors, but there are "
-                    f"{num_tasks} tasks; every task needs a game: want at least "
-                    f"{math.ceil(num_tasks / self.num_actors)}"
-                )
-            return games
-        return num_tasks * math.ceil(4 / num_tasks)
+        """Games of one actor process; in sync mode all games of the run."""
+        num_tasks, actors, games = len(self.resolved_tasks()), self._configured_actors, self.actors.games_per_actor
+        if games is None:
+            games = num_tasks * math.ceil(4 / num_tasks)
+        if games * actors < num_tasks:
+            raise ConfigError(
+                f"actors.games_per_actor: got {games} games for each of {actors} actors, but there are {num_tasks} "
+                f"tasks; every task needs a game: want at least {math.ceil(num_tasks / actors)}"
+            )
+        return games * actors if self.mode == "sync" else games
 
     @property
     def num_lanes(self) -> int:

@@ -26,13 +26,13 @@ class Rates:
         self._last: dict[str, float] = {}
         self._time_s = time.monotonic()
 
-    def __call__(self, counters: Mapping[str, float]) -> tuple[dict[str, float], float]:
-        """Returns the rate of each counter since the last call, and the seconds that passed."""
+    def __call__(self, counters: Mapping[str, float]) -> dict[str, float]:
+        """The rate of each counter since the last call, per second; 0 at the first."""
         now = time.monotonic()
         passed_s = max(now - self._time_s, 1e-9)
         rates = {name: (value - self._last.get(name, value)) / passed_s for name, value in counters.items()}
         self._last, self._time_s = dict(counters), now
-        return rates, passed_s
+        return rates
 
 
 class Telemetry:

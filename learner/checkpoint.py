@@ -13,7 +13,6 @@ import json
 import os
 import shutil
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -194,8 +193,7 @@ class Checkpointer:
         self._failures: list[str] = []
         for folder in (self._checkpoints, self._policies):
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-            for left in folder.glob(".writing-*"):
-                shutil.rmtree(left, ignore_errors=True)
+        self._remove_unfinished()
 
     @property
     def busy(self) -> bool:
@@ -219,7 +217,7 @@ class Checkpointer:
             except CheckpointError as error:
                 self._failures.append(str(error))
 
-        self._thread = threading.Thread(target=work, name=f"checkpoint-{num_updates}")
+        self._thread = threading.Thread(target=work, name=f"checkpoint-{num_updates}", daemon=True)
         self._thread.start()
 
     def failures(self) -> list[str]:
@@ -227,11 +225,18 @@ class Checkpointer:
         failed, self._failures = self._failures, []
         return failed
 
-    def wait(self, on_wait: Callable[[], None] | None = None) -> None:
-        """Waits until nothing is being written, calling `on_wait` every quarter of a second."""
-        while self.busy:
-            assert self._thread is not None
-            self._thread.join(0.25)
-            if on_wait is not None:
-                on_wait()
+    def wait(self) -> None:
+        """Waits until nothing is being written."""
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def abandon(self) -> None:
+        """Gives up what is being written; for a process that exits at once."""
         self._thread = None
+        self._remove_unfinished()
+
+    def _remove_unfinished(self) -> None:
+        for folder in (self._checkpoints, self._policies):
+            for left in folder.glob(".writing-*"):
+                shutil.rmtree(left, ignore_errors=True)
