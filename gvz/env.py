@@ -113,7 +113,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             start_tic=_WEAPON_UP_TIC if scenario.render_weapon else 1,
         )
         check_config(self._engine_config)
-        ensure_loads(self._compiled.wad_path)
+        ensure_loads(self._compiled.wad_path, self._compiled.map_name)
         self.action_space = Discrete(num_actions(scenario, config.action_set))
         self.observation_space = observation_space(config)
         self._recycle_episodes = recycle_episodes

@@ -1,8 +1,7 @@
-"""Loads a scenario file in a sub-process, where an engine that cannot start does no harm. Imports gvz.engine.
+"""Loads a scenario file in a sub-process, where an engine that cannot start does no harm. Imports gvz.engine, gvz.wad.
 
-An engine that fails before its first frame takes its client with it, and ViZDoom plays another map without a word
-when it finds none in the file. So a file is loaded here once before it is trusted. `python -m gvz.probe` is the
-sub-process.
+An engine that fails before its first frame takes its client with it. So a file is loaded here once before it is
+trusted. `python -m gvz.probe` is the sub-process.
 """
 
 import re
@@ -11,18 +10,21 @@ import subprocess
 import sys
 import tempfile
 import time
+import zlib
 from importlib.metadata import version
 from pathlib import Path
 
 from gvz import janitor
 from gvz.engine import Engine, EngineConfig
 from gvz.engine_process import log_tail, one_of
-from gvz.errors import EngineError
+from gvz.errors import EngineError, WadError
+from gvz.wad.lumps import read_wad
 
 _FAULTS = re.compile(r"unknown|tried to register|script error|no map|not found|execution could not continue", re.I)
 """what ZDoom prints, and then goes on as if nothing was wrong"""
 _MEMORY_BYTES = 4 * 2**30
 _TICS = 70
+_NUM_PLACES = 8
 
 
 def probe_wad(wad: Path, map_name: str = "MAP01", timeout_s: float = 60.0) -> str:
@@ -39,6 +41,12 @@ def probe_wad(wad: Path, map_name: str = "MAP01", timeout_s: float = 60.0) -> st
     Raises:
         EngineError: it crashed, did not finish in time, or its log shows a fault; the message has the log's lines.
     """
+    try:
+        lumps = [lump.name for lump in read_wad(wad.read_bytes())]
+    except (OSError, WadError) as error:
+        raise EngineError(f"{wad}: not a scenario file: {error}") from error
+    if map_name not in lumps:
+        raise EngineError(f"{wad}: no map {map_name}, only {', '.join(lumps[:8])}; the engine would play another one")
     with tempfile.TemporaryDirectory(prefix="gvz-probe-") as directory:
         log = Path(directory) / "engine.log"
         command = [sys.executable, "-m", "gvz.probe", str(wad), map_name, str(log), str(timeout_s)]
@@ -57,7 +65,7 @@ def probe_wad(wad: Path, map_name: str = "MAP01", timeout_s: float = 60.0) -> st
         return text
 
 
-def ensure_loads(wad: Path, timeout_s: float = 60.0) -> None:
+def ensure_loads(wad: Path, map_name: str = "MAP01", timeout_s: float = 60.0) -> None:
     """`probe_wad`, once for each content-addressed file and version of ViZDoom: success leaves a marker beside it.
 
     Raises:
@@ -66,9 +74,10 @@ def ensure_loads(wad: Path, timeout_s: float = 60.0) -> None:
     marker = wad.with_suffix(f".loads-{version('vizdoom')}")
     if marker.exists():
         return
-    with one_of([f"probe-{wad.stem[:64]}"], time.monotonic() + timeout_s):
+    place = zlib.crc32(wad.stem.encode()) % _NUM_PLACES  # one file is probed by one process at a time
+    with one_of([f"probe-{place}"], time.monotonic() + timeout_s):
         if not marker.exists():
-            probe_wad(wad, timeout_s=timeout_s)
+            probe_wad(wad, map_name, timeout_s)
             marker.touch()
 
 

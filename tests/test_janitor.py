@@ -1,0 +1,219 @@
+"""The janitor removes what dead owners left, and nothing else."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import vizdoom
+
+from gvz import janitor
+from gvz.errors import ResourceError
+
+STOCK_WAD = Path(vizdoom.scenarios_path) / "defend_the_center.wad"
+
+
+@pytest.fixture
+def registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A registry of this test's own, so that records can be forged."""
+    tmp_path.chmod(0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return janitor.runtime_dir()
+
+
+@pytest.fixture
+def segment() -> Iterator[Path]:
+    path = janitor.SHM_DIR / f"gvz-test-{os.getpid()}"
+    path.write_bytes(b"payload")
+    yield path
+    path.unlink(missing_ok=True)
+
+
+def run_until_killed(code: str) -> str:
+    """Runs code in a process of its own, kills it with SIGKILL at its first line of output, returns that line."""
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline().strip()
+        process.kill()
+    return line
+
+
+def change_record(registry: Path, **changes: object) -> None:
+    (path,) = registry.glob("*.json")
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def wait_until_gone(pid: int) -> bool:
+    deadline = time.monotonic() + 5
+    while janitor.process_start(pid) is not None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return janitor.process_start(pid) is None
+
+
+def test_records_are_private(registry: Path):
+    janitor.record("segment", "gvz-x")
+    (path,) = registry.glob("*.json")
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert registry.stat().st_mode & 0o777 == 0o700
+    janitor.forget("segment", "gvz-x")
+    assert list(registry.iterdir()) == []
+    janitor.forget("segment", "gvz-x")  # again, and of what was never recorded
+
+
+def test_what_a_living_owner_has_is_left_alone(registry: Path, segment: Path):
+    janitor.record("segment", segment.name)
+    assert janitor.clean_dead_instances() == []
+    assert segment.exists()
+    assert len(list(registry.glob("*.json"))) == 1
+
+
+def test_a_dead_owners_segment_is_unlinked(registry: Path, segment: Path):
+    run_until_killed(
+        f"from gvz import janitor; janitor.record('segment', {segment.name!r}); print(1, flush=True); input()"
+    )
+    assert len(list(registry.glob("*.json"))) == 1
+    assert janitor.clean_dead_instances() == [f"shared memory {segment.name}"]
+    assert not segment.exists()
+    assert list(registry.iterdir()) == []
+    assert janitor.clean_dead_instances() == []
+
+
+def test_a_reused_process_id_is_not_the_owner(registry: Path, segment: Path):
+    janitor.record("segment", segment.name)
+    start = janitor.process_start(os.getpid())
+    assert start is not None
+    change_record(registry, owner_start=start - 1)
+    assert janitor.clean_dead_instances() == [f"shared memory {segment.name}"]
+
+
+def test_records_of_another_machine_are_left_alone(registry: Path, segment: Path):
+    janitor.record("segment", segment.name)
+    change_record(registry, owner_start=1, machine="another boot")
+    assert janitor.clean_dead_instances() == []
+    assert segment.exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        ("segment", "../etc/passwd"),
+        ("segment", ".."),
+        ("segment", ""),
+        ("engine", "gvz-engine-relative"),
+        ("engine", "/tmp/gvz-engine-x/../../home"),
+        ("engine", "/home/someone"),
+        ("directory", "/tmp/x"),
+    ],
+)
+def test_forged_records_delete_nothing(registry: Path, segment: Path, kind: str, name: str):
+    janitor.record("segment", segment.name)
+    change_record(registry, owner_start=1, kind=kind, name=name)
+    (line,) = janitor.clean_dead_instances()
+    assert line.startswith("left alone: unreadable record")
+    assert segment.exists()
+    with pytest.raises(ValueError, match="record of kind"):
+        janitor.record(kind, name)
+
+
+def test_a_record_that_is_not_json_is_reported_and_left(registry: Path):
+    path = registry / "segment-1-1-x.json"
+    path.write_text("{")
+    (line,) = janitor.clean_dead_instances()
+    assert str(path) in line
+    assert path.exists()
+
+
+def test_a_process_without_the_instance_id_is_not_killed(registry: Path, tmp_path: Path):
+    directory = tmp_path / "gvz-engine-x"
+    directory.mkdir()
+    with subprocess.Popen(["sleep", "60"]) as bystander:
+        start = janitor.process_start(bystander.pid)
+        (directory / janitor.INSTANCE_FILE).write_text(f"{bystander.pid} {start} Abc123\n")
+        janitor.record("engine", str(directory))
+        change_record(registry, owner_start=1)
+        assert janitor.clean_dead_instances() == [f"directory {directory}"]
+        assert bystander.poll() is None
+        bystander.kill()
+
+
+def test_an_instance_file_that_is_not_ours_is_reported(registry: Path, tmp_path: Path):
+    directory = tmp_path / "gvz-engine-x"
+    directory.mkdir()
+    (directory / janitor.INSTANCE_FILE).write_text("1 2 ../../etc\n")
+    janitor.record("engine", str(directory))
+    change_record(registry, owner_start=1)
+    (line,) = janitor.clean_dead_instances()
+    assert "want process id, start time, instance id" in line
+    assert directory.exists()
+
+
+@pytest.mark.engine
+def test_a_killed_client_takes_its_engine_along_and_the_janitor_the_rest(registry: Path):
+    line = run_until_killed(
+        "from pathlib import Path; from gvz.engine import Engine, EngineConfig\n"
+        f"e = Engine(EngineConfig(wad=Path({str(STOCK_WAD)!r}), buttons=(), variables=()))\n"
+        "print(e.pid, e.instance_id, e.log.parent, flush=True); input()"
+    )
+    pid, instance_id, directory = line.split()
+    assert wait_until_gone(int(pid)), "the engine outlived its client"
+    left = {path.name for path in janitor.SHM_DIR.glob(f"*{instance_id}")}
+    assert left == {f"ViZDoom{part}{instance_id}" for part in ("SM", "MQCtr", "MQDoom")}
+    removed = janitor.clean_dead_instances()
+    assert sorted(removed) == sorted([*(f"shared memory {name}" for name in left), f"directory {directory}"])
+    assert not list(janitor.SHM_DIR.glob(f"*{instance_id}"))
+    assert not Path(directory).exists()
+    assert list(registry.glob("*.json")) == []
+
+
+@pytest.mark.engine
+def test_an_engine_that_outlived_its_owner_is_ended(registry: Path):
+    from gvz.engine import Engine, EngineConfig
+
+    engine = Engine(EngineConfig(wad=STOCK_WAD, buttons=(), variables=()))
+    change_record(registry, owner_start=1)
+    assert f"engine {engine.instance_id} (pid {engine.pid})" in janitor.clean_dead_instances()
+    assert wait_until_gone(engine.pid)
+    engine.close()
+
+
+def test_a_zombie_is_dead():
+    process = subprocess.Popen(["true"])
+    deadline = time.monotonic() + 5
+    while janitor.process_start(process.pid) is not None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert Path(f"/proc/{process.pid}").exists(), "not reaped yet"
+    assert janitor.process_start(process.pid) is None
+    process.wait()
+
+
+def test_a_stopped_process_lives():
+    with subprocess.Popen(["sleep", "60"]) as process:
+        process.send_signal(signal.SIGSTOP)
+        assert janitor.process_start(process.pid) is not None
+        process.kill()
+
+
+def test_a_runtime_directory_that_others_can_enter_is_refused(registry: Path):
+    registry.chmod(0o755)
+    with pytest.raises(ResourceError, match=r"want a directory of user \d+ that nobody else can enter"):
+        janitor.runtime_dir()
+
+
+def test_a_runtime_directory_that_is_a_link_is_refused(registry: Path, tmp_path: Path):
+    registry.rmdir()
+    registry.symlink_to(tmp_path)
+    with pytest.raises(ResourceError, match="that nobody else can enter"):
+        janitor.runtime_dir()
+
+
+def test_a_runtime_directory_that_cannot_be_made_is_refused(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/proc/self")
+    with pytest.raises(ResourceError, match="set TMPDIR to one that can be written"):
+        janitor.runtime_dir()
