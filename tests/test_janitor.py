@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -213,7 +214,14 @@ def test_a_runtime_directory_that_is_a_link_is_refused(registry: Path, tmp_path:
         janitor.runtime_dir()
 
 
-def test_a_runtime_directory_that_cannot_be_made_is_refused(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", "/proc/self")
+def test_a_runtime_directory_that_cannot_be_made_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    file = tmp_path / "file"
+    file.touch(mode=0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(file))
     with pytest.raises(ResourceError, match="set TMPDIR to one that can be written"):
         janitor.runtime_dir()
+
+
+def test_without_a_users_runtime_directory_the_temporary_one_is_taken(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/nowhere")
+    assert janitor.runtime_dir() == Path(tempfile.gettempdir()) / f"gvizdoom-{os.getuid()}"
