@@ -7,7 +7,7 @@ import pytest
 
 from gvz.errors import AcsError
 from gvz.wad.acs import compile_acs
-from gvz.wad.acs.parser import MAX_NESTING
+from gvz.wad.acs.cursor import MAX_NESTING
 
 TERMINATE = 1
 
@@ -77,7 +77,9 @@ def error_of(source: str, **options) -> AcsError:
         ('Spawn("Demon", 1.0, 2.0, 0.0);', "a7 00 03 00000100 03 00000200 b1 00 00 00 95 36"),
         ("SetActivatorToTarget(7);", "a7 07 f0 6f 01 0d00 36"),
         ("int x = SetActivator(7, 2);", "b0 07 02 f0 6f 02 0c00 19 00"),
-        ("SetThingSpecial(1, ACS_ExecuteAlways, 3);", "af 07 01 e2 03 00 00 00 00 b4"),
+        ("SetThingSpecial(9, ACS_ExecuteAlways, 1);", "af 07 09 e2 01 00 00 00 00 b4"),
+        ("SetThingSpecial(9, Thing_Remove, 1, 2, 3);", "af 07 09 84 01 02 03 00 00 b4"),
+        ("SetThingSpecial(9, 132, 1, 2, 3, 4, 5);", "af 07 09 84 01 02 03 04 05 b4"),
         ("suspend; restart; terminate;", "02 45"),
         ('Log(s:"a", d:1, c:65, f:1.5, i:2);', "55 a7 00 57 a7 01 58 a7 41 59 03 00800100 9d a7 02 58 f0 1e"),
         ('Print(s:"a");', "55 a7 00 57 56"),
@@ -185,6 +187,14 @@ def test_a_long_sum_compiles():
 
 def test_names_and_keywords_ignore_case():
     assert body("INT X = 1; DELAY(x);") == body("int x = 1; delay(X);")
+
+
+def test_a_name_of_a_script_is_free_again_after_it():
+    assert compile_acs("script 1 OPEN { int x; } function void f(int x) { } int x; script 2 (int y) { x = y; }")
+
+
+def test_a_script_whose_number_only_the_game_knows_may_be_started():
+    assert compile_acs("script 1 (int n) { ACS_Execute(n, 0); ACS_Execute(n + 1, 0); }")
 
 
 def test_equal_strings_are_stored_once_in_order_of_first_use():
@@ -302,6 +312,11 @@ def test_no_dummy_script_stands_for_a_number_beyond_255():
             'script 1 OPEN { Spawn("Demon", -96, 0, 0); }', 1, 33,
             "argument 2 of Spawn: got the integer 96, want a fixed-point number such as 96.0",
         ),
+        ("script 1 OPEN { TakeInventory(ON, 1); }", 1, 31, "argument 1 of TakeInventory: got a number, want a string"),
+        ("script 5 OPEN { ACS_Execute(3, 0); }", 1, 29, "got script 3, which is not there, want one of [5]"),
+        ("#define N 6\nscript 5 OPEN { ACS_ExecuteAlways(N); }", 2, 35, "got script 6, which is not there"),
+        ("script 5 OPEN { SetThingSpecial(1, ACS_Execute, 7); }", 1, 49, "got script 7, which is not there"),
+        ('script 5 OPEN { ACS_Terminate("x", 0); }', 1, 31, "argument 1 of ACS_Terminate: got a string, want a number"),
         # statements out of place
         ("script 1 OPEN { break; }", 1, 17, "got 'break' outside a loop, want it in one"),
         ("script 1 OPEN { switch (1) { case 1: continue; } }", 1, 38, "got 'continue' outside a loop, want it in one"),
@@ -339,6 +354,7 @@ def test_an_error_says_where_and_what_was_found_and_expected(source: str, line: 
 @pytest.mark.parametrize(
     ("source", "text"),
     [
+        (f"function void f({', '.join(f'int v{i}' for i in range(256))}) {{ }}", "got more than 255 local variables"),
         ("".join(f"int v{i};" for i in range(129)), "got more than 128 map variables"),
         ("".join(f"function void f{i}(void) {{ }}" for i in range(257)), "got more than 256 functions"),
         (f"script 1 OPEN {{ int {', '.join(f'v{i}' for i in range(256))}; }}", "got more than 255 local variables"),

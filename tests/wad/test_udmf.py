@@ -131,6 +131,7 @@ def test_a_made_thing_is_there_for_everyone():
         ('"C";', '"C;', "TEXTMAP line 8: got '\"C; specia', want a name"),
         ("thing {", "thing { /* ", "TEXTMAP line 9: got '/*  x = 8.', want a name"),
         ("coop = False; }", "coop = False;", "TEXTMAP line 10: got the end of the text, want a field or '}'"),
+        ("type = 1; skill1 = true; coop = False; }", "type =", "TEXTMAP line 10: got the end of the text, want a"),
         ("v1 = 0;", "v1 = 3;", "TEXTMAP line 5, linedef 0, v1: got 3, want the number of one of 3 vertex blocks"),
         ("v1 = 0;", "v1 = -1;", "TEXTMAP line 5, linedef 0, v1: got -1, want the number of one of 3 vertex blocks"),
         ("v1 = 0;", "v1 = true;", "TEXTMAP line 5, linedef 0, v1: got True, want"),

@@ -1,8 +1,8 @@
-"""Expressions, assignments and calls to instructions, and constant expressions to values."""
+"""Expressions, assignments and calls to instructions. Imports gvz.wad.acs."""
 
 from gvz.wad.acs.classes import USED_AS_CLASS
-from gvz.wad.acs.intrinsics import FIXED_PROPERTIES, LATENT, SET_ACTOR_PROPERTY, Intrinsic, Kind, Type
-from gvz.wad.acs.lexer import Position, error
+from gvz.wad.acs.intrinsics import FIXED_PROPERTIES, LATENT, Intrinsic, Kind, Type
+from gvz.wad.acs.lexer import error
 from gvz.wad.acs.symbols import ConstantSymbol, FunctionSymbol, Unit, VariableSymbol
 from gvz.wad.acs.syntax import Assign, Binary, Call, Expression, Increment, Name, Number, String, Unary
 
@@ -38,16 +38,29 @@ def emit_value(unit: Unit, node: Expression, kind: Kind, what: str) -> None:
     type_name = emit_expression(unit, node)
     if type_name == "int" and kind in ("str", "class"):
         raise error(node.at, f"{what}: got a number, want a string")
-    if type_name == "str" and kind in ("int", "fixed"):
+    if type_name == "str" and kind in ("int", "fixed", "script"):
         raise error(node.at, f"{what}: got a string, want a number")
     if type_name == "void":
         raise error(node.at, f"{what}: got a function that returns nothing, want a value")
+    if kind == "script":
+        _note_script(unit, node)
     literal = node.operand if isinstance(node, Unary) else node
     if kind == "fixed" and isinstance(literal, Number) and literal.value and not literal.is_fixed:
         raise error(
             literal.at,
             f"{what}: got the integer {literal.value}, want a fixed-point number such as {literal.value}.0",
         )
+
+
+def _note_script(unit: Unit, node: Expression) -> None:
+    value = node if isinstance(node, Number) else _named_constant(unit, node)
+    if value is not None:  # else only the running engine knows
+        unit.started_scripts.append((value.value, node.at))
+
+
+def _named_constant(unit: Unit, node: Expression) -> ConstantSymbol | None:
+    symbol = unit.lookup(node.name, node.at) if isinstance(node, Name) else None
+    return symbol if isinstance(symbol, ConstantSymbol) else None
 
 
 def emit_expression(unit: Unit, node: Expression) -> Type:
@@ -182,9 +195,8 @@ def emit_call(unit: Unit, node: Call, *, discard: bool) -> Type:
     _check_count(node, symbol.name, required, most)
     if unit.function is not None and node.name in LATENT:
         raise error(node.at, f"got {symbol.name} in a function, want it in a script: only scripts can wait")
-    for i, (argument, kind) in enumerate(zip(node.arguments, symbol.parameters, strict=False)):
-        if node.name == SET_ACTOR_PROPERTY and i == 2 and _is_fixed_property(unit, node.arguments[1]):
-            kind = "fixed"
+    kinds = _argument_kinds(unit, node, symbol)[: len(node.arguments)]
+    for i, (argument, kind) in enumerate(zip(node.arguments, kinds, strict=True)):
         emit_value(unit, argument, kind, f"argument {i + 1} of {symbol.name}")
     _emit_intrinsic(unit, symbol, len(node.arguments), discard)
     return symbol.returns
@@ -225,11 +237,18 @@ def _check_count(node: Call, name: str, least: int, most: int) -> None:
         raise error(node.at, f"{name}: got {got} arguments, want {wanted}")
 
 
-def _is_fixed_property(unit: Unit, node: Expression) -> bool:
-    if not isinstance(node, Name):
-        return False
-    symbol = unit.lookup(node.name, node.at)
-    return isinstance(symbol, ConstantSymbol) and symbol.value in FIXED_PROPERTIES
+def _argument_kinds(unit: Unit, node: Call, symbol: Intrinsic) -> tuple[Kind, ...]:
+    """What the arguments of a built-in must be, where an argument decides on the kind of the next one."""
+    kinds = symbol.parameters
+    if node.name == "setactorproperty":
+        constant_symbol = _named_constant(unit, node.arguments[1])
+        if constant_symbol is not None and constant_symbol.value in FIXED_PROPERTIES:
+            return (*kinds[:2], "fixed")
+    if node.name == "setthingspecial" and isinstance(node.arguments[1], Name):
+        special = unit.lookup(node.arguments[1].name, node.arguments[1].at)
+        if isinstance(special, Intrinsic) and special.form == "special":
+            return (*kinds[:2], *special.parameters, *kinds[2 + len(special.parameters) :])
+    return kinds
 
 
 def flow(unit: Unit, node: Expression, target: object) -> None:
@@ -246,74 +265,3 @@ def flow(unit: Unit, node: Expression, target: object) -> None:
                 unit.flow.add(symbol, target)
         case _:
             pass  # numbers: no class name
-
-
-def constant(unit: Unit, node: Expression, what: str) -> ConstantSymbol:
-    """The value of an expression that must be known now, as a signed 32-bit number or a string.
-
-    Raises:
-        AcsError: it is not constant, adds up strings, or divides by zero.
-    """
-    match node:
-        case Number():
-            return ConstantSymbol(_signed(node.value))
-        case String():
-            return ConstantSymbol(unit.string(node.text, node.at), node.text)
-        case Name(index=None):
-            symbol = unit.lookup(node.name, node.at)
-            if isinstance(symbol, ConstantSymbol):
-                return symbol
-        case Unary():
-            value = constant_number(unit, node.operand, what)
-            return ConstantSymbol(_signed({"-": -value, "!": int(not value), "~": ~value}[node.operator]))
-        case Binary():
-            chain = [node]
-            while isinstance(node.left, Binary):
-                node = node.left
-                chain.append(node)
-            total = constant_number(unit, node.left, what)
-            for link in reversed(chain):
-                total = _fold(link.operator, total, constant_number(unit, link.right, what), link.at)
-            return ConstantSymbol(total)
-        case _:
-            pass
-    raise error(node.at, f"{what}: got a value known only when the script runs, want a constant")
-
-
-def constant_number(unit: Unit, node: Expression, what: str) -> int:
-    """The value of a constant expression that must be a number."""
-    result = constant(unit, node, what)
-    if result.text is not None:
-        raise error(node.at, f"{what}: got a string, want a number")
-    return result.value
-
-
-def _signed(value: int) -> int:
-    return (value + 0x80000000) % 0x100000000 - 0x80000000
-
-
-def _fold(operator: str, left: int, right: int, at: Position) -> int:
-    if operator in ("/", "%"):
-        if right == 0:
-            raise error(at, f"got a division by zero on the right of {operator!r}, want another constant")
-        quotient = abs(left) // abs(right) * (1 if (left < 0) == (right < 0) else -1)
-        return _signed(quotient if operator == "/" else left - quotient * right)
-    results = {
-        "+": lambda: left + right,
-        "-": lambda: left - right,
-        "*": lambda: left * right,
-        "==": lambda: left == right,
-        "!=": lambda: left != right,
-        "<": lambda: left < right,
-        ">": lambda: left > right,
-        "<=": lambda: left <= right,
-        ">=": lambda: left >= right,
-        "&&": lambda: bool(left and right),
-        "||": lambda: bool(left or right),
-        "&": lambda: left & right,
-        "|": lambda: left | right,
-        "^": lambda: left ^ right,
-        "<<": lambda: left << (right & 31),
-        ">>": lambda: left >> (right & 31),
-    }
-    return _signed(int(results[operator]()))

@@ -4,6 +4,7 @@ Numbers are those of the engine (ZDoom's p_acs.h, actionspecials.h) and of zcomm
 need is listed. A parameter is described by its kind:
 
 * `int`: a number; `fixed`: a fixed-point number, where a bare integer is almost surely a slip (1.0 is 65536);
+* `script`: the number of a script of the same source;
 * `str`: a string; `class`: a string that names an actor class; `any`: a number or a string.
 
 A `?` marks a parameter that may be left out.
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Literal, cast
 
-Kind = Literal["int", "fixed", "str", "class", "any"]
+Kind = Literal["int", "fixed", "script", "str", "class", "any"]
 Type = Literal["int", "str", "any", "void"]
 """what a value is known to be; `any` where only the running engine knows"""
 Form = Literal["instruction", "function", "special"]
@@ -107,9 +108,9 @@ SPECIALS = """
  19 int Thing_Stop int
  72 int ThrustThing int int int? int?
  73 int DamageThing int int?
- 80 int ACS_Execute int int? any? any? any?
- 82 int ACS_Terminate int int
- 84 int ACS_ExecuteWithResult int any? any? any? any?
+ 80 int ACS_Execute script int? any? any? any?
+ 82 int ACS_Terminate script int
+ 84 int ACS_ExecuteWithResult script any? any? any? any?
 119 int Thing_Damage int int int?
 125 int Thing_Move int int int?
 128 int ThrustThingZ int int int int
@@ -119,7 +120,7 @@ SPECIALS = """
 133 int Thing_Destroy int int? int?
 176 int Thing_ChangeTID int int
 177 int Thing_Hate int int int?
-226 int ACS_ExecuteAlways int int? any? any? any?
+226 int ACS_ExecuteAlways script int? any? any? any?
 229 int Thing_SetGoal int int int int?
 243 int Exit_Normal int
 248 int HealThing int int?
@@ -164,7 +165,6 @@ T_NONE 0
 FIXED_PROPERTIES = frozenset((1, 3, 12, 15, 24, 29, 30, 38, 39, 40, 42, 43))
 """actor properties whose value is a fixed-point number (Speed, Alpha, JumpZ, Gravity, DamageFactor, ...)"""
 
-SET_ACTOR_PROPERTY = "setactorproperty"
 LATENT = frozenset(("delay",))
 """built-ins that suspend the script and therefore cannot stand in a function"""
 

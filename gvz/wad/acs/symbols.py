@@ -1,10 +1,11 @@
-"""What names mean while a source is compiled: variables, functions, constants, the string table."""
+"""What is known of a source while it is compiled: names, strings, the script under way. Imports gvz.wad.acs."""
 
 import difflib
 from dataclasses import dataclass, field
 from typing import Literal
 
-from gvz.wad.acs.assembler import Assembler
+from gvz.wad.acs.assembler import Assembler, Label
+from gvz.wad.acs.behavior import FunctionEntry, MapVariableEntry, ScriptEntry
 from gvz.wad.acs.classes import ClassFlow
 from gvz.wad.acs.intrinsics import Intrinsic, constants, intrinsics
 from gvz.wad.acs.lexer import Position, error
@@ -12,8 +13,6 @@ from gvz.wad.acs.syntax import Function
 
 MAX_LOCALS = 255
 """variables, or arrays, of one script or function: numbers and counts are one byte in the object file"""
-MAX_MAP_VARIABLES = 128
-MAX_FUNCTIONS = 256
 MAX_STRINGS = 32768
 
 Storage = Literal["script", "map", "global", "map array", "script array"]
@@ -50,20 +49,29 @@ Symbol = VariableSymbol | FunctionSymbol | ConstantSymbol | Intrinsic
 
 @dataclass(slots=True)
 class Unit:
-    """Everything known about the source under compilation."""
+    """Everything known about the source under compilation; the emitting functions add to it."""
 
     code: Assembler = field(default_factory=Assembler)
+    scripts: list[ScriptEntry] = field(default_factory=list)
+    functions: list[FunctionEntry] = field(default_factory=list)
+    variables: list[MapVariableEntry] = field(default_factory=list)
     strings: dict[str, int] = field(default_factory=dict)
-    flow: ClassFlow = field(default_factory=ClassFlow)
     names: dict[str, Symbol] = field(default_factory=dict)
     """names of the source that are known everywhere"""
+    flow: ClassFlow = field(default_factory=ClassFlow)
+    started_scripts: list[tuple[int, Position]] = field(default_factory=list)
+    """numbers of scripts that the source starts, and where"""
+
+    # of the script or function under compilation:
+    function: Function | None = None
+    """None in a script"""
     locals: dict[str, VariableSymbol] = field(default_factory=dict)
-    """names of the script or function under compilation"""
     num_locals: int = 0
     array_sizes: list[int] = field(default_factory=list)
-    """of the local arrays so far"""
-    function: Function | None = None
-    """the function under compilation; None in a script"""
+    breaks: list[Label] = field(default_factory=list)
+    """where `break` goes, of the loops and switches around the current statement"""
+    continues: list[Label] = field(default_factory=list)
+    """where `continue` goes, of the loops around the current statement"""
 
     def string(self, text: str, at: Position) -> int:
         """The number of a string, which is what stands for it in the code."""
@@ -86,33 +94,46 @@ class Unit:
         return symbol
 
     def declare(self, name: str, symbol: Symbol, at: Position) -> None:
-        """Gives `name` a meaning in the whole source."""
+        """Gives `name` a meaning in the whole source.
+
+        Raises:
+            AcsError: it has one already.
+        """
         self._refuse_duplicate(name, at)
         self.names[name] = symbol
 
     def declare_local(self, name: str, type_name: str, at: Position, size: int = 0) -> VariableSymbol:
-        """Gives `name` a meaning in this script or function: a variable, or an array of `size` elements."""
-        self._refuse_duplicate(name, at)
-        count = len(self.array_sizes) if size else self.num_locals
-        if count == MAX_LOCALS:
-            raise error(at, f"got more than {MAX_LOCALS} local variables or arrays, want fewer")
-        symbol = VariableSymbol("script array" if size else "script", count, type_name)
-        self.locals[name] = symbol
+        """Gives `name` a meaning in this script or function: a variable, or an array of `size` elements.
+
+        Raises:
+            AcsError: it has one already, or there are too many.
+        """
         if size:
+            self._add_local(name, VariableSymbol("script array", len(self.array_sizes), type_name), at)
             self.array_sizes.append(size)
         else:
+            self._add_local(name, VariableSymbol("script", self.num_locals, type_name), at)
             self.num_locals += 1
-        return symbol
+        return self.locals[name]
 
     def declare_parameter(self, name: str, symbol: VariableSymbol, at: Position) -> None:
-        """Gives `name` a meaning in this function, for a parameter that callers already know."""
-        self._refuse_duplicate(name, at)
-        self.locals[name] = symbol
+        """Gives `name` a meaning in this function, for a parameter that callers already know.
+
+        Raises:
+            AcsError: it has one already, or there are too many.
+        """
+        self._add_local(name, symbol, at)
         self.num_locals += 1
 
-    def begin_locals(self) -> None:
-        """Forgets the names of the last script or function."""
-        self.locals, self.array_sizes, self.num_locals = {}, [], 0
+    def forget_locals(self) -> None:
+        """Ends a script or function."""
+        self.function, self.locals, self.num_locals, self.array_sizes = None, {}, 0, []
+
+    def _add_local(self, name: str, symbol: VariableSymbol, at: Position) -> None:
+        self._refuse_duplicate(name, at)
+        if symbol.index == MAX_LOCALS:
+            raise error(at, f"got more than {MAX_LOCALS} local variables or arrays, want fewer")
+        self.locals[name] = symbol
 
     def _find(self, name: str) -> Symbol | None:
         for names in (self.locals, self.names, intrinsics()):

@@ -1,0 +1,76 @@
+"""Expressions whose value must be known when the source is compiled. Imports gvz.wad.acs."""
+
+from gvz.wad.acs.lexer import Position, error
+from gvz.wad.acs.symbols import ConstantSymbol, Unit
+from gvz.wad.acs.syntax import Binary, Expression, Name, Number, String, Unary
+
+
+def constant(unit: Unit, node: Expression, what: str) -> ConstantSymbol:
+    """The value of an expression that must be known now, as a signed 32-bit number or a string.
+
+    Raises:
+        AcsError: it is not constant, adds up strings, or divides by zero.
+    """
+    match node:
+        case Number():
+            return ConstantSymbol(_signed(node.value))
+        case String():
+            return ConstantSymbol(unit.string(node.text, node.at), node.text)
+        case Name(index=None):
+            symbol = unit.lookup(node.name, node.at)
+            if isinstance(symbol, ConstantSymbol):
+                return symbol
+        case Unary():
+            value = constant_number(unit, node.operand, what)
+            return ConstantSymbol(_signed({"-": -value, "!": int(not value), "~": ~value}[node.operator]))
+        case Binary():
+            chain = [node]
+            while isinstance(node.left, Binary):
+                node = node.left
+                chain.append(node)
+            total = constant_number(unit, node.left, what)
+            for link in reversed(chain):
+                total = _fold(link.operator, total, constant_number(unit, link.right, what), link.at)
+            return ConstantSymbol(total)
+        case _:
+            pass
+    raise error(node.at, f"{what}: got a value known only when the script runs, want a constant")
+
+
+def constant_number(unit: Unit, node: Expression, what: str) -> int:
+    """The value of a constant expression that must be a number."""
+    result = constant(unit, node, what)
+    if result.text is not None:
+        raise error(node.at, f"{what}: got a string, want a number")
+    return result.value
+
+
+def _signed(value: int) -> int:
+    return (value + 0x80000000) % 0x100000000 - 0x80000000
+
+
+def _fold(operator: str, left: int, right: int, at: Position) -> int:
+    if operator in ("/", "%"):
+        if right == 0:
+            raise error(at, f"got a division by zero on the right of {operator!r}, want another constant")
+        quotient = abs(left) // abs(right) * (1 if (left < 0) == (right < 0) else -1)
+        return _signed(quotient if operator == "/" else left - quotient * right)
+    results = {
+        "+": lambda: left + right,
+        "-": lambda: left - right,
+        "*": lambda: left * right,
+        "==": lambda: left == right,
+        "!=": lambda: left != right,
+        "<": lambda: left < right,
+        ">": lambda: left > right,
+        "<=": lambda: left <= right,
+        ">=": lambda: left >= right,
+        "&&": lambda: bool(left and right),
+        "||": lambda: bool(left or right),
+        "&": lambda: left & right,
+        "|": lambda: left | right,
+        "^": lambda: left ^ right,
+        "<<": lambda: left << (right & 31),
+        ">>": lambda: left >> (right & 31),
+    }
+    return _signed(int(results[operator]()))
