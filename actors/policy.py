@@ -2,6 +2,8 @@
 there is a function to load, so that a pool of random players starts without it.
 """
 
+import itertools
+import math
 from typing import Protocol
 
 import numpy as np
@@ -36,7 +38,7 @@ class RandomPolicy:
         """Chance has no parameters."""
 
     def act(self, obs: np.ndarray, _task: np.ndarray, /) -> np.ndarray:
-        rng = np.random.default_rng((self._seed, self.num_calls))
+        rng = np.random.Generator(np.random.Philox(key=self._seed, counter=self.num_calls))
         self.num_calls += 1
         return rng.integers(self._num_actions, size=len(obs), dtype=np.int32)
 
@@ -44,8 +46,12 @@ class RandomPolicy:
 class ExportedPolicy:
     """An acting function that was serialized with `jax.export` for a CPU.
 
-    Its signature is f(params f32[P], obs u8[B,H,W,stack*C], task i32[B], key u32[2], epsilon f32[]) -> i32[B]. The
-    key of a call is the seed's key folded with the number of calls.
+    Its signature is f(params list of f32 leaves, obs u8[B,H,W,stack*C], task i32[B], key u32[2], epsilon f32[])
+    -> i32[B]. The leaves are cut from the flat vector in order. The key of a call is the seed's key folded with the
+    number of calls.
+
+    Raises:
+        ValueError: the function is for other parameters or other observations.
     """
 
     def __init__(self, serialized: bytes, num_params: int, obs_shape: tuple[int, int, int, int], seed: int):
@@ -53,6 +59,10 @@ class ExportedPolicy:
         import jax.export
 
         exported = jax.export.deserialize(bytearray(serialized))
+        self._shapes = [aval.shape for aval in exported.in_avals[:-4]]
+        self._ends = list(itertools.accumulate(math.prod(shape) for shape in self._shapes))
+        if self._ends[-1] != num_params:
+            raise ValueError(f"acting function: it takes {self._ends[-1]} parameters, want {num_params}")
         self._jax = jax
         self._cpu = jax.devices("cpu")[0]
         self._seed_key = jax.device_put(np.array(jax.random.PRNGKey(seed)), self._cpu)
@@ -68,7 +78,9 @@ class ExportedPolicy:
         self.num_calls = 0
 
     def set_params(self, params: np.ndarray, header: ParamsHeader) -> None:
-        self._params = self._jax.device_put(params, self._cpu)  # no copy if aligned, whatever may_alias says
+        leaves = np.split(params, self._ends[:-1])
+        leaves = [leaf.reshape(shape) for leaf, shape in zip(leaves, self._shapes, strict=True)]
+        self._params = self._jax.device_put(leaves, self._cpu)
         self._epsilon = self._jax.device_put(np.float32(header.epsilon), self._cpu)
 
     def act(self, obs: np.ndarray, task: np.ndarray, /) -> np.ndarray:

@@ -25,6 +25,8 @@ SPACE_TIMEOUT_S = 3600.0
 """a learner that reads nothing for so long is given up (it compiles, saves and is paused for far shorter times)"""
 PARAMS_TIMEOUT_S = 600.0
 """likewise for the first version of the parameters"""
+MAX_PARAMS_SHARE = 0.05
+"""share of an actor's time that may go into taking parameters (27 MB: 20 ms), however often they are published"""
 _PR_SET_PDEATHSIG = 1
 
 
@@ -48,6 +50,7 @@ class Worker:
         self._board = (
             BroadcastReader.attach(spec.broadcast_name, spec.num_params, spec.layout_hash) if spec.policy else None
         )
+        self._take_params_at = 0.0
         self._loop = ActorLoop(spec, self._ring, channel.send)
 
     def run(self) -> None:
@@ -69,11 +72,15 @@ class Worker:
         return any(isinstance(m, Stop) for m in self._channel.receive()) or self._channel.closed
 
     def _take_params(self) -> bool:
-        """Acts by the newest parameters from now on; False if there are none newer."""
-        newest = self._board.read() if self._board else None
-        if newest is not None:
-            self._loop.set_params(*newest)
-        return newest is not None
+        """Acts by the newest parameters from now on; False if there are none newer, or if it is too soon."""
+        start = time.monotonic()
+        newest = self._board.read() if self._board and start >= self._take_params_at else None
+        if newest is None:
+            return False
+        self._loop.set_params(*newest)
+        now = time.monotonic()
+        self._take_params_at = now + (now - start) / MAX_PARAMS_SHARE
+        return True
 
     def _wait_for_params(self) -> bool:
         """Waits for the first version; False if told to stop first."""

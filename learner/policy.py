@@ -49,19 +49,21 @@ def export_policy(agent: Agent, template: Params, batch_size: int, *, explore: b
         explore: True acts with noise and epsilon, False greedily with both ignored.
 
     Returns:
-        Bytes for `jax.export.deserialize`; `.call` takes (params f32[P], obs u8[B, H, W, C], task i32[B],
-        key u32[2], epsilon f32[]) and returns the actions, i32[B].
+        Bytes for `jax.export.deserialize`; `.call` takes (the parameters' leaves as a list, obs u8[B, H, W, C],
+        task i32[B], key u32[2], epsilon f32[]) and returns the actions, i32[B]. A flat vector is cut into leaves by
+        the caller, once a version: within the function it would be copied in every call (27 MB, 2.5 ms).
     """
+    template_leaves, treedef = jax.tree.flatten(template)
 
-    def policy(flat: Array, obs: Array, task: Array, key_data: Array, epsilon: Array) -> Array:
-        params = unflatten_params(flat, template)
+    def policy(leaves: list[Array], obs: Array, task: Array, key_data: Array, epsilon: Array) -> Array:
+        params = jax.tree.unflatten(treedef, leaves)
         if not explore:
             return agent.evaluate(params, obs, task).action.astype(jnp.int32)
         key = jax.random.wrap_key_data(key_data, impl="threefry2x32")
         return agent.act(params, key, obs, task, epsilon)
 
     arguments = (
-        jax.ShapeDtypeStruct((sum(leaf.size for leaf in jax.tree.leaves(template)),), jnp.float32),
+        [jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in template_leaves],
         jax.ShapeDtypeStruct((batch_size, *agent.spec.obs_shape), jnp.uint8),
         jax.ShapeDtypeStruct((batch_size,), jnp.int32),
         jax.ShapeDtypeStruct((2,), jnp.uint32),

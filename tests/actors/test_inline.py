@@ -35,11 +35,11 @@ def hashing_policy(num_games: int) -> bytes:
 
     def act(params, obs, task, key, epsilon):
         mixed = (obs.reshape(num_games, -1).astype(jnp.uint32) * WEIGHTS).sum(1)
-        mixed += params.sum().astype(jnp.uint32) + key.sum() * epsilon.astype(jnp.uint32)
+        mixed += params[0].sum().astype(jnp.uint32) + key.sum() * epsilon.astype(jnp.uint32)
         return (((mixed >> 7) + task.astype(jnp.uint32)) % 5).astype(jnp.int32)
 
     arguments = (
-        jax.ShapeDtypeStruct((3,), jnp.float32),
+        [jax.ShapeDtypeStruct((3,), jnp.float32)],
         jax.ShapeDtypeStruct((num_games, *STACKED), jnp.uint8),
         jax.ShapeDtypeStruct((num_games,), jnp.int32),
         jax.ShapeDtypeStruct((2,), jnp.uint32),

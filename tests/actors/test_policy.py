@@ -13,8 +13,8 @@ BATCH, OBS, NUM_ACTIONS = 3, (3, 4, 5, 6), 7
 
 
 def act(params, obs, task, key, epsilon):
-    """Greedy: params[0] + task + the observation's sum; with probability epsilon a random action."""
-    greedy = (params[0].astype(jnp.int32) + task + obs.astype(jnp.int32).sum((1, 2, 3))) % NUM_ACTIONS
+    """Greedy: the second parameter + task + the observation's sum; with probability epsilon a random action."""
+    greedy = (params[1][0].astype(jnp.int32) + task + obs.astype(jnp.int32).sum((1, 2, 3))) % NUM_ACTIONS
     explore_key, action_key = jax.random.split(jax.random.wrap_key_data(key))
     explore = jax.random.bernoulli(explore_key, epsilon, (BATCH,))
     return jnp.where(explore, jax.random.randint(action_key, (BATCH,), 0, NUM_ACTIONS), greedy)
@@ -23,7 +23,7 @@ def act(params, obs, task, key, epsilon):
 @pytest.fixture(scope="module")
 def serialized() -> bytes:
     arguments = (
-        jax.ShapeDtypeStruct((2,), jnp.float32),
+        [jax.ShapeDtypeStruct((1, 1), jnp.float32), jax.ShapeDtypeStruct((1,), jnp.float32)],
         jax.ShapeDtypeStruct(OBS, jnp.uint8),
         jax.ShapeDtypeStruct((BATCH,), jnp.int32),
         jax.ShapeDtypeStruct((2,), jnp.uint32),
@@ -43,7 +43,7 @@ TASK = np.array([0, 1, 2], np.int32)
 def test_the_function_is_called_with_the_newest_parameters(serialized: bytes):
     policy = ExportedPolicy(serialized, 2, OBS, seed=0)
     for value in (3.0, 5.0):
-        policy.set_params(np.array([value, 0.0], np.float32), header(0.0))
+        policy.set_params(np.array([0.0, value], np.float32), header(0.0))
         wanted = (value + TASK + OBSERVATION.sum((1, 2, 3), dtype=np.int64)) % NUM_ACTIONS
         action = policy.act(OBSERVATION, TASK)
         assert action.dtype == np.int32
@@ -87,7 +87,7 @@ def test_chance_is_uniform():
 
 
 def test_a_function_for_other_games_is_refused_at_once(serialized: bytes):
-    with pytest.raises(ValueError, match="Shape mismatch"):
+    with pytest.raises(ValueError, match="acting function: it takes 2 parameters, want 3"):
         ExportedPolicy(serialized, 3, OBS, seed=0)
     with pytest.raises(ValueError, match="Shape mismatch"):
         ExportedPolicy(serialized, 2, (4, *OBS[1:]), seed=0)

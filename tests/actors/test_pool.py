@@ -240,13 +240,13 @@ def test_a_state_of_another_size_is_refused(tmp_path: Path):
 
 
 def constant_policy() -> bytes:
-    """Plays params[0]."""
+    """Plays its first parameter."""
 
     def act(params, _obs, task, _key, _epsilon):
-        return jnp.full(len(task), params[0].astype(jnp.int32))
+        return jnp.full(len(task), params[0][0].astype(jnp.int32))
 
     arguments = (
-        jax.ShapeDtypeStruct((1000,), jnp.float32),
+        [jax.ShapeDtypeStruct((1000,), jnp.float32)],
         jax.ShapeDtypeStruct((2, *FRAME_SHAPE[:2], 4 * FRAME_SHAPE[2]), jnp.uint8),
         jax.ShapeDtypeStruct((2,), jnp.int32),
         jax.ShapeDtypeStruct((2,), jnp.uint32),
