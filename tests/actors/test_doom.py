@@ -1,0 +1,121 @@
+"""The pool with the real game: bit-for-bit resumption, and engines and actors that are killed."""
+
+import dataclasses
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import psutil
+import pytest
+
+from actors.config import ActorsConfig
+from actors.inline import InlinePool
+from actors.pool import ActorPool, PoolConfig
+from gvz import janitor
+from gvz.specs import EnvConfig
+from gvz.transport.messages import EpisodeStats, Fault, Message, StepBlock
+
+pytestmark = pytest.mark.engine
+
+ENV = EnvConfig(frame_height=32, frame_width=40, render_width=160, render_height=120)
+
+
+def config(work_dir: Path, *, num_actors: int) -> PoolConfig:
+    return PoolConfig(
+        tasks=("defend_the_center/default", "defend_the_center/gore"),
+        num_actors=num_actors,
+        games_per_actor=2,
+        seed=1,
+        env_entry_point="gvz.env:make_env",
+        env_config=dataclasses.asdict(ENV),
+        frame_shape=ENV.frame_shape,
+        stack_size=4,
+        num_actions=3,
+        policy=b"",
+        num_params=0,
+        layout_hash=0,
+        actors=ActorsConfig(),
+        work_dir=work_dir,
+    )
+
+
+def gather(blocks: list[StepBlock]) -> tuple[np.ndarray, np.ndarray]:
+    steps = np.concatenate([block.steps for block in blocks])
+    steps["sequence"] = 0
+    return steps, np.concatenate([block.frames for block in blocks])
+
+
+def test_a_resumed_game_goes_on_bit_for_bit(tmp_path: Path):
+    """The cut lies in the middle of episodes that are not the first; the resumed pool has engines of its own."""
+    pool_config = config(tmp_path, num_actors=1)
+    with InlinePool(pool_config) as pool:
+        pool.drain(301)
+        before = pool.poll()
+        state = msgpack.unpackb(msgpack.packb(pool.state()))
+        wanted_steps, wanted_frames = gather(pool.drain(300))
+        wanted_messages = pool.poll()
+    assert {m.lane for m in before if isinstance(m, EpisodeStats)} == {0, 1}
+    assert all(game["actions"] for game in state["loop"]["games"])
+    with InlinePool(pool_config, state) as pool:
+        steps, frames = gather(pool.drain(300))
+        messages = pool.poll()
+    np.testing.assert_array_equal(steps, wanted_steps)
+    np.testing.assert_array_equal(frames, wanted_frames)
+    assert messages == wanted_messages
+    assert len(messages) >= 2
+
+
+def test_killed_engines_and_actors_are_replaced_and_leave_nothing(tmp_path: Path):
+    before = set(Path("/dev/shm").iterdir())
+    messages: list[Message] = []
+    last: dict[int, np.void] = {}
+    num_cuts = 0
+
+    def until(done: Callable[[], bool]) -> None:
+        nonlocal num_cuts
+        deadline = time.monotonic() + 120
+        while not done():
+            assert time.monotonic() < deadline, messages
+            for block in pool.drain(100, wait_s=0.02):
+                for step in block.steps:
+                    lane = int(step["lane"])
+                    if lane in last:
+                        over = last[lane]["terminated"] or last[lane]["truncated"]
+                        assert step["first"] or not over
+                        assert bool(step["first"]) == (step["episode"] > last[lane]["episode"])
+                        num_cuts += bool(step["first"] and not over)
+                    last[lane] = step.copy()
+            messages.extend(pool.poll())
+
+    def faults(kind: str) -> list[Fault]:
+        return [m for m in messages if isinstance(m, Fault) and m.kind == kind]
+
+    def engines(actor: int) -> list[psutil.Process]:
+        pid = pool.writer_statuses()[actor].pid
+        return [child for child in psutil.Process(pid).children(recursive=True) if "vizdoom" in child.name()]
+
+    with ActorPool(config(tmp_path, num_actors=2)) as pool:
+        until(lambda: pool.statistics().actors_ready == 2 and len(last) == 4)
+
+        engines(0)[0].kill()
+        until(lambda: bool(faults("engine_crash")))
+        crash = faults("engine_crash")[0]
+        until(lambda: any(isinstance(m, EpisodeStats) and m.lane == crash.lane and not m.cut for m in messages))
+        assert crash.lane in (0, 1)
+        assert pool.statistics().restarts == 0, "the actor lives; it starts a new engine by itself"
+        assert num_cuts == 0, "the crashed episode's last record is marked truncated"
+
+        victims = engines(1)
+        assert len(victims) == 2
+        os.kill(pool.writer_statuses()[1].pid, signal.SIGKILL)
+        until(lambda: pool.statistics().restarts == 1 and pool.statistics().actors_ready == 2)
+        assert not any(janitor.process_start(victim.pid) for victim in victims), "engines died with their actor"
+        assert num_cuts <= 2
+    assert len(faults("died")) == 1
+    assert not psutil.Process().children(recursive=True)
+    mine = {path for path in set(Path("/dev/shm").iterdir()) - before if f"gvz-{os.getpid()}-" in path.name}
+    assert not mine
