@@ -26,6 +26,7 @@ _START_LOCKS = tuple(f"start-{place}" for place in range(min(8, max(2, os.cpu_co
 """so many engines of one user start at the same time, over all processes; many at once fail (ViZDoom #355)"""
 _SHM_BYTES = 16 * 2**20
 """free shared memory a start needs: the three files of one engine take 10.8 MB"""
+_LAUNCHER_MODE = 0o700
 _WATCH_PERIOD_S = 0.5
 
 
@@ -62,7 +63,7 @@ def write_launcher(directory: Path, engine: Path, log: Path) -> Path:
     words = (sys.executable, "-IS", wrapper, os.getpid(), directory, log, engine)
     launcher = directory / "launch"
     launcher.write_text(f'#!/bin/sh\nexec {shlex.join(str(word) for word in words)} "$@"\n')
-    launcher.chmod(0o700)
+    launcher.chmod(_LAUNCHER_MODE)
     if not os.access(launcher, os.X_OK):
         raise EngineError(
             f"engine launcher {launcher}: the file system forbids running programs (noexec); "

@@ -218,7 +218,7 @@ def test_a_runtime_directory_that_cannot_be_made_is_refused(tmp_path: Path, monk
     file = tmp_path / "file"
     file.touch(mode=0o700)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(file))
-    with pytest.raises(ResourceError, match="set TMPDIR to one that can be written"):
+    with pytest.raises(ResourceError, match="set TMPDIR to a writable directory"):
         janitor.runtime_dir()
 
 
