@@ -266,6 +266,11 @@ class Task:
         return self.id
 
 
+def words(text: str) -> tuple[str, ...]:
+    """The words of a text: a list of names as it is read aloud."""
+    return tuple(text.split())
+
+
 def nearest(name: str, known: Sequence[str]) -> str:
     """A hint at the known name most like `name`, or nothing."""
     match = get_close_matches(name, known, n=1)

@@ -9,12 +9,12 @@ Start: a strip 64 units wide at one end of a room; enemies that never move stand
     The agent's damage factor is set by enemy type, so that tasks of one level are alike.
 Termination: the agent dies. Truncation: after 2100 tics.
 Metric: frames alive, at most the time-out.
-Attributes: thesis B.4, below. Tasks: thesis Table A.4. Revenants stand for two attributes (their missiles home),
-    so does the Arachnotron (it fires rapidly).
+Attributes: thesis B.4, below. Revenants stand for two attributes (their missiles home), so does the Arachnotron
+    (it fires rapidly); `complete` has both kinds, and city for its textures. Tasks: thesis Table A.4.
 Differs: the enemies have their normal health, as in the author's maps; nobody has a weapon to use on them.
 """
 
-from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform, Value
+from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform, Value, words
 from gvz.scenarios.rewards import Reward, fell, living
 from gvz.wad.udmf import UdmfMap
 
@@ -173,47 +173,23 @@ SCENARIO = Scenario(
         "flames+flaming_skulls+mancubus": Content(agent={"DamageFactor": 0.7}),
         "complete": Content(parameters=_row("Arachnotron", 3, 56.0, 140.0, 440.0), agent={"DamageFactor": 0.5}),
     },
-    tasks=(
-        "default",
-        "city",
-        "flames",
-        "flaming_skulls",
-        "mancubus",
-        "barons",
-        "cacodemons",
-        "resized_agent",
-        "revenants",
-        "city+resized_agent",
-        "arachnotron",
-        "barons+flaming_skulls",
-        "cacodemons+flames",
-        "mancubus+resized_agent",
-        "flames+flaming_skulls+mancubus",
-        "resized_agent+revenants",
-        "city+arachnotron",
-        "complete",
+    tasks=words(
+        """
+        default
+        city flames flaming_skulls mancubus barons cacodemons resized_agent
+        revenants city+resized_agent arachnotron barons+flaming_skulls cacodemons+flames
+        mancubus+resized_agent
+        flames+flaming_skulls+mancubus resized_agent+revenants city+arachnotron
+        complete
+        """
     ),
     splits={
-        "train1": ("default",),
-        "train4": ("default", "flames", "flaming_skulls", "barons"),
-        "train8": (
-            "default",
-            "city",
-            "flames",
-            "flaming_skulls",
-            "mancubus",
-            "barons",
-            "cacodemons",
-            "resized_agent",
-        ),
-        "test": (
-            "revenants",
-            "city+resized_agent",
-            "barons+flaming_skulls",
-            "flames+flaming_skulls+mancubus",
-            "resized_agent+revenants",
-            "city+arachnotron",
-            "complete",
+        "train1": words("default"),
+        "train4": words("default flames flaming_skulls barons"),
+        "train8": words("default city flames flaming_skulls mancubus barons cacodemons resized_agent"),
+        "test": words(
+            "revenants city+resized_agent barons+flaming_skulls flames+flaming_skulls+mancubus "
+            "resized_agent+revenants city+arachnotron complete"
         ),
     },
     buttons=("SPEED", "MOVE_LEFT", "MOVE_RIGHT"),

@@ -9,10 +9,12 @@ Start: one of 20 places (levdoom: 12) at a random angle, a pistol and 200 bullet
     about, unable to walk; one more comes every 30 tics.
 Termination: the agent dies. Truncation: after 1200 tics (levdoom: 1250).
 Metric: kills (KILLCOUNT, which also counts enemies that enemies killed), 20 counted as the most.
-Attributes: thesis B.3, below. Tasks: thesis Table A.3.
+Attributes: thesis B.3, below. `complete` takes blue and mixed_enemies. Tasks: thesis Table A.3.
+Known: about one enemy in a hundred appears in the walled-off notch at the map's north side, out of reach; so does
+    a kit on the map of health_gathering/supreme. The author's maps have it too.
 """
 
-from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform
+from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform, words
 from gvz.scenarios.rewards import Reward, death, fell, living, moved, rose
 from gvz.wad.udmf import UdmfMap
 
@@ -251,47 +253,22 @@ SCENARIO = Scenario(
             actors=_born_soul(100),
         ),
     },
-    tasks=(
-        "default",
-        "blue",
-        "red",
-        "obstacles",
-        "resized_enemies",
-        "shadows",
-        "mixed_enemies",
-        "invulnerable",
-        "blue+shadows",
-        "obstacles+resized",
-        "red+mixed",
-        "invulnerable+blue",
-        "resized+red",
-        "shadows+obstacles",
-        "blue+mixed+resized",
-        "red+obstacles+invulnerable",
-        "resized+shadows+invulnerable",
-        "complete",
+    tasks=words(
+        """
+        default
+        blue red obstacles resized_enemies shadows mixed_enemies invulnerable
+        blue+shadows obstacles+resized red+mixed invulnerable+blue resized+red shadows+obstacles
+        blue+mixed+resized red+obstacles+invulnerable resized+shadows+invulnerable
+        complete
+        """
     ),
     splits={
-        "train1": ("default",),
-        "train4": ("default", "red", "obstacles", "mixed_enemies"),
-        "train8": (
-            "default",
-            "blue",
-            "red",
-            "obstacles",
-            "resized_enemies",
-            "shadows",
-            "mixed_enemies",
-            "invulnerable",
-        ),
-        "test": (
-            "blue+shadows",
-            "obstacles+resized",
-            "red+mixed",
-            "blue+mixed+resized",
-            "red+obstacles+invulnerable",
-            "resized+shadows+invulnerable",
-            "complete",
+        "train1": words("default"),
+        "train4": words("default red obstacles mixed_enemies"),
+        "train8": words("default blue red obstacles resized_enemies shadows mixed_enemies invulnerable"),
+        "test": words(
+            "blue+shadows obstacles+resized red+mixed blue+mixed+resized red+obstacles+invulnerable "
+            "resized+shadows+invulnerable complete"
         ),
     },
     buttons=("ATTACK", "SPEED", "MOVE_FORWARD", "TURN_LEFT", "TURN_RIGHT"),

@@ -57,6 +57,11 @@ script 903 (void)
 {
     SetActorProperty(0, APROP_Invulnerable, TRUE);
 }
+
+script 904 (int tid)
+{
+    Spawn("LostSoul", 640.0, 1728.0, 30.0, tid);
+}
 """
 PROPERTIES = ("health", "speed", "render_style", "scale_x", "scale_y")
 PROPERTIES = (*PROPERTIES, "damage_factor", "view_height", "invulnerable", "x", "y")
@@ -148,6 +153,8 @@ def measure(task_id: str, profile: str) -> dict[str, Any]:
     found["entities"] = [player.properties(first_tid + i) for i in range(count)]
     if scenario in ("defend_the_center", "seek_and_kill"):
         found["deaths"] = _deaths(player, first_tid)
+    if scenario == "seek_and_kill" and "invulnerable" in task_id:
+        found["soul_kills"] = _soul_kills(player)
     if scenario == "health_gathering":
         found["items"] = _items(player)
         player.restart(1)
@@ -183,10 +190,23 @@ def _deaths(player: Player, tid: int) -> dict[str, Any]:
     return result
 
 
+def _soul_kills(player: Player) -> list[float]:
+    """PLAYER_KILLS brought by the death of a soul that a Pain Elemental might have borne: by the agent, by an enemy."""
+    kills = []
+    for tid, killer in ((9, 0), (10, FIRST_TID["seek_and_kill"] + 2)):
+        before = player["PLAYER_KILLS"]
+        player.command(904, tid)
+        player.step(tics=3)
+        player.command(901, tid, killer)
+        player.step(tics=3)
+        kills.append(player["PLAYER_KILLS"] - before)
+    return kills
+
+
 def _items(player: Player) -> list[dict[str, float]]:
     """Walks over the first items, at 50 health each time; the floor's blows come every 32 tics, so between them."""
     items = []
-    for tid in range(FIRST_TID["health_gathering"], FIRST_TID["health_gathering"] + 40):
+    for tid in range(FIRST_TID["health_gathering"], FIRST_TID["health_gathering"] + 12):
         while player.game.get_episode_time() % 32 not in range(2, 20):
             player.step()
         before = {name: player[name] for name in ("KITS_TAKEN", "POISONS_TAKEN")}

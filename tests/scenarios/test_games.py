@@ -10,6 +10,9 @@ from collections import Counter
 
 import pytest
 
+from gvz.engine import Engine, EngineConfig
+from gvz.scenarios.base import BOOKKEEPING
+from gvz.scenarios.compiler import compile_task
 from gvz.tasks import named_tasks, parse_task, scenarios
 
 pytestmark = [pytest.mark.engine, pytest.mark.xdist_group("games")]
@@ -307,5 +310,32 @@ def test_seek_and_kill_is_what_it_says(measured, batch, job):
     assert found["start_variables"]["AMMO2"] == 200
     assert found["deaths"]["player_kills"] == 1
     assert found["deaths"]["kill_count"] == 2
+    assert found.get("soul_kills", [1, 0]) == [1, 0]
     check_starts(found, SUPREME_SPOTS if levdoom else SUPREME_SPOTS | MORE_SPOTS)
     assert len({start["ANGLE"] for start in found["starts"]}) > 30
+
+
+def kills(task_id: str, buttons: list[float], tics: int, seed: int) -> tuple[float, float]:
+    """KILLCOUNT and PLAYER_KILLS after so many tics with these buttons held."""
+    task = parse_task(task_id)
+    wad = compile_task(task).wad_path
+    engine = Engine(EngineConfig(wad=wad, buttons=task.scenario.buttons, variables=(), width=160, height=120))
+    try:
+        engine.new_episode(seed)
+        for _ in range(tics // 4):
+            if engine.step(buttons, 4) is None:
+                break
+        return engine.variable("KILLCOUNT"), engine.variable(BOOKKEEPING["PLAYER_KILLS"])
+    finally:
+        engine.close()
+
+
+def test_what_the_agent_shoots_is_its_kill():
+    all_kills, own = kills("defend_the_center/default", [1, 1, 0], 1100, seed=1)
+    assert all_kills == own >= 2
+
+
+def test_what_enemies_do_to_each_other_is_not():
+    both = [kills("seek_and_kill/invulnerable", [0] * 5, 1200, seed) for seed in range(3)]
+    assert sum(all_kills for all_kills, _ in both) >= 3
+    assert [own for _, own in both] == [0, 0, 0]
