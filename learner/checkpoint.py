@@ -77,7 +77,7 @@ def write(directory: Path, arrays: Any, host: dict[str, Any]) -> None:
     try:
         shutil.rmtree(writing, ignore_errors=True)
         writing.mkdir(parents=True, mode=0o700)
-        flat = {f"{i:03d}": leaf for i, leaf in enumerate(jax.tree.leaves(arrays))}
+        flat = {f"{i:03d}": leaf for i, leaf in enumerate(jax.tree.leaves(arrays)) if leaf.size}
         with ocp.StandardCheckpointer() as checkpointer:
             checkpointer.save((writing / "arrays").absolute(), flat)
             checkpointer.wait_until_finished()
@@ -143,10 +143,12 @@ def read(directory: Path, template: Any) -> tuple[Any, dict[str, Any]]:
                 "it belongs to another configuration"
             )
     leaves = jax.tree.leaves(plain)
-    abstract = {f"{i:03d}": np.empty(np.shape(leaf), leaf.dtype) for i, leaf in enumerate(leaves)}
+    # orbax refuses arrays without elements: they are left out, and made anew here
+    empty = {f"{i:03d}": np.empty(np.shape(leaf), leaf.dtype) for i, leaf in enumerate(leaves)}
     try:
         with ocp.StandardCheckpointer() as checkpointer:
-            flat = checkpointer.restore((directory / "arrays").absolute(), abstract)
+            stored = {name: leaf for name, leaf in empty.items() if leaf.size}
+            flat = empty | checkpointer.restore((directory / "arrays").absolute(), stored)
         host = json.loads((directory / "host.json").read_text())
     except Exception as error:  # as for writing
         raise CheckpointError(f"{directory} cannot be read: {type(error).__name__}: {error}") from error

@@ -21,6 +21,7 @@ def example(fill: int = 0):
         "num_updates": jnp.int32(fill),
         "key": jax.random.key(fill),
         "flag": jnp.bool_(True),
+        "empty": jnp.zeros((0, 3), jnp.int32),
     }
 
 
