@@ -1,11 +1,14 @@
 """Names, levels and splits of tasks, against the thesis's appendix A."""
 
 import dataclasses
+import doctest
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import gvz.scenarios
 from gvz.errors import TaskError
 from gvz.scenarios.base import Attribute, Content, Task, Textures
 from gvz.scenarios.compiler import task_content
@@ -152,16 +155,60 @@ def test_attributes_of_different_groups_do_not_fight_over_a_value():
                 assert both == dataclasses.replace(other.content.overlaid(one.content), things=both.things)
 
 
-def test_a_new_attribute_is_one_line_of_data():
-    """The worked example of the documentation."""
+def test_the_worked_example_of_adding_an_attribute_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path))
+    result = doctest.testmod(gvz.scenarios)
+    assert result.attempted >= 9
+    assert result.failed == 0
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_an_added_attribute_obeys_its_group():
     scenario = scenario_named("defend_the_center")
-    ice = Attribute(
-        name="ice", groups=("textures",), content=Content(textures=Textures("FLAT14", "FWATER1", "CEIL4_3"))
-    )
+    ice = Attribute(name="ice", groups=("textures",), content=Content(textures=Textures("FLAT14", "A", "B")))
     with_ice = dataclasses.replace(scenario, attributes=(*scenario.attributes, ice))
-    task = Task(with_ice, ("ice", "gore"))
-    assert task.id == "defend_the_center/gore+ice"
-    assert task.level == 2
-    assert task_content(task, "thesis").textures == Textures("FLAT14", "FWATER1", "CEIL4_3")
     with pytest.raises(TaskError, match="ice and stone_wall are both of group textures"):
         Task(with_ice, ("ice", "stone_wall"))
+
+
+TABLE_3_1 = {
+    "defend_the_center": (
+        ("ATTACK", "TURN_LEFT", "TURN_RIGHT"),
+        ("KILLCOUNT", "AMMO2", "HEALTH"),
+        *("frames_alive", 1100, 1100, True),
+    ),
+    "health_gathering": (
+        ("MOVE_FORWARD", "TURN_LEFT", "TURN_RIGHT"),
+        ("HEALTH",),
+        *("frames_alive", 2100, 2100, False),
+    ),
+    "seek_and_kill": (
+        ("ATTACK", "SPEED", "MOVE_FORWARD", "TURN_LEFT", "TURN_RIGHT"),
+        ("KILLCOUNT", "AMMO2", "HEALTH", "POSITION_X", "POSITION_Y"),
+        *("kills", 20, 1200, True),
+    ),
+    "dodge_projectiles": (
+        ("SPEED", "MOVE_LEFT", "MOVE_RIGHT"),
+        ("HEALTH",),
+        *("frames_alive", 2100, 2100, False),
+    ),
+}
+"""buttons, variables, metric, its upper bound, time-out in frames, whether there is a weapon"""
+
+
+@pytest.mark.parametrize("name", TABLE_3_1)
+def test_a_scenario_is_the_thesiss_table_3_1(name: str):
+    one = scenario_named(name)
+    found = (one.buttons, one.game_variables, one.metric, one.upper_bound(), one.timeout_frames(), one.render_weapon)
+    assert found == TABLE_3_1[name]
+    assert one.timeout_frames("levdoom") == (1250 if name == "seek_and_kill" else 2100)
+    assert one.upper_bound("levdoom") == (20 if name == "seek_and_kill" else 2100)
+
+
+def test_the_maps_are_made_from_the_engines_own():
+    assert {name: one.base_wad for name, one in scenarios().items()} == {
+        "defend_the_center": "defend_the_center.wad",
+        "health_gathering": "health_gathering.wad",
+        "seek_and_kill": "health_gathering_supreme.wad",
+        "dodge_projectiles": "defend_the_line.wad",
+    }
