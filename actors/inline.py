@@ -15,8 +15,6 @@ from gvz.errors import ResumeError
 from gvz.transport.messages import STEP_DTYPE, EpisodeStats, Message, ParamsHeader, StepBlock, decode, encode
 from gvz.transport.ring import RingReader
 
-_COMMITTED = [name for name in STEP_DTYPE.names or () if name not in ("sequence", "pad")]
-
 
 class InlinePool:
     """One loop that plays every lane. Use as a context manager, or `close` it."""
@@ -39,6 +37,8 @@ class InlinePool:
         self._ring = RingReader.create(None, spec.ring_capacity, config.frame_shape)
         self._writer = self._ring.writer()
         self._published: tuple[np.ndarray, ParamsHeader] | None = None
+        self._rest = StepBlock(np.empty(0, STEP_DTYPE), np.empty((0, *config.frame_shape), np.uint8))
+        """played, but not yet asked for"""
         self._num_games = len(spec.lanes)
         self._needs_params = bool(spec.policy)
         self._env_steps = self._episodes = 0
@@ -75,11 +75,15 @@ class InlinePool:
             raise ValueError("drain: publish parameters first")
         blocks: list[StepBlock] = []
         while max_records > 0:
-            while self._ring.num_unread < max_records and self._writer.free >= self._num_games:
-                self._loop.step()
-            blocks.append(self._ring.read(max_records))
-            max_records -= len(blocks[-1])
+            if not len(self._rest):
+                while self._ring.num_unread < max_records and self._writer.free >= self._num_games:
+                    self._loop.step()
+                self._rest = self._ring.read(self._ring.capacity)
+            steps, frames = self._rest.steps, self._rest.frames
+            blocks.append(StepBlock(steps[:max_records], frames[:max_records]))
+            self._rest = StepBlock(steps[max_records:], frames[max_records:])
             self._env_steps += num_decisions(blocks[-1].steps)
+            max_records -= len(blocks[-1])
         return blocks
 
     def poll(self) -> list[Message]:
@@ -91,7 +95,6 @@ class InlinePool:
 
     def state(self) -> dict[str, Any]:
         """All that a pool of the same configuration needs to go on from here bit for bit, as msgpack types."""
-        unread = self._ring.peek(self._ring.capacity)
         published = None
         if self._published is not None:
             params, header = self._published
@@ -99,8 +102,8 @@ class InlinePool:
         return {
             "loop": self._loop.state(),
             "published": published,
-            "unread_steps": unread.steps.tobytes(),
-            "unread_frames": unread.frames.tobytes(),
+            "rest_steps": self._rest.steps.tobytes(),
+            "rest_frames": self._rest.frames.tobytes(),
             "messages": [encode(message) for message in self._messages],
         }
 
@@ -128,9 +131,7 @@ class InlinePool:
         if state["published"] is not None:
             header = ParamsHeader(**state["published"]["header"])
             self.publish(np.frombuffer(state["published"]["params"], np.float32), header)
-        steps = np.frombuffer(state["unread_steps"], STEP_DTYPE)
-        frames = np.frombuffer(state["unread_frames"], np.uint8).reshape(len(steps), *self._ring.frame_shape)
-        for step, frame in zip(steps, frames, strict=True):
-            self._writer.reserve()[...] = frame
-            self._writer.commit(**{name: step[name].item() for name in _COMMITTED})
+        steps = np.frombuffer(state["rest_steps"], STEP_DTYPE)
+        frames = np.frombuffer(state["rest_frames"], np.uint8).reshape(len(steps), *self._ring.frame_shape)
+        self._rest = StepBlock(steps, frames)
         self._messages += [decode(data) for data in state["messages"]]

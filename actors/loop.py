@@ -101,10 +101,9 @@ class ActorLoop:
 
     def step(self) -> None:
         """One decision for every game: writes one record each, then plays on. The ring must have the room."""
-        actions = self._policy.act(self._obs, self._tasks).tolist()
-        for game, action in zip(self.games, actions, strict=True):
-            self._write(game, action)
-        for game, action in zip(self.games, actions, strict=True):
+        actions = self._policy.act(self._obs, self._tasks)
+        self._write(actions)
+        for game, action in zip(self.games, actions.tolist(), strict=True):
             if game.terminated or game.truncated:
                 self._finish(game)
             else:
@@ -134,19 +133,22 @@ class ActorLoop:
         module, _, name = self._spec.env_entry_point.partition(":")
         return getattr(importlib.import_module(module), name)(self._spec.tasks[task], self._spec.env_config)
 
-    def _write(self, game: Game, action: int) -> None:
-        self._ring.reserve()[...] = game.frame
-        self._ring.commit(
-            episode=game.episode,
-            params_version=self._params_version,
-            action=0 if game.terminated or game.truncated else action,
-            reward=game.reward,
-            lane=game.lane,
-            task=game.task,
-            first=not game.actions,
-            terminated=game.terminated,
-            truncated=game.truncated,
-        )
+    def _write(self, actions: np.ndarray) -> None:
+        """Publishes o_t, r_t, the end flags and a_t of every game."""
+        games = self.games
+        steps, frames = self._ring.reserve(len(games))
+        steps["episode"] = [game.episode for game in games]
+        steps["params_version"] = self._params_version
+        steps["reward"] = [game.reward for game in games]
+        steps["lane"] = self._spec.lanes
+        steps["task"] = self._tasks
+        steps["first"] = [not game.actions for game in games]
+        steps["terminated"] = [game.terminated for game in games]
+        steps["truncated"] = [game.truncated for game in games]
+        steps["action"] = np.where(steps["terminated"] | steps["truncated"], 0, actions)
+        for frame, game in zip(frames, games, strict=True):
+            frame[...] = game.frame
+        self._ring.commit()
 
     def _play(self, game: Game, action: int) -> None:
         frame, reward, game.terminated, game.truncated, game.info = game.env.step(action)

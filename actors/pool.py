@@ -60,11 +60,6 @@ class PoolConfig:
     """private directory for logs and the engines' files"""
 
     def __post_init__(self) -> None:
-        if self.actors.ring_capacity < self.games_per_actor:
-            raise ConfigError(
-                f"actors.ring_capacity: got {self.actors.ring_capacity}, want at least the {self.games_per_actor} "
-                "games of an actor: each step writes one record a game"
-            )
         if self.num_lanes < len(self.tasks):
             raise ConfigError(
                 f"actors: got {self.num_actors} actors with {self.games_per_actor} games for {len(self.tasks)} tasks, "
@@ -77,9 +72,15 @@ class PoolConfig:
     def num_lanes(self) -> int:
         return self.num_actors * self.games_per_actor
 
+    @property
+    def ring_capacity(self) -> int:
+        """Records of a ring: a whole number of an actor's steps, at least two, each of one record a game."""
+        num_steps = max(2, -(-self.actors.ring_capacity // self.games_per_actor))
+        return num_steps * self.games_per_actor
+
     def shared_memory_bytes(self) -> int:
         """What an `ActorPool` takes of /dev/shm."""
-        rings = self.num_actors * ring_bytes(self.actors.ring_capacity, self.frame_shape)
+        rings = self.num_actors * ring_bytes(self.ring_capacity, self.frame_shape)
         return rings + (broadcast_bytes(self.num_params) if self.policy else 0)
 
     def actor_specs(self, names: str, first_episodes: list[int]) -> list[ActorSpec]:
@@ -102,7 +103,7 @@ class PoolConfig:
                     num_actions=self.num_actions,
                     policy=self.policy,
                     ring_name=f"{names}-ring-{actor}",
-                    ring_capacity=self.actors.ring_capacity,
+                    ring_capacity=self.ring_capacity,
                     broadcast_name=f"{names}-params",
                     num_params=self.num_params,
                     layout_hash=self.layout_hash,

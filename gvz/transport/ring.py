@@ -26,7 +26,6 @@ from gvz.transport.segment import Fence, Segment, aligned, hash_layout
 _PUBLISHED, _HEARTBEAT_NS, _STATE, _PID, _WAITED_NS, _CONSUMED, _NUM_WORDS = 0, 1, 2, 3, 4, 8, 16
 _UNPUBLISHED = 2**64 - 1
 """sequence number of a slot that is being filled"""
-_PAD = (0,) * STEP_DTYPE["pad"].shape[0]
 _FIRST_SLEEP_S, _LONGEST_SLEEP_S = 20e-6, 1e-3
 
 
@@ -106,6 +105,7 @@ class RingReader(_Ring):
             name, ring_bytes(capacity, frame_shape), layout_hash=_layout_hash(capacity, frame_shape)
         )
         ring = cls(segment, capacity, frame_shape)
+        ring._steps["pad"] = 0
         for index in range(_NUM_WORDS):
             ring._words[index] = 0
         return ring
@@ -179,11 +179,12 @@ class RingReader(_Ring):
 
 
 class RingWriter(_Ring):
-    """The actor's end. `reserve`, fill the frame in place, `commit`."""
+    """The actor's end. `reserve`, fill in place, `commit`."""
 
     def __init__(self, segment: Segment, capacity: int, frame_shape: tuple[int, int, int]):
         super().__init__(segment, capacity, frame_shape)
         self._next = self._words[_PUBLISHED]
+        self._num_reserved = 0
         self._words[_PID] = os.getpid()
 
     @classmethod
@@ -203,43 +204,27 @@ class RingWriter(_Ring):
         """Records that fit without waiting."""
         return self.capacity - self._num_unread()
 
-    def reserve(self) -> np.ndarray:
-        """View uint8[H, W, C] of the next slot's frame, to be filled."""
-        assert self.free > 0, f"ring {self.name}: full; wait_for_space first"
-        slot = self._next % self.capacity
-        self._sequence[slot] = _UNPUBLISHED
-        self._fence()
-        return self._frames[slot]
+    def reserve(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Views of the next `count` slots, to be filled: STEP_DTYPE[count] but for `sequence`, uint8[count, H, W, C].
 
-    def commit(
-        self,
-        *,
-        episode: int,
-        params_version: int,
-        action: int,
-        reward: float,
-        lane: int,
-        task: int,
-        first: bool,
-        terminated: bool,
-        truncated: bool,
-    ) -> None:
-        """Publishes the reserved slot as the next record; the fields are those of STEP_DTYPE."""
-        ends = (first, terminated, truncated)
-        self._steps[self._next % self.capacity] = (
-            self._next,
-            episode,
-            params_version,
-            action,
-            reward,
-            lane,
-            task,
-            *ends,
-            _PAD,
-        )  # one assignment: 1 us
+        They must be free, and the ring's capacity a multiple of `count` if that is always the same: a reservation
+        does not wrap round the end.
+        """
+        slot = self._next % self.capacity
+        assert count <= self.free, f"ring {self.name}: {self.free} records are free; wait_for_space first"
+        assert slot + count <= self.capacity, f"ring {self.name}: {count} records from slot {slot} on wrap round"
+        self._num_reserved = count
+        self._sequence[slot : slot + count] = _UNPUBLISHED
         self._fence()
-        self._next += 1
-        self._words[_PUBLISHED] = self._next
+        return self._steps[slot : slot + count], self._frames[slot : slot + count]
+
+    def commit(self) -> None:
+        """Publishes what was reserved, all at once."""
+        slot, last = self._next % self.capacity, self._next + self._num_reserved
+        self._sequence[slot : slot + self._num_reserved] = np.arange(self._next, last, dtype=np.uint64)
+        self._fence()
+        self._words[_PUBLISHED] = self._next = last
+        self._num_reserved = 0
 
     def beat(self, state: WriterState) -> None:
         """A sign of life."""

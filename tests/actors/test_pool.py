@@ -350,7 +350,6 @@ def test_a_killed_learner_takes_its_actors_along_and_the_next_start_cleans_up(tm
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"games_per_actor": 9, "actors": ActorsConfig(ring_capacity=8)}, "actors.ring_capacity: got 8, want at least"),
         ({"tasks": ("a", "b", "c", "d", "e")}, "got 2 actors with 2 games for 5 tasks, want at least one game a task"),
         ({"num_actors": 2**15, "games_per_actor": 3}, "got 98304 games, want at most 65536"),
     ],
@@ -358,3 +357,9 @@ def test_a_killed_learner_takes_its_actors_along_and_the_next_start_cleans_up(tm
 def test_sizes_that_do_not_fit_are_refused(tmp_path: Path, changes: dict[str, Any], text: str):
     with pytest.raises(ConfigError, match=text):
         config(tmp_path, {}, **changes)
+
+
+@pytest.mark.parametrize(("asked", "games", "got"), [(256, 4, 256), (256, 6, 258), (8, 9, 18), (8, 4, 8)])
+def test_rings_hold_whole_steps_at_least_two(tmp_path: Path, asked: int, games: int, got: int):
+    pool_config = config(tmp_path, {}, games_per_actor=games, actors=ActorsConfig(ring_capacity=asked))
+    assert pool_config.ring_capacity == got

@@ -44,20 +44,21 @@ def writer(reader: RingReader, name: str) -> Iterator[RingWriter]:
     ring.close()
 
 
-def write(writer: RingWriter, number: int) -> None:
-    """A record all of whose content follows from `number`."""
-    writer.reserve()[...] = number % 251
-    writer.commit(
-        episode=number * 3,
-        params_version=number * 5,
-        action=number % 7,
-        reward=number / 2,
-        lane=number % 11,
-        task=number % 13,
-        first=number % 2 == 0,
-        terminated=number % 3 == 0,
-        truncated=number % 5 == 0,
-    )
+def write(writer: RingWriter, *numbers: int) -> None:
+    """Records all of whose content follows from their numbers."""
+    n = np.array(numbers)
+    steps, frames = writer.reserve(len(n))
+    frames[...] = (n % 251)[:, None, None, None]
+    steps["episode"] = n * 3
+    steps["params_version"] = n * 5
+    steps["action"] = n % 7
+    steps["reward"] = n / 2
+    steps["lane"] = n % 11
+    steps["task"] = n % 13
+    steps["first"] = n % 2 == 0
+    steps["terminated"] = n % 3 == 0
+    steps["truncated"] = n % 5 == 0
+    writer.commit()
 
 
 def check(block: StepBlock, numbers: list[int]) -> None:
@@ -97,10 +98,11 @@ class RingMachine(RuleBasedStateMachine):
 
     @rule(count=st.integers(1, CAPACITY))
     def write(self, count: int):
-        for _ in range(min(count, self.writer.free)):
-            write(self.writer, self.written)
-            self.unread.append(self.written)
-            self.written += 1
+        until_wrap = CAPACITY - self.written % CAPACITY
+        numbers = range(self.written, self.written + min(count, self.writer.free, until_wrap))
+        write(self.writer, *numbers)
+        self.unread.extend(numbers)
+        self.written += len(numbers)
 
     @rule(count=st.integers(0, 2 * CAPACITY))
     def read(self, count: int):
@@ -118,7 +120,8 @@ class RingMachine(RuleBasedStateMachine):
     @rule(half_written=st.booleans())
     def writer_dies(self, half_written: bool):
         if half_written and self.writer.free:
-            self.writer.reserve()[...] = 252
+            steps, frames = self.writer.reserve(1)
+            steps["episode"], frames[...] = 252, 252
         self.writer = self.attach()
 
     @invariant()
@@ -147,8 +150,15 @@ def test_blocks_are_copies(reader: RingReader, writer: RingWriter):
 def test_reserving_in_a_full_ring_is_a_bug(reader: RingReader, writer: RingWriter):
     for number in range(reader.capacity):
         write(writer, number)
-    with pytest.raises(AssertionError, match="full; wait_for_space first"):
-        writer.reserve()
+    with pytest.raises(AssertionError, match="0 records are free; wait_for_space first"):
+        writer.reserve(1)
+
+
+def test_a_reservation_that_wraps_is_a_bug(reader: RingReader, writer: RingWriter):
+    write(writer, *range(CAPACITY - 1))
+    reader.read(CAPACITY)
+    with pytest.raises(AssertionError, match="2 records from slot 7 on wrap round"):
+        writer.reserve(2)
 
 
 @pytest.mark.usefixtures("reader")
@@ -264,15 +274,18 @@ def test_an_unknown_writer_state_is_found(reader: RingReader, name: str):
 
 _WRITER = """
 import sys
+import numpy as np
 from gvz.transport.ring import RingWriter
 name, capacity = sys.argv[1], int(sys.argv[2])
 writer = RingWriter.attach(name, capacity, (84, 84, 3))
 while True:
-    writer.wait_for_space(1, 60.0)
-    number = writer._next  # a counting game: all content follows from the record's number
-    writer.reserve()[...] = number % 251
-    writer.commit(episode=number, params_version=0, action=number % 1000, reward=0.0, lane=0, task=0, first=False,
-                  terminated=False, truncated=False)
+    writer.wait_for_space(4, 60.0)
+    numbers = np.arange(writer._next, writer._next + 4)  # a counting game: all content follows from these
+    steps, frames = writer.reserve(4)
+    steps["episode"] = numbers
+    for frame, number in zip(frames, numbers):
+        frame[...] = number % 251
+    writer.commit()
 """
 
 

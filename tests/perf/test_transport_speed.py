@@ -1,0 +1,102 @@
+"""Speed of the transport: ring against memcpy, parameter queue with 8 readers against memcpy.
+
+`extra_info` holds the rates; the goals are at least half of memcpy's bandwidth for the ring, and at most twice the
+time of one memcpy for a publication.
+"""
+
+import secrets
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from gvz.transport.broadcast import BroadcastWriter
+from gvz.transport.messages import ParamsHeader
+from gvz.transport.ring import RingReader
+
+SHAPE, NUM_FRAMES = (84, 84, 3), 64
+NUM_PARAMS = 6_728_248
+"""of the default Rainbow agent with 3 actions"""
+
+
+def memcpy_s(source: np.ndarray, repeats: int) -> float:
+    """Median seconds of one copy of `source` into memory that is warm."""
+    target = np.empty_like(source)
+    times = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        target[...] = source
+        times.append(time.perf_counter() - start)
+    return float(np.median(times[1:]))
+
+
+@pytest.mark.parametrize("side", ["write", "read"])
+def test_ring(benchmark: BenchmarkFixture, side: str):
+    """One block of 64 records in, or out."""
+    reader = RingReader.create(f"gvz-perf-{secrets.token_hex(6)}", 2 * NUM_FRAMES, SHAPE)
+    writer = reader.writer()
+    frames = np.random.default_rng(0).integers(0, 256, (NUM_FRAMES, *SHAPE), np.uint8)
+
+    def write() -> None:
+        steps, slots = writer.reserve(NUM_FRAMES)
+        steps["lane"] = 3
+        slots[...] = frames
+        writer.commit()
+
+    def drain() -> None:
+        reader.read(2 * NUM_FRAMES)
+
+    try:
+        for _ in range(4):  # touch every page
+            write()
+            drain()
+        if side == "write":
+            benchmark.pedantic(write, setup=drain, rounds=50)
+        else:
+            benchmark.pedantic(drain, setup=write, rounds=50)
+        if benchmark.stats is not None:
+            median_s = benchmark.stats["median"]
+            benchmark.extra_info["frames_per_s"] = NUM_FRAMES / median_s
+            benchmark.extra_info["share_of_memcpy"] = memcpy_s(frames, 50) / median_s
+    finally:
+        reader.close()
+
+
+_READER = """
+import sys
+from gvz.transport.broadcast import BroadcastReader
+reader = BroadcastReader.attach(sys.argv[1], int(sys.argv[2]), 0)
+print("attached", flush=True)
+while True:
+    newest = reader.read()
+    if newest is not None and newest[1].num_updates:
+        break
+"""
+
+
+@pytest.mark.parametrize("num_readers", [0, 8])
+def test_broadcast(benchmark: BenchmarkFixture, num_readers: int):
+    """One publication, while the readers copy as fast as they can."""
+    name = f"gvz-perf-{secrets.token_hex(6)}"
+    writer = BroadcastWriter.create(name, NUM_PARAMS, 0)
+    command = [sys.executable, "-c", _READER, name, str(NUM_PARAMS)]
+    readers = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(num_readers)]
+    params = np.ones(NUM_PARAMS, np.float32)
+    header = ParamsHeader(version=1, num_updates=0)
+    try:
+        for reader in readers:
+            assert reader.stdout is not None
+            assert reader.stdout.readline() == b"attached\n"
+        benchmark.pedantic(writer.publish, (params, header), warmup_rounds=3, rounds=30)
+        if benchmark.stats is not None:
+            benchmark.extra_info["memcpies"] = benchmark.stats["median"] / memcpy_s(params, 10)
+        writer.publish(params, ParamsHeader(version=2, num_updates=1))
+        assert [reader.wait(60) for reader in readers] == [0] * num_readers
+    finally:
+        for reader in readers:
+            reader.kill()
+            reader.communicate()
+        writer.close()
