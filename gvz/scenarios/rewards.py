@@ -83,4 +83,5 @@ class Rewarder:
         """
         assert self._history, "Rewarder.step before reset"
         self._history.append(variables)
-        return {name: weight * event(self._history, terminated) for name, weight, event in self._terms}
+        history = self._history  # "0.0 +" keeps negative zeros out of the logs
+        return {name: 0.0 + weight * event(history, terminated) for name, weight, event in self._terms}
