@@ -10,6 +10,8 @@ import numpy as np
 
 from gvz.transport.messages import ParamsHeader
 
+_CALLS_PER_BLOCK = 256
+
 
 class Policy(Protocol):
     """Chooses an action for every game of an actor in one call."""
@@ -27,20 +29,26 @@ class Policy(Protocol):
 
 
 class RandomPolicy:
-    """Uniformly random actions."""
+    """Uniformly random actions, drawn for many calls at once: to make a generator costs more than to use it."""
 
-    def __init__(self, num_actions: int, seed: int):
+    def __init__(self, num_actions: int, batch_size: int, seed: int):
         self.num_calls = 0
         self._num_actions = num_actions
         self._seed = seed
+        self._block = -1
+        self._actions = np.empty((_CALLS_PER_BLOCK, batch_size), np.int32)
 
     def set_params(self, params: np.ndarray, header: ParamsHeader) -> None:
         """Chance has no parameters."""
 
-    def act(self, obs: np.ndarray, _task: np.ndarray, /) -> np.ndarray:
-        rng = np.random.Generator(np.random.Philox(key=self._seed, counter=self.num_calls))
+    def act(self, _obs: np.ndarray, _task: np.ndarray, /) -> np.ndarray:
+        block, call = divmod(self.num_calls, _CALLS_PER_BLOCK)
+        if block != self._block:
+            rng = np.random.default_rng((self._seed, block))
+            self._actions = rng.integers(self._num_actions, size=self._actions.shape, dtype=np.int32)
+            self._block = block
         self.num_calls += 1
-        return rng.integers(self._num_actions, size=len(obs), dtype=np.int32)
+        return self._actions[call]
 
 
 class ExportedPolicy:
@@ -103,5 +111,5 @@ def make_policy(
         seed: 31-bit seed of every choice.
     """
     if not serialized:
-        return RandomPolicy(num_actions, seed)
+        return RandomPolicy(num_actions, obs_shape[0], seed)
     return ExportedPolicy(serialized, num_params, obs_shape, seed)

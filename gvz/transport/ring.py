@@ -134,12 +134,11 @@ class RingReader(_Ring):
         self._fence()
         block = StepBlock(steps=self._copy(self._steps, first, count), frames=self._copy(self._frames, first, count))
         self._fence()
-        expected = np.arange(first, first + count, dtype=np.uint64)
         # in the copy: every record is the one it should be; in the ring, afterwards: none was touched meanwhile
+        expected = np.arange(first, first + count, dtype=np.uint64)
         for found in (block.steps["sequence"], self._copy(self._sequence, first, count)):
-            wrong = np.flatnonzero(found != expected)
-            if wrong.size:
-                at = int(wrong[0])
+            if not (found == expected).all():
+                at = int(np.argmax(found != expected))
                 raise TransportError(
                     f"ring {self.name}: got record {int(found[at])} where {int(expected[at])} should be; "
                     "records were lost, repeated or torn"

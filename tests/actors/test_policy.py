@@ -62,13 +62,13 @@ def test_choices_follow_from_seed_and_call_number_alone(serialized: bytes, kind:
         policy.set_params(np.zeros(2, np.float32), header(1.0))
         return policy
 
-    first = draws(make(5), 20)
-    assert draws(make(5), 20) == first
-    assert draws(make(6), 20) != first
-    assert len({tuple(d) for d in first}) > 10, "every call has a key of its own"
+    first = draws(make(5), 300)
+    assert draws(make(5), 300) == first
+    assert draws(make(6), 300) != first
+    assert len({tuple(d) for d in first}) > 150, "every call has a key of its own"
     late = make(5)
-    late.num_calls = 12
-    assert draws(late, 8) == first[12:]
+    late.num_calls = 200
+    assert draws(late, 100) == first[200:]
 
 
 def test_epsilon_is_the_share_of_random_actions(serialized: bytes):
@@ -80,7 +80,7 @@ def test_epsilon_is_the_share_of_random_actions(serialized: bytes):
 
 
 def test_chance_is_uniform():
-    policy = RandomPolicy(NUM_ACTIONS, seed=1)
+    policy = RandomPolicy(NUM_ACTIONS, BATCH, seed=1)
     counts = np.bincount(np.array(draws(policy, 2000)).ravel(), minlength=NUM_ACTIONS)
     assert counts.size == NUM_ACTIONS
     np.testing.assert_allclose(counts / counts.sum(), 1 / NUM_ACTIONS, atol=0.02)  # 4 standard deviations
