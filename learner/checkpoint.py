@@ -1,6 +1,6 @@
-"""Checkpoints: orbax arrays, a JSON host state, and a manifest that proves the whole. May import gvz tier 0 only.
+"""Checkpoints: orbax arrays, a msgpack host state, and a manifest that proves the whole. May import gvz tier 0 only.
 
-    checkpoints/<updates>/  arrays/ (orbax)  host.json  manifest.json      the whole state, `keep` of them
+    checkpoints/<updates>/  arrays/ (orbax)  host.msgpack  manifest.json   the whole state, `keep` of them
     policies/<updates>/     the same, parameters only, never pruned         what evaluation reads
 
 Writing: snapshot to host memory now, write into a hidden sibling in a thread, hash every file into the manifest,
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import msgpack
 import numpy as np
 import orbax.checkpoint as ocp
 
@@ -68,7 +69,7 @@ def _files(directory: Path) -> list[Path]:
 
 
 def write(directory: Path, arrays: Any, host: dict[str, Any]) -> None:
-    """Writes `arrays` (numpy leaves) and `host` (JSON types) to `directory`, whole or not at all.
+    """Writes `arrays` (numpy leaves) and `host` (msgpack types) to `directory`, whole or not at all.
 
     Raises:
         CheckpointError: the disk is full, permission is missing, or the like; nothing is left behind.
@@ -81,7 +82,7 @@ def write(directory: Path, arrays: Any, host: dict[str, Any]) -> None:
         with ocp.StandardCheckpointer() as checkpointer:
             checkpointer.save((writing / "arrays").absolute(), flat)
             checkpointer.wait_until_finished()
-        (writing / "host.json").write_text(json.dumps(host))
+        (writing / "host.msgpack").write_bytes(msgpack.packb(host))
         manifest = {
             "schema": CHECKPOINT_SCHEMA,
             "leaves": _leaf_specs(arrays),
@@ -149,7 +150,7 @@ def read(directory: Path, template: Any) -> tuple[Any, dict[str, Any]]:
         with ocp.StandardCheckpointer() as checkpointer:
             stored = {name: leaf for name, leaf in empty.items() if leaf.size}
             flat = empty | checkpointer.restore((directory / "arrays").absolute(), stored)
-        host = json.loads((directory / "host.json").read_text())
+        host = msgpack.unpackb((directory / "host.msgpack").read_bytes())
     except Exception as error:  # as for writing
         raise CheckpointError(f"{directory} cannot be read: {type(error).__name__}: {error}") from error
     arrays = jax.tree.unflatten(jax.tree.structure(plain), [flat[f"{i:03d}"] for i in range(len(leaves))])

@@ -77,7 +77,7 @@ DAMAGES = {
     "missing file": (lambda d: largest(d).unlink(), "missing or unknown"),
     "missing manifest": (lambda d: (d / "manifest.json").unlink(), "no readable manifest"),
     "half a manifest": (lambda d: os.truncate(d / "manifest.json", 40), "no readable manifest"),
-    "host state changed": (lambda d: flip(d / "host.json"), "do not match the manifest"),
+    "host state changed": (lambda d: flip(d / "host.msgpack"), "do not match the manifest"),
     "emptied": (lambda d: (shutil.rmtree(d), d.mkdir()), "no readable manifest"),
 }
 

@@ -1,0 +1,362 @@
+"""THE data flow of training, an arrow a line: drain -> replay.add -> limiter -> train_step -> broadcast.
+
+What is laid round it (supervision, records, checkpoints, resume) calls into the modules that do the work. Nothing
+here waits for the device between log periods except a publication, which copies the parameters to the host.
+"""
+
+import contextlib
+import dataclasses
+import os
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from actors.inline import InlinePool
+from actors.pool import ActorPool
+from gvz import bill, janitor
+from gvz.assemble import Parts, Pool, assemble
+from gvz.config import RunConfig
+from gvz.errors import WaitTimeoutError, WorkerError
+from gvz.progress import Progress, Status
+from gvz.rundir import RunDir
+from gvz.stop import StopRequest
+from gvz.telemetry import Rates, Telemetry
+from gvz.transport.messages import EpisodeStats, Fault, ParamsHeader
+from learner import replay, train_step
+from learner.checkpoint import Checkpointer, Restored, restore_newest
+from learner.ingest import Ingest
+from learner.limiter import RateLimiter
+from learner.metrics import TaskKpis
+from learner.policy import flatten_params
+
+DRAIN_RECORDS = 256
+"""most records taken between two looks at the limiter"""
+DRAIN_WAIT_S = 0.02
+"""longest wait for a record before the loop looks after its actors again"""
+NO_RECORDS_TIMEOUT_S = 900.0
+"""a run whose actors deliver nothing for so long is stopped; a stuck actor is replaced long before"""
+STATUS_PERIOD_S = 0.5
+"""seconds between looks at the counters for the live panel"""
+
+
+@dataclass(kw_only=True, slots=True)
+class Counts:
+    """What has been done so far; part of every checkpoint."""
+
+    records: int = 0
+    """step records put into the replay, overwritten ones included"""
+    env_steps: int = 0
+    """decisions among them"""
+    updates: int = 0
+    """gradient steps"""
+    version: int = 0
+    """of the newest parameters on the broadcast queue"""
+    published_updates: int = 0
+    """gradient steps of that version"""
+    logged_updates: int = 0
+    saved_updates: int = 0
+
+
+class Trainer:
+    """One run, from its first update or its newest checkpoint to its last. `close` ends all that it started."""
+
+    def __init__(self, config: RunConfig, run: RunDir, parts: Parts, progress: Progress, restored: Restored | None):
+        learner, spec, key = config.learner, parts.replay_spec, jax.random.key(config.seed)
+        self._config, self._run, self._parts, self._progress = config, run, parts, progress
+        self._add = jax.jit(partial(replay.add, spec), donate_argnums=0)
+        self._flatten = jax.jit(flatten_params)
+        self._train_steps: dict[int, train_step.TrainStep] = {}
+        if restored is None:
+            self._state = jax.jit(partial(train_step.init, parts.agent, spec, learner))(key)
+            self._replay = replay.init(spec)
+            self._acting = np.asarray(self._flatten(self._state.params))
+        else:
+            arrays = jax.tree.map(jnp.array, restored.arrays)  # copies: a borrowed buffer cannot be donated
+            self._state, self._replay = arrays["learner"], arrays["replay"]
+            self._acting = np.asarray(arrays["acting"])
+        host = None if restored is None else restored.host
+        self._counts = Counts() if host is None else Counts(**host["counts"])
+        self._ingest = Ingest(spec)
+        self._limiter = RateLimiter(
+            learner.env_steps_per_update, learner.warmup_steps, learner.step_tolerance, parts.num_updates_per_call
+        )
+        self._kpis = TaskKpis(spec.num_tasks, learner)
+        self._telemetry = Telemetry(
+            run,
+            tasks=parts.pool_config.tasks,
+            upper_bound=config.resolved_scenario().upper_bound(config.env.profile),
+            tensorboard=config.log.tensorboard,
+            num_updates=self._counts.updates,
+        )
+        if host is not None:
+            self._ingest.restore(host["ingest"])
+            self._limiter.restore(host["limiter"])
+            self._kpis.restore({name: np.asarray(values) for name, values in host["kpis"].items()})
+            self._telemetry.restore(host["telemetry"])
+        self._checkpointer = Checkpointer(run.path, keep=config.checkpoint.keep)
+        self._metrics: dict[str, float] = {}
+        self._rates, self._last_record_s, self._last_status_s = Rates(), time.monotonic(), 0.0
+        self._last_rates: dict[str, float] = {}
+        pool = InlinePool if config.mode == "sync" else ActorPool
+        self._pool: Pool = pool(parts.pool_config, None if host is None else host["pool"])
+        self._send()
+
+    def run(self, stop: StopRequest) -> None:
+        """Trains until the last update, or until asked to stop; then writes a checkpoint.
+
+        Raises:
+            WorkerError, WaitTimeoutError: the actors failed for good; a checkpoint is written first.
+            NonFiniteError: the learner's numbers went wrong; the checkpoints before it stand.
+        """
+        try:
+            while self._counts.updates < self._config.learner.total_updates and not stop.requested:
+                self._collect()
+                self._supervise()
+                self._learn()
+                self._broadcast()
+                self._record()
+                self._save()
+        except (WorkerError, WaitTimeoutError):
+            self._save(force=True)
+            raise
+        self._progress.say("stopping: writing a checkpoint" if stop.requested else "done: writing the last checkpoint")
+        self._save(force=True)
+
+    def close(self, *, abandon_save: bool = False) -> None:
+        """Ends every actor, waits for the checkpoint (or abandons it), closes the records. Can be repeated."""
+        self._pool.close()
+        if abandon_save:
+            self._checkpointer.abandon()
+        self._checkpointer.wait()
+        self._report_save()
+        self._telemetry.close()
+
+    # ------------------------------------------------------------------------------------- the arrows
+
+    def _collect(self) -> None:
+        """Rings -> replay, as far as the limiter allows."""
+        ready_to_learn = self._limiter.num_updates_allowed() > 0
+        allowed = min(self._limiter.num_steps_allowed(), DRAIN_RECORDS)
+        blocks = self._pool.drain(allowed, wait_s=0.0 if ready_to_learn else DRAIN_WAIT_S)
+        for arrays in self._ingest.arrays(blocks, self._counts.version):
+            self._replay = self._add(self._replay, arrays)
+        self._counts.records += sum(map(len, blocks))
+        steps = self._ingest.take_env_steps()
+        self._limiter.insert(steps)
+        self._counts.env_steps += steps
+        now = time.monotonic()
+        if blocks or ready_to_learn:
+            self._last_record_s = now
+        elif now - self._last_record_s > NO_RECORDS_TIMEOUT_S:
+            raise WaitTimeoutError(
+                f"learner waited {now - self._last_record_s:.0f} s for the actors' next step record; their logs are in "
+                f"{self._run.work}, what was done about them in faults.jsonl"
+            )
+
+    def _supervise(self) -> None:
+        """Actors' messages -> records; dead and stuck actors are replaced by the pool."""
+        for message in self._pool.poll():
+            if isinstance(message, EpisodeStats):
+                self._telemetry.episode(message, num_updates=self._counts.updates, env_steps=self._counts.env_steps)
+                if not message.cut:
+                    self._kpis.add(message.task, message.score)
+            elif isinstance(message, Fault):
+                self._telemetry.fault(message, num_updates=self._counts.updates)
+                self._progress.say(f"fault: {message.message}")
+
+    def _learn(self) -> None:
+        """Replay -> gradient steps -> priorities, as far as the limiter allows."""
+        per_call = self._parts.num_updates_per_call
+        per_call = min(per_call, self._config.learner.total_updates - self._counts.updates)
+        if self._limiter.num_updates_allowed() < per_call:
+            return
+        if per_call not in self._train_steps:
+            self._train_steps[per_call] = train_step.make_train_step(
+                self._parts.agent, self._parts.replay_spec, self._config.learner, self._config.replay, per_call
+            )
+        weights = jnp.asarray(self._kpis.weights())
+        self._state, self._replay = self._train_steps[per_call](self._state, self._replay, weights)
+        self._limiter.update(per_call)
+        self._counts.updates += per_call
+
+    def _broadcast(self) -> None:
+        """Parameters -> actors."""
+        if self._counts.updates >= self._counts.published_updates + self._config.learner.publish_period_updates:
+            self._acting = np.asarray(self._flatten(self._state.params))
+            self._counts.version += 1
+            self._counts.published_updates = self._counts.updates
+            self._send()
+
+    def _send(self) -> None:
+        header = ParamsHeader(
+            version=self._counts.version,
+            num_updates=self._counts.published_updates,
+            epsilon=self._epsilon(),
+            layout_hash=self._parts.pool_config.layout_hash,
+        )
+        self._pool.publish(self._acting, header)
+
+    def _epsilon(self) -> float:
+        """Linear from start to end over the decisions after warm-up; 0 for an agent that explores by noise."""
+        agent = self._config.agent
+        if agent.noisy != "off":
+            return 0.0
+        since_warmup = max(0, self._counts.env_steps - self._config.learner.warmup_steps)
+        progress = min(1.0, since_warmup / agent.epsilon_decay_steps)
+        return agent.epsilon_start + progress * (agent.epsilon_end - agent.epsilon_start)
+
+    # ------------------------------------------------------------------- records, checkpoints, the end
+
+    def _record(self) -> None:
+        """Counters -> panel; metrics -> records every log period, the only wait for the device."""
+        counts, now = self._counts, time.monotonic()
+        logging = counts.updates >= counts.logged_updates + self._config.log.period_updates
+        if logging:
+            counts.logged_updates = counts.updates
+            tasks = self._parts.pool_config.tasks
+            self._metrics, self._state = train_step.read_metrics(self._state, tasks, self._run.path)
+        elif counts.updates > 0 or now - self._last_status_s < STATUS_PERIOD_S:
+            return
+        self._last_status_s = now
+        row = self._measure()
+        if logging:
+            learner = {f"learner/{name}": value for name, value in self._metrics.items()}
+            self._telemetry.scalars(counts.updates, {**row, **learner})
+        self._progress.show(self._status(row))
+
+    def _save(self, *, force: bool = False) -> None:
+        """Whole state -> checkpoint, every period and at the end; a failed one is reported and tried again."""
+        counts = self._counts
+        if self._checkpointer.busy and not force:
+            return
+        self._report_save()
+        due = counts.updates >= counts.saved_updates + self._config.checkpoint.period_updates
+        if not (due or (force and counts.updates > counts.saved_updates)):
+            return
+        counts.saved_updates = counts.updates
+        arrays = {"learner": self._state, "replay": self._replay, "acting": self._acting}
+        self._checkpointer.save(counts.updates, arrays, self._state.params, self._host_state())
+
+    def _report_save(self) -> None:
+        for failure in self._checkpointer.failures():
+            self._progress.say(f"checkpoint failed, the next period tries again: {failure}")
+            fault = Fault(actor=-1, lane=None, kind="checkpoint", message=failure)
+            self._telemetry.fault(fault, num_updates=self._counts.updates)
+
+    def _host_state(self) -> dict[str, Any]:
+        """What a checkpoint holds beside arrays, msgpack types."""
+        return {
+            "counts": dataclasses.asdict(self._counts),
+            "ingest": self._ingest.state(),
+            "limiter": self._limiter.state(),
+            "kpis": {name: array.tolist() for name, array in self._kpis.state().items()},
+            "telemetry": self._telemetry.state(),
+            "pool": self._pool.state(),
+            "records": self._run.record_lengths(),
+        }
+
+    def _measure(self) -> dict[str, float]:
+        """A row of metrics: rates and waits since the last one, sizes, and the learner's own means."""
+        counts, statistics = self._counts, self._pool.statistics()
+        rates = self._rates(
+            {
+                "learner/updates_per_s": counts.updates,
+                "learner/samples_per_s": counts.updates * self._config.learner.batch_size,
+                "actors/decisions_per_s": counts.env_steps,
+                "actors/frames_per_s": counts.env_steps * self._config.env.frame_skip,
+                "learner/wait_share": statistics.waited_for_records_s,
+                "actors/wait_share": statistics.waited_for_space_s / self._config.num_actors,
+            }
+        )
+        staleness = self._ingest.take_staleness()
+        return {
+            **rates,
+            "actors/env_steps": counts.env_steps,
+            "actors/restarts": statistics.restarts,
+            "actors/staleness_mean_versions": staleness.mean,
+            "actors/staleness_p95_versions": staleness.p95,
+            "actors/staleness_max_versions": staleness.max,
+            "replay/fill_share": min(1.0, counts.records / self._parts.replay_spec.num_slots),
+        }
+
+    def _status(self, row: Mapping[str, float]) -> Status:
+        counts, learner = self._counts, self._config.learner
+        if counts.updates:
+            phase = "training"
+        elif counts.env_steps:
+            phase = f"warm-up {counts.env_steps:,}/{learner.warmup_steps:,} decisions"
+        else:
+            phase = "starting actors"
+        return Status(
+            phase=phase,
+            num_updates=counts.updates,
+            total_updates=learner.total_updates,
+            env_steps=counts.env_steps,
+            updates_per_s=row["learner/updates_per_s"],
+            steps_per_s=row["actors/decisions_per_s"],
+            frames_per_s=row["actors/frames_per_s"],
+            replay_fill=row["replay/fill_share"],
+            learner_wait=row["learner/wait_share"],
+            actor_wait=row["actors/wait_share"],
+            staleness_updates=row["actors/staleness_mean_versions"] * learner.publish_period_updates,
+            loss=self._metrics.get("loss", float("nan")),
+            restarts=int(row["actors/restarts"]),
+            tasks=self._telemetry.task_statuses(),
+        )
+
+
+def _template(config: RunConfig, parts: Parts) -> dict[str, Any]:
+    """Shapes and dtypes of a checkpoint's arrays."""
+    spec = parts.replay_spec
+    return {
+        "learner": jax.eval_shape(
+            lambda: train_step.init(parts.agent, spec, config.learner, jax.random.key(config.seed))
+        ),
+        "replay": jax.eval_shape(lambda: replay.init(spec)),
+        "acting": jax.ShapeDtypeStruct((parts.pool_config.num_params,), jnp.float32),
+    }
+
+
+def train(config: RunConfig, run: RunDir) -> int:
+    """Trains, resuming if the run directory holds a checkpoint.
+
+    Returns: 0 when all updates are done; 130 or 143 when a signal stopped the run, which is then saved.
+
+    Raises:
+        ResourceError: the machine is too small. GvzError: what a user can do something about.
+    """
+    with StopRequest() as stop, Progress() as progress:
+        for line in janitor.clean_dead_instances():
+            progress.say(f"removed what a dead run left: {line}")
+        parts = assemble(config, run.work)
+        for line in parts.bill.lines():
+            progress.say(line)
+        bill.check(parts.bill)
+        restored = restore_newest(run.checkpoints, _template(config, parts))
+        if restored is None:
+            progress.say(f"new run in {run.path}")
+            run.truncate_records(dict.fromkeys(run.record_lengths(), 0))
+        else:
+            for damage in restored.damage:
+                progress.say(f"damaged checkpoint passed over: {damage}")
+            progress.say(f"run in {run.path} goes on from update {restored.num_updates}")
+            run.truncate_records(restored.host["records"])
+        run.write_config(config)
+        trainer = Trainer(config, run, parts, progress, restored)
+        del restored
+        with contextlib.closing(trainer):
+            try:
+                trainer.run(stop)
+            except KeyboardInterrupt:
+                trainer.close(abandon_save=True)
+                run.close()
+                sys.stderr.flush()
+                os._exit(stop.exit_code)  # a second signal: at once, though a checkpoint's thread may be writing
+        return stop.exit_code if stop.requested else 0
