@@ -1,0 +1,192 @@
+"""The sum tree against a float64 oracle, its distribution, and what float32 does to others."""
+
+import math
+from functools import partial
+
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from scipy import stats
+
+from learner import sum_tree
+from learner.sum_tree import FANOUT, SumTree
+
+NUM_LEAVES = (1, FANOUT - 1, FANOUT, FANOUT**2, FANOUT**2 + 1, 1000)
+set_leaves = jax.jit(sum_tree.set, donate_argnums=0)
+get_leaves = jax.jit(lambda tree: sum_tree.get(tree, jnp.arange(tree.num_leaves + 3)))
+total = jax.jit(sum_tree.total)
+draw = jax.jit(sum_tree.sample, static_argnames="batch_size")
+
+
+def tree_of(values) -> SumTree:
+    values = np.asarray(values, np.float32)
+    return set_leaves(sum_tree.init(len(values)), np.arange(len(values)), values)
+
+
+class AgainstOracle(RuleBasedStateMachine):
+    """Random operations on the tree and on a float64 array; indices repeat and some lie beyond the last leaf."""
+
+    @initialize(num_leaves=st.sampled_from(NUM_LEAVES))
+    def make(self, num_leaves):
+        self.tree = sum_tree.init(num_leaves)
+        self.leaves = np.zeros(num_leaves)
+
+    @rule(data=st.data(), size=st.sampled_from((1, 8)), spread=st.sampled_from((1, 3, 1000)))
+    def set_some(self, data, size, spread):
+        highest = min(len(self.leaves) + 2, spread)
+        value = st.one_of(st.just(0.0), st.floats(2.0**-20, 2.0**20, width=32))
+        indices = data.draw(st.lists(st.integers(0, highest), min_size=size, max_size=size))
+        values = data.draw(st.lists(value, min_size=size, max_size=size))
+        self.tree = set_leaves(self.tree, np.array(indices, np.int32), np.array(values, np.float32))
+        for index in set(indices):
+            if index < len(self.leaves):
+                self.leaves[index] = max(v for i, v in zip(indices, values, strict=True) if i == index)
+
+    @rule()
+    def set_all_to_zero(self):
+        n = len(self.leaves)
+        self.tree = set_leaves(self.tree, np.arange(n), np.zeros(n, np.float32))
+        self.leaves[:] = 0
+        assert float(total(self.tree)) == 0
+
+    @precondition(lambda self: self.leaves.any())
+    @rule(seed=st.integers(0, 2**31), batch_size=st.sampled_from((1, 7)))
+    def draw_some(self, seed, batch_size):
+        indices, probabilities = map(np.asarray, draw(self.tree, jax.random.key(seed), batch_size))
+        assert (self.leaves[indices] > 0).all(), "drew a leaf of zero, or beyond the last"
+        total = math.fsum(self.leaves)
+        np.testing.assert_allclose(probabilities, self.leaves[indices] / total, rtol=1e-5)
+        ends = np.cumsum(self.leaves) / total
+        starts = ends - self.leaves / total
+        strata = np.arange(batch_size + 1) / batch_size
+        assert (starts[indices] <= strata[1:] + 1e-5).all(), "drew a leaf that lies behind its stratum"
+        assert (ends[indices] >= strata[:-1] - 1e-5).all(), "drew a leaf that lies before its stratum"
+
+    @invariant()
+    def is_the_same(self):
+        if not hasattr(self, "tree"):
+            return
+        sum_tree.check_valid(self.tree)
+        np.testing.assert_array_equal(get_leaves(self.tree), np.append(self.leaves, [0, 0, 0]).astype(np.float32))
+        np.testing.assert_allclose(float(total(self.tree)), math.fsum(self.leaves), rtol=1e-6)
+
+
+TestAgainstOracle = AgainstOracle.TestCase
+TestAgainstOracle.settings = settings(max_examples=40, stateful_step_count=20, deadline=None, derandomize=True)
+
+
+@partial(jax.jit, donate_argnums=0, static_argnums=2)
+def churn(tree: SumTree, key: jax.Array, num_rounds: int) -> SumTree:
+    """Batches of 512 random updates over ten orders of magnitude."""
+
+    def some(_, carry):
+        tree, key = carry
+        key, key_index, key_value = jax.random.split(key, 3)
+        indices = jax.random.randint(key_index, (512,), 0, tree.num_leaves)
+        return sum_tree.set(tree, indices, 10 ** jax.random.uniform(key_value, (512,), minval=-5, maxval=5)), key
+
+    return jax.lax.fori_loop(0, num_rounds, some, (tree, key))[0]
+
+
+def test_a_million_updates_leave_the_root_within_float32_rounding():
+    tree = churn(sum_tree.init(20_000), jax.random.key(0), 2_000)
+    sum_tree.check_valid(tree)
+    leaves = np.asarray(get_leaves(tree))[:20_000]
+    assert (leaves > 0).all()
+    roundings = 4 * 4  # four pairwise additions in each of four levels
+    assert abs(float(total(tree)) - math.fsum(leaves)) <= roundings * 2.0**-24 * math.fsum(leaves)
+    tree = set_leaves(tree, np.arange(20_000), np.zeros(20_000, np.float32))
+    assert not np.asarray(tree.nodes).any(), "something is left of what was taken away"
+
+
+@pytest.mark.parametrize("batch_size", [1, 64])
+def test_frequencies_are_the_priorities(batch_size: int):
+    """Chi-square, fixed seed. Alone, draws are independent: they may fit neither too badly nor too well."""
+    values = np.random.default_rng(1).exponential(size=300) * (np.arange(300) % 3 > 0)
+    tree, keys = tree_of(values), jax.random.split(jax.random.key(2), 64_000 // batch_size)
+    indices = jax.jit(jax.vmap(lambda key: sum_tree.sample(tree, key, batch_size)[0]))(keys)
+    counts = np.bincount(np.asarray(indices).ravel(), minlength=300)
+    assert not counts[values == 0].any()
+    drawable = values > 0
+    expected = values[drawable] / values.sum() * 64_000
+    p_value = stats.chisquare(counts[drawable], expected * counts.sum() / expected.sum()).pvalue
+    assert p_value > 0.001
+    if batch_size == 1:
+        assert p_value < 0.999
+
+
+def test_strata_divide_the_batch_evenly():
+    indices, probabilities = draw(tree_of(np.full(32, 0.25)), jax.random.key(0), 32)
+    np.testing.assert_array_equal(indices, np.arange(32))
+    np.testing.assert_allclose(probabilities, 1 / 32)
+
+
+def test_a_leaf_below_the_rounding_step_of_the_total_gets_its_share():
+    """4096 leaves of 1/256 behind one of 2^20, where float32 steps are 1/8: without the finer bits only every 32nd
+    of them could ever be drawn."""
+    tree = tree_of([2.0**20, *[2.0**-8] * 4096])
+    hits = [np.asarray(draw(tree, jax.random.key(seed), 2**17)[0]) for seed in range(24)]
+    small = np.concatenate(hits)
+    small = small[small > 0]
+    expected = 24 * 2**17 * 16 / (2**20 + 16)
+    assert abs(len(small) - expected) < 4 * expected**0.5
+    assert len(np.unique(small % 32)) > 16
+
+
+def test_a_target_at_the_end_of_a_row_finds_the_last_positive_child():
+    """Rounding can carry a target to the sum of its row; one draw in 10^5 or less, so the row is asked directly."""
+    row = np.zeros((4, FANOUT), np.float32)
+    row[:, 2], row[:, 5] = 1.0, 2.0
+    target = np.array([0.0, 1.0, 3.0, 4.0], np.float32)
+    child, start = sum_tree._choose_child(row, target)
+    np.testing.assert_array_equal(child, [2, 5, 5, 5])
+    np.testing.assert_array_equal(start, [0, 1, 1, 1])
+
+
+def test_the_largest_of_repeated_values_wins_in_any_order():
+    for order in ([0, 1, 2, 3], [3, 2, 1, 0], [1, 3, 0, 2]):
+        indices, values = np.array([5, 5, 7, 5])[order], np.array([1, 4, 9, 2], np.float32)[order]
+        tree = set_leaves(tree_of(np.full(20, 3.0)), indices, values)
+        leaves = get_leaves(tree)
+        assert (leaves[5], leaves[7], total(tree)) == (4, 9, 18 * 3 + 4 + 9)
+
+
+def test_all_zero_priorities_are_refused_with_nan():
+    indices, probabilities = draw(sum_tree.init(50), jax.random.key(0), 4)
+    assert np.isnan(probabilities).all()
+    assert ((indices >= 0) & (indices < 50)).all()
+
+
+def test_an_empty_tree_cannot_be_made():
+    with pytest.raises(ValueError, match="sum tree: got num_leaves 0, want at least 1"):
+        sum_tree.init(0)
+
+
+def test_donation_writes_in_place():
+    tree = tree_of(np.ones(10_000))
+    address = tree.nodes.unsafe_buffer_pointer()
+    for _ in range(3):
+        tree = set_leaves(tree, np.arange(8), np.ones(8, np.float32))
+        assert tree.nodes.unsafe_buffer_pointer() == address
+
+
+@pytest.mark.parametrize(
+    ("node", "value", "message"),
+    [
+        (-24, -1.0, "leaf 88 is -1.0, want a finite number of at least 0"),
+        (-24, np.nan, "leaf 88 is nan, want"),
+        (-1, 1.0, "padding after leaf 99 is"),
+        (3, 7.0, "node 3 is 7.0, its children are 16.0"),
+        (15, 1e-3, "node 15 is 0.0010000000474974513, its children are 0.0"),
+    ],
+)
+def test_check_valid_names_what_is_wrong(node: int, value: float, message: str):
+    tree = tree_of(np.ones(100))
+    sum_tree.check_valid(tree)
+    broken = SumTree(nodes=tree.nodes.at[node].set(value), num_leaves=100)
+    with pytest.raises(ValueError, match=f"sum tree: {message}"):
+        sum_tree.check_valid(broken)
