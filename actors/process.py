@@ -1,4 +1,4 @@
-"""One actor process as its parent sees it: start, signs of life, end. Imports gvz (tier 0) and the standard library.
+"""One actor process as its parent sees it: start, signs of life, end. Imports gvz (tier 0), platformdirs.
 
 Started with `subprocess` (an exec: nothing of a JAX process is inherited by fork) in a session of its own, so that a
 Ctrl-C reaches the learner alone. It dies with the *thread* that started it.
@@ -10,6 +10,8 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+
+from platformdirs import user_cache_path
 
 from gvz.transport.channel import Channel
 from gvz.transport.messages import ActorSpec, Message, Stop
@@ -27,6 +29,13 @@ _ENVIRONMENT = {
 """A core is an actor's share. Must be set before the process imports anything."""
 
 
+def _environment() -> dict[str, str]:
+    """Our own, with this process's import path and a cache of compiled acting functions (6 s less at a start)."""
+    cache = Path(os.environ.get("GVZ_CACHE_DIR") or user_cache_path("gvizdoom")) / "xla"
+    path = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path)
+    return {"JAX_COMPILATION_CACHE_DIR": str(cache), **os.environ, **_ENVIRONMENT, "PYTHONPATH": path}
+
+
 class ActorProcess:
     """A running worker. `spec` goes to it as the first message; its output is appended to a log file."""
 
@@ -35,7 +44,6 @@ class ActorProcess:
         work_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.log_path = work_dir / f"actor_{spec.actor}.log"
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        path = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path)
         with theirs, self.log_path.open("ab") as log:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "actors.worker", str(theirs.fileno()), str(os.getpid())],
@@ -43,7 +51,7 @@ class ActorProcess:
                 stdout=log,
                 stderr=log,
                 cwd=work_dir,
-                env={**os.environ, **_ENVIRONMENT, "PYTHONPATH": path},
+                env=_environment(),
                 pass_fds=[theirs.fileno()],
                 start_new_session=True,
             )

@@ -255,8 +255,10 @@ def constant_policy() -> bytes:
     return bytes(jax.export.export(jax.jit(act), platforms=["cpu"])(*arguments).serialize())
 
 
-def test_published_parameters_are_acted_by_and_recorded(tmp_path: Path):
-    pool_config = config(tmp_path, {}, policy=constant_policy(), num_params=1000, layout_hash=99)
+def test_published_parameters_are_acted_by_and_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    pool_config = config(tmp_path / "work", {}, policy=constant_policy(), num_params=1000, layout_hash=99)
     with ActorPool(pool_config) as pool:
         run = Run(pool, pool_config)
         assert sum(path.stat().st_size for path in segments()) == pool_config.shared_memory_bytes() + 3 * 64
@@ -276,6 +278,7 @@ def test_published_parameters_are_acted_by_and_recorded(tmp_path: Path):
                     if (steps["params_version"] == version).any():
                         seen.add(int(steps["lane"][0]) // 2)
     assert not run.faults()
+    assert list((tmp_path / "cache" / "xla").iterdir()), "the compiled function is kept for the next start"
 
 
 def test_closing_is_quick_bounded_and_repeatable(tmp_path: Path):
