@@ -14,7 +14,7 @@ class ActorsConfig:
     games_per_actor: int | None = None
     """games each actor plays and acts on in one batch; default the smallest number >= 4 that gives every actor
     every task"""
-    ring_capacity: int = 256
+    ring_capacity: int = 64
     """step records a ring holds; a full ring makes its actor wait"""
     start_timeout_s: float = 120.0
     """an actor that has not started all its games by then is restarted"""

@@ -22,6 +22,7 @@ from actors.inline import InlinePool
 from actors.pool import ActorPool
 from gvz import bill, janitor
 from gvz.assemble import Parts, Pool, assemble
+from gvz.cache import xla_cache_directory
 from gvz.config import RunConfig
 from gvz.errors import WaitTimeoutError, WorkerError
 from gvz.progress import Progress, Status
@@ -332,6 +333,7 @@ def train(config: RunConfig, run: RunDir) -> int:
     Raises:
         ResourceError: the machine is too small. GvzError: what a user can do something about.
     """
+    jax.config.update("jax_compilation_cache_dir", str(xla_cache_directory()))
     with StopRequest() as stop, Progress() as progress:
         for line in janitor.clean_dead_instances():
             progress.say(f"removed what a dead run left: {line}")

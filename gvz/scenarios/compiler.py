@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from string import Template
 
-from platformdirs import user_cache_path
-
+from gvz.cache import cache_directory
 from gvz.errors import ResourceError, TaskError, WadError
 from gvz.scenarios.base import Content, Task, Uniform, Value
 from gvz.specs import Profile
@@ -173,7 +172,7 @@ def _draw(task: Task, content: Content) -> UdmfMap:
 
 def _cached(data: bytes) -> Path:
     """The file in the cache directory that holds `data`, written if it is not there or damaged."""
-    directory = Path(os.environ.get("GVZ_CACHE_DIR") or user_cache_path("gvizdoom"))
+    directory = cache_directory()
     path = directory / f"{hashlib.sha256(data).hexdigest()}.wad"
     try:
         if path.exists() and path.read_bytes() == data:
