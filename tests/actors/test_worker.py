@@ -1,0 +1,165 @@
+"""A worker process from within: its first message, its waits, its end."""
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fake_env import FRAME_SHAPE, config
+
+from actors import worker
+from actors.process import ActorProcess
+from actors.worker import Worker
+from gvz.errors import WaitTimeoutError
+from gvz.transport.broadcast import BroadcastWriter
+from gvz.transport.channel import Channel
+from gvz.transport.messages import ActorSpec, ParamsHeader, Ready, Stop
+from gvz.transport.ring import RingReader, WriterState
+
+LAYOUT, NUM_PARAMS = 5, 4
+
+
+def first_param_policy() -> bytes:
+    def act(params, _obs, task, _key, _epsilon):
+        return jnp.full(len(task), params[0][0].astype(jnp.int32))
+
+    arguments = (
+        [jax.ShapeDtypeStruct((NUM_PARAMS,), jnp.float32)],
+        jax.ShapeDtypeStruct((2, *FRAME_SHAPE[:2], 4 * FRAME_SHAPE[2]), jnp.uint8),
+        jax.ShapeDtypeStruct((2,), jnp.int32),
+        jax.ShapeDtypeStruct((2,), jnp.uint32),
+        jax.ShapeDtypeStruct((), jnp.float32),
+    )
+    return bytes(jax.export.export(jax.jit(act), platforms=["cpu"])(*arguments).serialize())
+
+
+@pytest.fixture
+def spec(tmp_path: Path) -> ActorSpec:
+    pool_config = config(tmp_path, {}, num_actors=1)
+    return pool_config.actor_specs(f"gvz-test-{os.urandom(6).hex()}", [0, 0])[0]
+
+
+@pytest.fixture
+def ring(spec: ActorSpec) -> Iterator[RingReader]:
+    reader = RingReader.create(spec.ring_name, spec.ring_capacity, FRAME_SHAPE)
+    yield reader
+    reader.close()
+
+
+@pytest.fixture
+def channels() -> Iterator[tuple[Channel, Channel]]:
+    ours, theirs = socket.socketpair()
+    learner, actor = Channel(ours, peer="the actor"), Channel(theirs, peer="the learner")
+    yield learner, actor
+    learner.close()
+    actor.close()
+
+
+def params(version: int) -> tuple[np.ndarray, ParamsHeader]:
+    header = ParamsHeader(version=version, num_updates=version, layout_hash=LAYOUT)
+    return np.full(NUM_PARAMS, version, np.float32), header
+
+
+def start(first: bytes | None, parent_pid: int) -> subprocess.CompletedProcess[str]:
+    """Runs a worker to its end, `first` being all that ever comes on its socket."""
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "actors.worker", str(theirs.fileno()), str(parent_pid)],
+            pass_fds=[theirs.fileno()],
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        theirs.close()
+        if first is not None:
+            ours.sendall(first)
+        ours.close()
+        _, stderr = process.communicate(timeout=60)
+    return subprocess.CompletedProcess(process.args, process.returncode, None, stderr)
+
+
+def test_a_worker_without_a_spec_says_so():
+    done = start(None, os.getpid())
+    assert done.returncode == 1
+    assert "the learner closed it before the message that was waited for" in done.stderr
+
+
+def test_a_first_message_that_is_no_spec_is_refused():
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        Channel(ours, peer="").send(Stop())
+        done = start(theirs.recv(1000), os.getpid())
+    assert done.returncode == 1
+    assert "first message: got Stop, want ActorSpec" in done.stderr
+
+
+def test_a_worker_whose_parent_has_gone_ends_at_once():
+    done = start(None, os.getpid() + 1)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
+def test_told_to_stop_it_ends_well(spec: ActorSpec, ring: RingReader):
+    process = ActorProcess(spec)
+    try:
+        while not any(isinstance(message, Ready) for message in process.receive()):
+            assert process.exit_text() is None
+            ring.read(100)
+        process.ask_to_stop()
+        assert process.wait(30)
+        assert process.exit_text() == "exited with code 0"
+        assert ring.writer_status().state == WriterState.STOPPED
+        assert process.log_tail() == ""
+    finally:
+        process.end(grace_s=0.0)
+
+
+@pytest.mark.usefixtures("ring")
+def test_a_learner_that_never_reads_is_given_up(
+    spec: ActorSpec, channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(worker, "SPACE_TIMEOUT_S", 0.05)
+    with pytest.raises(WaitTimeoutError, match=r"waited 0\.\d s for the learner to read; 0 of \d+ records are free"):
+        Worker(spec, channels[1]).run()
+
+
+@pytest.mark.usefixtures("ring")
+def test_a_learner_that_never_publishes_is_given_up(
+    spec: ActorSpec, channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(worker, "PARAMS_TIMEOUT_S", 0.05)
+    spec = replace(spec, policy=first_param_policy(), num_params=NUM_PARAMS, layout_hash=LAYOUT)
+    board = BroadcastWriter.create(spec.broadcast_name, NUM_PARAMS, LAYOUT)
+    try:
+        with pytest.raises(
+            WaitTimeoutError, match="actor 0 waited 0 s for the learner to publish the first parameters"
+        ):
+            Worker(spec, channels[1]).run()
+        channels[0].send(Stop())
+        Worker(spec, channels[1]).run()  # told to stop, it does not wait
+    finally:
+        board.close()
+
+
+@pytest.mark.usefixtures("ring")
+def test_taking_parameters_keeps_to_its_share_of_the_time(
+    spec: ActorSpec, channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
+):
+    spec = replace(spec, policy=first_param_policy(), num_params=NUM_PARAMS, layout_hash=LAYOUT)
+    board = BroadcastWriter.create(spec.broadcast_name, NUM_PARAMS, LAYOUT)
+    try:
+        actor = Worker(spec, channels[1])
+        assert not actor._take_params()
+        for share, taken in ((1e9, True), (1e9, True), (1e-9, True), (1e-9, False)):
+            monkeypatch.setattr(worker, "MAX_PARAMS_SHARE", share)
+            board.publish(*params(1))
+            assert actor._take_params() == taken
+    finally:
+        board.close()
