@@ -74,10 +74,8 @@ def check(bill: Bill, *, shm_free: int | None = None, memory_free: int | None = 
     Raises:
         ResourceError: says what is too small, by how much, and how to get it.
     """
-    if shm_free is None:
-        shm_free = shutil.disk_usage(SHARED_MEMORY).free if SHARED_MEMORY.is_dir() else bill.shm_bytes
-    if memory_free is None:
-        memory_free = psutil.virtual_memory().available
+    shm_free = shutil.disk_usage(SHARED_MEMORY).free if shm_free is None else shm_free
+    memory_free = int(psutil.virtual_memory().available) if memory_free is None else memory_free
     if bill.shm_bytes > shm_free:
         need = -(-bill.shm_bytes // 2**20)
         raise ResourceError(

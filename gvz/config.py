@@ -300,7 +300,7 @@ def _from_plain(kind: Any, value: Any, where: str) -> Any:
     if kind is float and type(value) is int:
         return float(value)
     if type(value) is not kind:
-        raise ConfigError(f"{where}: got {value!r}, want {kind.__name__}")
+        raise ConfigError(f"{where}: got {value!r}, want {getattr(kind, '__name__', kind)}")
     return value
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import msgpack
 import numpy as np
 import orbax.checkpoint as ocp
@@ -46,7 +47,7 @@ class Restored:
 
 
 def _is_key(x: Any) -> bool:
-    return isinstance(x, jax.Array | jax.ShapeDtypeStruct) and jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
+    return isinstance(x, jax.Array | jax.ShapeDtypeStruct) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
 def snapshot(tree: Any) -> Any:
@@ -82,7 +83,9 @@ def write(directory: Path, arrays: Any, host: dict[str, Any]) -> None:
         with ocp.StandardCheckpointer() as checkpointer:
             checkpointer.save((writing / "arrays").absolute(), flat)
             checkpointer.wait_until_finished()
-        (writing / "host.msgpack").write_bytes(msgpack.packb(host))
+        packed = msgpack.packb(host)
+        assert packed is not None  # packb is typed for a stream too
+        (writing / "host.msgpack").write_bytes(packed)
         manifest = {
             "schema": CHECKPOINT_SCHEMA,
             "leaves": _leaf_specs(arrays),
