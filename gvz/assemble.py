@@ -34,6 +34,27 @@ class Parts:
     bill: Bill
 
 
+def run_agent(config: RunConfig) -> Agent:
+    """The agent of a run, to train it or to read its parameters.
+
+    Raises:
+        ConfigError: values that do not fit together.
+    """
+    scenario = config.resolved_scenario()
+    v_min, v_max = scenario.return_range(config.agent.discount)
+    height, width, channels = config.env.frame_shape
+    return make_agent(
+        config.agent,
+        AgentSpec(
+            obs_shape=(height, width, channels * config.agent.stack_size),
+            num_actions=num_actions(scenario, config.env.action_set),
+            num_tasks=len(config.resolved_tasks()),
+            v_min=v_min,
+            v_max=v_max,
+        ),
+    )
+
+
 def assemble(config: RunConfig, work_dir: Path) -> Parts:
     """Compiles the maps and works out every size.
 
@@ -47,19 +68,7 @@ def assemble(config: RunConfig, work_dir: Path) -> Parts:
     tasks = config.resolved_tasks()
     for task in tasks:
         compile_task(task, config.env.profile)  # once, here: the actors find it in the cache
-    scenario = config.resolved_scenario()
-    v_min, v_max = scenario.return_range(config.agent.discount)
-    height, width, channels = config.env.frame_shape
-    agent = make_agent(
-        config.agent,
-        AgentSpec(
-            obs_shape=(height, width, channels * config.agent.stack_size),
-            num_actions=num_actions(scenario, config.env.action_set),
-            num_tasks=len(tasks),
-            v_min=v_min,
-            v_max=v_max,
-        ),
-    )
+    agent = run_agent(config)
     replay_spec = ReplaySpec(
         num_lanes=config.num_lanes,
         capacity=config.replay.capacity,

@@ -1,5 +1,5 @@
 """Plays evaluation episodes over the cores. The episode's seed follows from (task, episode) alone, so that every
-player meets the same episodes. Imports gvz.env (in the workers), gvz.evaluation.players.
+player meets the same episodes. Imports gvz.evaluation.players, and gvz.env in the workers.
 """
 
 import ctypes
@@ -10,13 +10,13 @@ import signal
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any
-
-import gymnasium
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from gvz.errors import EngineError, GvzError
 from gvz.evaluation.players import Player, PlayerSpec, make_player
+
+if TYPE_CHECKING:
+    from gvz.env import DoomEnv
 
 Job = tuple[str, int]
 """(task id, number of the episode)"""
@@ -32,25 +32,26 @@ def episode_seed(task: str, episode: int) -> int:
     return int.from_bytes(digest, "little") & 0x7FFFFFFF
 
 
-def play_episode(env: gymnasium.Env[np.ndarray, int], player: Player, task: str, episode: int) -> Row:
+def play_episode(env: "DoomEnv", player: Player, episode: int) -> Row:
     """Plays one episode to its end.
 
     Returns:
-        task, episode, seed, score, normalized_score (percent), reward, reward_components, length_frames,
-        length_steps, terminated, truncated.
+        task, episode, seed, score, normalized_score (percent), kills, player_kills, reward, reward_components,
+        length_frames, length_steps, terminated, truncated.
 
     Raises:
         EngineError: the engine died in each of MAX_ATTEMPTS attempts.
     """
+    task = env.task.id
     seed = episode_seed(task, episode)
     for _ in range(MAX_ATTEMPTS):
-        frame, info = env.reset(options={"episode_seed": seed})
-        player.begin(frame, info, seed)
+        observation, info = env.reset(options={"episode_seed": seed})
+        player.begin(env, observation, info, seed)
         reward_sum, steps, components = 0.0, 0, {}
         terminated = truncated = False
         while not (terminated or truncated):
-            frame, reward, terminated, truncated, info = env.step(player.act())
-            player.observe(frame, info)
+            observation, reward, terminated, truncated, info = env.step(player.act())
+            player.observe(observation, info)
             reward_sum += float(reward)
             steps += 1
             for name, value in info["reward_components"].items():
@@ -62,6 +63,8 @@ def play_episode(env: gymnasium.Env[np.ndarray, int], player: Player, task: str,
                 "seed": seed,
                 "score": float(info["score"]),
                 "normalized_score": float(info["normalized_score"]),
+                "kills": float(info["kills"]),
+                "player_kills": float(info["player_kills"]),
                 "reward": reward_sum,
                 "reward_components": components,
                 "length_frames": int(info["episode_frames"]),
@@ -105,23 +108,20 @@ def play(
 
 
 class _Worker:
-    """What a worker process keeps between chunks: the environment of the last task and its player."""
+    """What a worker process keeps between chunks: the player, and the environment of the last task."""
 
     def __init__(self, player: PlayerSpec, env_config: dict[str, Any]):
-        self._spec, self._env_config = player, env_config
-        self._task, self._env, self._player = "", None, None
+        self._player, self._env_config = make_player(player), env_config
+        self._env: DoomEnv | None = None
 
     def episode(self, task: str, episode: int) -> Row:
-        if task != self._task or self._env is None or self._player is None:
+        if self._env is None or self._env.task.id != task:
             from gvz.env import make_env
 
             if self._env is not None:
                 self._env.close()
             self._env = make_env(task, self._env_config)
-            if self._player is None:
-                self._player = make_player(self._spec, self._env)
-            self._task = task
-        return play_episode(self._env, self._player, task, episode)
+        return play_episode(self._env, self._player, episode)
 
 
 _worker: _Worker | None = None
