@@ -7,28 +7,22 @@
 import os
 import secrets
 import time
-from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from actors.config import ActorsConfig
-from actors.process import ActorProcess
+from actors.supervisor import SupervisedActor
 from gvz import janitor
-from gvz.errors import ConfigError, ResumeError, TransportError, WorkerError
+from gvz.errors import ConfigError, ResumeError
 from gvz.transport.broadcast import BroadcastWriter, broadcast_bytes
-from gvz.transport.messages import ActorSpec, EpisodeStats, Fault, Message, ParamsHeader, Ready, StepBlock
-from gvz.transport.ring import RingReader, WriterState, WriterStatus, ring_bytes
+from gvz.transport.messages import ActorSpec, EpisodeStats, Message, ParamsHeader, StepBlock
+from gvz.transport.ring import WriterStatus, ring_bytes
 
 STOP_TIMEOUT_S = 5.0
-_DUMP_S = 0.5
-"""time given to a stuck actor to write its stacks before it is killed"""
-_STABLE_S = 10.0
-"""an actor that has played for so long is restarted at once; others wait longer each time"""
 _WAIT_SLEEP_S = 0.0005
-_FIRST_BACKOFF_S, _LONGEST_BACKOFF_S = 0.25, 15.0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -129,29 +123,6 @@ class PoolStatistics:
     """seconds the learner waited in `drain`"""
 
 
-@dataclass(kw_only=True, slots=True)
-class _Actor:
-    """What the pool knows of one actor: its ring outlives its processes."""
-
-    spec: ActorSpec
-    ring: RingReader
-    next_episodes: list[int]
-    """per game: one more than the largest episode number seen"""
-    process: ActorProcess | None = None
-    start_at: float = 0.0
-    """`time.monotonic()` before which it is not started again"""
-    ready_at: float | None = None
-    silent_s: float = 0.0
-    """time without a sign of life (or, before Ready, since the start) while we watched"""
-    heartbeat_ns: int = 0
-    kill_at: float | None = None
-    """set when it is stuck and has been asked for its stacks"""
-    ended_at: deque[float] = field(default_factory=deque)
-    """the ends of its processes within the restart window"""
-    failed_starts: int = 0
-    """ends in a row before the process was stable"""
-
-
 class ActorPool:
     """Actors in processes of their own. Use as a context manager, or `close` it."""
 
@@ -169,20 +140,18 @@ class ActorPool:
         first_episodes = episodes_to_begin_with(config, state)
         specs = config.actor_specs(f"gvz-{os.getpid()}-{secrets.token_hex(4)}", first_episodes)
         self._config = config
-        self._actors: list[_Actor] = []
+        self._actors: list[SupervisedActor] = []
         self._board: BroadcastWriter | None = None
-        self._messages: list[Message] = []
         self._polled_at = time.monotonic()
-        self._env_steps = self._episodes = self._restarts = 0
+        self._env_steps = self._episodes = 0
         self._waited_s = 0.0
         try:
             if config.policy:
                 self._board = BroadcastWriter.create(specs[0].broadcast_name, config.num_params, config.layout_hash)
             for spec in specs:
-                ring = RingReader.create(spec.ring_name, spec.ring_capacity, config.frame_shape)
-                self._actors.append(_Actor(spec=spec, ring=ring, next_episodes=list(spec.first_episodes)))
+                self._actors.append(SupervisedActor(spec, config.actors))
             for actor in self._actors:
-                self._start(actor)
+                actor.start()
         except BaseException:
             self.close()
             raise
@@ -221,7 +190,7 @@ class ActorPool:
             block = actor.ring.read(share)
             if len(block):
                 max_records -= len(block)
-                self._note(actor, block.steps)
+                actor.note(block.steps)
                 self._env_steps += num_decisions(block.steps)
                 blocks.append(block)
         return blocks
@@ -239,15 +208,14 @@ class ActorPool:
         # our own sleep is not the actors' silence: a learner that compiled for a minute has not watched for a minute
         watched_s = min(now - self._polled_at, self._config.actors.heartbeat_timeout_s / 4)
         self._polled_at = now
-        for actor in self._actors:
-            self._watch(actor, now, watched_s)
-        messages, self._messages = self._messages, []
+        messages = [message for actor in self._actors for message in actor.watch(now, watched_s)]
+        self._episodes += sum(isinstance(message, EpisodeStats) for message in messages)
         return messages
 
     def state(self) -> dict[str, Any]:
         """What the pool of a resumed run begins with: lanes go on with new episodes."""
         for actor in self._actors:
-            self._note(actor, actor.ring.peek(actor.ring.capacity).steps)
+            actor.note_unread()
         return {"next_episodes": [episode for actor in self._actors for episode in actor.next_episodes]}
 
     def statistics(self) -> PoolStatistics:
@@ -255,8 +223,8 @@ class ActorPool:
         return PoolStatistics(
             env_steps=self._env_steps,
             episodes=self._episodes,
-            restarts=self._restarts,
-            actors_ready=sum(actor.ready_at is not None for actor in self._actors),
+            restarts=sum(actor.restarts for actor in self._actors),
+            actors_ready=sum(actor.ready for actor in self._actors),
             waited_for_space_s=sum(status.waited_for_space_s for status in self.writer_statuses()),
             waited_for_records_s=self._waited_s,
         )
@@ -283,105 +251,11 @@ class ActorPool:
             for process in processes:
                 process.end(grace_s=max(0.0, deadline - time.monotonic()))
             for actor in self._actors:
-                actor.process, actor.ready_at = None, None
+                actor.process = None
                 actor.ring.close()
             if self._board is not None:
                 self._board.close()
             janitor.clean_dead_instances()
-
-    def _start(self, actor: _Actor) -> None:
-        actor.process = ActorProcess(actor.spec)
-        actor.ready_at, actor.kill_at, actor.silent_s = None, None, 0.0
-        actor.heartbeat_ns = actor.ring.writer_status().heartbeat_ns
-
-    def _watch(self, actor: _Actor, now: float, watched_s: float) -> None:
-        if actor.process is None:
-            if now >= actor.start_at:
-                self._start(actor)
-            return
-        exit_text = actor.process.exit_text()  # first: what it said before its end is then all there
-        try:
-            for message in actor.process.receive():
-                self._take(actor, message, now)
-        except TransportError as error:  # its process is beside itself, the others are not
-            exit_text = f"sent something else than a message ({error})"
-        if actor.kill_at is not None:
-            if exit_text is not None or now >= actor.kill_at:
-                self._replace(actor, now, "stuck", self._silence(actor))
-        elif exit_text is not None:
-            self._replace(actor, now, "died", exit_text)
-        elif self._is_stuck(actor, watched_s):
-            actor.process.dump_stacks()
-            actor.kill_at = now + _DUMP_S
-
-    def _take(self, actor: _Actor, message: Message, now: float) -> None:
-        if isinstance(message, Ready):
-            actor.ready_at, actor.silent_s = now, 0.0
-        elif isinstance(message, EpisodeStats):
-            self._episodes += 1
-        self._messages.append(message)
-
-    def _is_stuck(self, actor: _Actor, watched_s: float) -> bool:
-        status = actor.ring.writer_status()
-        if actor.ready_at is not None and status.heartbeat_ns != actor.heartbeat_ns:
-            actor.silent_s = 0.0
-        else:
-            actor.silent_s += watched_s
-        actor.heartbeat_ns = status.heartbeat_ns
-        return actor.silent_s > getattr(self._config.actors, self._patience(actor))
-
-    def _patience(self, actor: _Actor) -> str:
-        """Which setting bounds the actor's silence: to start an engine takes its time, also in mid-run."""
-        acting = actor.ready_at is not None and actor.ring.writer_status().state != WriterState.RESETTING
-        return "heartbeat_timeout_s" if acting else "start_timeout_s"
-
-    def _silence(self, actor: _Actor) -> str:
-        what = "had not started its games after" if actor.ready_at is None else "gave no sign of life for"
-        state = actor.ring.writer_status().state.name.lower()
-        return f"{what} {actor.silent_s:.1f} s (actors.{self._patience(actor)}); it was {state}"
-
-    def _replace(self, actor: _Actor, now: float, kind: str, what: str) -> None:
-        """Ends what is left of an actor's process and plans the next, if the budget allows."""
-        assert actor.process is not None
-        log_tail = actor.process.log_tail()
-        actor.process.end(grace_s=0.0)
-        actor.process = None
-        janitor.clean_dead_instances()
-        stable = actor.ready_at is not None and now - actor.ready_at > _STABLE_S
-        actor.ready_at = None
-        limits, ended_at = self._config.actors, actor.ended_at
-        ended_at.append(now)
-        while now - ended_at[0] > limits.restart_window_s:
-            ended_at.popleft()
-        index = actor.spec.actor
-        if len(ended_at) > limits.max_restarts:
-            raise WorkerError(
-                f"actor {index} {what}; that was end {len(ended_at)} within {limits.restart_window_s:.0f} s, and "
-                f"actors.max_restarts allows {limits.max_restarts} restarts. The end of {self._log_path(index)}:\n"
-                f"{log_tail}"
-            )
-        actor.failed_starts = 0 if stable else actor.failed_starts + 1
-        backoff_s = min(_FIRST_BACKOFF_S * 2**actor.failed_starts, _LONGEST_BACKOFF_S)
-        actor.start_at = now + backoff_s
-        self._restarts += 1
-        self._note(actor, actor.ring.peek(actor.ring.capacity).steps)
-        # also a lane that wrote nothing gets a new episode: its seed may be what the engine cannot start with
-        actor.next_episodes = [
-            max(next_, first + 1) for next_, first in zip(actor.next_episodes, actor.spec.first_episodes, strict=True)
-        ]
-        actor.spec = replace(actor.spec, first_episodes=actor.next_episodes)
-        message = f"actor {index} {what}; restart {len(ended_at)} of {limits.max_restarts} in {backoff_s:.2f} s"
-        self._messages.append(Fault(actor=index, lane=None, kind=kind, message=message, traceback=log_tail))
-
-    def _log_path(self, index: int) -> Path:
-        return self._config.work_dir / f"actor_{index}.log"
-
-    def _note(self, actor: _Actor, steps: np.ndarray) -> None:
-        """Keeps track of the episodes that have begun."""
-        for game, lane in enumerate(actor.spec.lanes):
-            episodes = steps["episode"][steps["lane"] == lane]
-            if episodes.size:
-                actor.next_episodes[game] = max(actor.next_episodes[game], int(episodes[-1]) + 1)
 
 
 def episodes_to_begin_with(config: PoolConfig, state: dict[str, Any] | None) -> list[int]:

@@ -55,7 +55,11 @@ class ActorProcess:
             )
         self.pid = self._process.pid
         self._channel = Channel(ours, peer=f"actor {spec.actor} (pid {self.pid})")
-        self._channel.send(spec)
+        try:
+            self._channel.send(spec)
+        except BaseException:
+            self.end(grace_s=0.0)
+            raise
 
     def receive(self) -> list[Message]:
         """Messages that have arrived."""

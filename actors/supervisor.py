@@ -1,0 +1,157 @@
+"""One actor over the lives of its processes: watched, ended when stuck, replaced within a budget.
+
+Imports gvz (tier 0) and actors.
+"""
+
+import dataclasses
+from collections import deque
+
+import numpy as np
+
+from actors.config import ActorsConfig
+from actors.process import ActorProcess
+from gvz import janitor
+from gvz.errors import TransportError, WorkerError
+from gvz.transport.messages import ActorSpec, Fault, Message, Ready
+from gvz.transport.ring import RingReader, WriterState
+
+_DUMP_S = 0.5
+"""time given to a stuck actor to write its stacks before it is killed"""
+_STABLE_S = 10.0
+"""an actor that has played for so long is soon restarted; others wait longer each time"""
+_FIRST_BACKOFF_S, _LONGEST_BACKOFF_S = 0.25, 15.0
+
+
+class SupervisedActor:
+    """An actor as the pool knows it. Its ring outlives its processes; each process goes on where the last published.
+
+    Attributes:
+        ring: the reading end of its ring.
+        process: its present process; None while it waits to be started.
+        next_episodes: per game, one more than the largest episode number seen.
+        ready: its present process has started all its games.
+        restarts: processes that were replaced.
+    """
+
+    def __init__(self, spec: ActorSpec, limits: ActorsConfig):
+        height, width, channels = spec.frame_shape
+        self.ring = RingReader.create(spec.ring_name, spec.ring_capacity, (height, width, channels))
+        self.process: ActorProcess | None = None
+        self.next_episodes = list(spec.first_episodes)
+        self.restarts = 0
+        self._spec = spec
+        self._limits = limits
+        self._start_at = 0.0
+        self._ready_at: float | None = None
+        self._silent_s = 0.0  # without a sign of life (or, before Ready, since the start) while we watched
+        self._heartbeat_ns = 0
+        self._kill_at: float | None = None  # set when it is stuck and was asked for its stacks
+        self._ended_at: deque[float] = deque()  # ends of its processes within the restart window
+        self._failed_starts = 0  # ends in a row before a process was stable
+
+    @property
+    def ready(self) -> bool:
+        return self.process is not None and self._ready_at is not None
+
+    def start(self) -> None:
+        """Starts a process; does not wait for it."""
+        self.process = ActorProcess(self._spec)
+        self._ready_at, self._kill_at, self._silent_s = None, None, 0.0
+        self._heartbeat_ns = self.ring.writer_status().heartbeat_ns
+
+    def watch(self, now: float, watched_s: float) -> list[Message]:
+        """Looks after the process once.
+
+        Args:
+            now: `time.monotonic()`.
+            watched_s: time since the last look that counts as silence if there was no sign of life.
+
+        Returns:
+            What the process said, and a Fault if it was replaced.
+
+        Raises:
+            WorkerError: it failed more often than its budget allows.
+        """
+        if self.process is None:
+            if now >= self._start_at:
+                self.start()
+            return []
+        exit_text = self.process.exit_text()  # first: what it said before its end is then all there
+        messages: list[Message] = []
+        try:
+            messages += self.process.receive()
+        except TransportError as error:  # its process is beside itself, the others are not
+            exit_text = f"sent something else than a message ({error})"
+        if any(isinstance(message, Ready) for message in messages):
+            self._ready_at, self._silent_s = now, 0.0
+        if self._kill_at is not None:
+            if exit_text is not None or now >= self._kill_at:
+                messages.append(self._replace(now, "stuck", self._silence()))
+        elif exit_text is not None:
+            messages.append(self._replace(now, "died", exit_text))
+        elif self._is_stuck(watched_s):
+            self.process.dump_stacks()
+            self._kill_at = now + _DUMP_S
+        return messages
+
+    def note(self, steps: np.ndarray) -> None:
+        """Keeps track of the episodes that have begun, from records of the ring."""
+        for game, lane in enumerate(self._spec.lanes):
+            episodes = steps["episode"][steps["lane"] == lane]
+            if episodes.size:
+                self.next_episodes[game] = max(self.next_episodes[game], int(episodes[-1]) + 1)
+
+    def note_unread(self) -> None:
+        """As `note`, from what is still in the ring."""
+        self.note(self.ring.peek(self.ring.capacity).steps)
+
+    def _is_stuck(self, watched_s: float) -> bool:
+        heartbeat_ns = self.ring.writer_status().heartbeat_ns
+        moved = self.ready and heartbeat_ns != self._heartbeat_ns
+        self._silent_s = 0.0 if moved else self._silent_s + watched_s
+        self._heartbeat_ns = heartbeat_ns
+        return self._silent_s > getattr(self._limits, self._patience())
+
+    def _patience(self) -> str:
+        """Which setting bounds its silence: to start an engine takes its time, also in mid-run."""
+        acting = self.ready and self.ring.writer_status().state != WriterState.RESETTING
+        return "heartbeat_timeout_s" if acting else "start_timeout_s"
+
+    def _silence(self) -> str:
+        what = "gave no sign of life for" if self.ready else "had not started its games after"
+        state = self.ring.writer_status().state.name.lower()
+        return f"{what} {self._silent_s:.1f} s (actors.{self._patience()}); it was {state}"
+
+    def _replace(self, now: float, kind: str, what: str) -> Fault:
+        """Ends what is left of the process and plans the next, if the budget allows."""
+        assert self.process is not None
+        stable = self._ready_at is not None and now - self._ready_at > _STABLE_S
+        process, self.process = self.process, None
+        process.end(grace_s=0.0)
+        log_tail = process.log_tail()
+        janitor.clean_dead_instances()
+        actor, limits = self._spec.actor, self._limits
+        self._ended_at.append(now)
+        while now - self._ended_at[0] > limits.restart_window_s:
+            self._ended_at.popleft()
+        if len(self._ended_at) > limits.max_restarts:
+            raise WorkerError(
+                f"actor {actor} {what}; that was end {len(self._ended_at)} within {limits.restart_window_s:.0f} s, "
+                f"and actors.max_restarts allows {limits.max_restarts} restarts. The end of {process.log_path}:\n"
+                f"{log_tail}"
+            )
+        self._failed_starts = 0 if stable else self._failed_starts + 1
+        backoff_s = min(_FIRST_BACKOFF_S * 2**self._failed_starts, _LONGEST_BACKOFF_S)
+        self._start_at = now + backoff_s
+        self.restarts += 1
+        self._renumber()
+        message = f"actor {actor} {what}; restart {len(self._ended_at)} of {limits.max_restarts} in {backoff_s:.2f} s"
+        return Fault(actor=actor, lane=None, kind=kind, message=message, traceback=log_tail)
+
+    def _renumber(self) -> None:
+        """The next process plays new episodes: also in lanes that have written nothing, for the seed of such an
+        episode may be what their engine cannot start with."""
+        self.note_unread()
+        begun = [first + 1 for first in self._spec.first_episodes]
+        self.next_episodes = [max(pair) for pair in zip(self.next_episodes, begun, strict=True)]
+        self._spec = dataclasses.replace(self._spec, first_episodes=list(self.next_episodes))
