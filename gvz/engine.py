@@ -1,6 +1,6 @@
 """One ViZDoom engine: a process, its private directory, its shared memory. The only importer of vizdoom.
 
-Imports vizdoom (when an engine starts, not before), gvz.errors and gvz.janitor.
+Imports vizdoom (when an engine starts, not before), numpy, gvz.engine_process, gvz.errors and gvz.janitor.
 
 What is known of ViZDoom 1.3 and decides the shape of this file:
 - An engine that fails before its first frame takes the client process with it (the library reads a null
@@ -11,6 +11,7 @@ What is known of ViZDoom 1.3 and decides the shape of this file:
 """
 
 import contextlib
+import mmap
 import os
 import signal
 import time
@@ -20,6 +21,8 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from gvz import engine_process, janitor
 from gvz.errors import ConfigError, EngineError
@@ -80,6 +83,8 @@ class Engine:
     Attributes:
         pid: process id of the engine.
         instance_id: ViZDoom's name for it, part of the names of its shared memory.
+        screen: u8[H W 3], RGB, read-only: the engine's own buffer in shared memory, no copy. It changes with
+            every call; after the player's death it shows the moment of it, where `state` has nothing.
         log: the file with the engine's output.
     """
 
@@ -103,6 +108,8 @@ class Engine:
         instance = janitor.read_instance(directory)
         assert instance is not None, "an engine that answered has written its instance file"
         self.pid, _, self.instance_id = instance
+        self._variables = game.get_available_game_variables()
+        self.screen = _map_screen(game, self.instance_id)
         engine_process.watch(self)
 
     def new_episode(self, seed: int) -> "GameState":
@@ -122,14 +129,19 @@ class Engine:
         return state
 
     def step(self, buttons: Sequence[float], tics: int) -> "GameState | None":
-        """Holds the buttons for so many tics.
+        """`advance`, then `state`."""
+        self.advance(buttons, tics)
+        return self.state()
+
+    def advance(self, buttons: Sequence[float], tics: int) -> bool:
+        """Holds the buttons for so many tics, or until the player dies.
 
         Args:
             buttons: one number a button, in the order of the configuration.
             tics: how long, in game tics.
 
         Returns:
-            The state after them, or None if the player died or the map ended.
+            Whether the episode goes on.
 
         Raises:
             EngineError: the engine died or did not answer.
@@ -138,27 +150,43 @@ class Engine:
         self.deadline = time.monotonic() + self.config.step_timeout_s
         try:
             self._game.make_action(buttons, tics)
-            return self._game.get_state()
+            return not self._game.is_episode_finished()
         except _vizdoom_errors() as error:
-            raise self._dead("step", error) from error
+            raise self._dead("advance", error) from error
         finally:
             self.deadline = None
 
+    def state(self) -> "GameState | None":
+        """A copy of everything there is to see, or None once the player is dead."""
+        return self._game.get_state()
+
+    def variables(self) -> list[float]:
+        """Values of the configured variables, in their order, now; after the player's death too.
+
+        Raises:
+            EngineError: the engine is not running.
+        """
+        read = self._game.get_game_variable
+        try:
+            return [read(variable) for variable in self._variables]
+        except _vizdoom_errors() as error:
+            raise self._dead("variables", error) from error
+
     def variable(self, name: str) -> float:
-        """Value of any game variable, now; after the player's death too."""
+        """Value of any game variable; like `variables`."""
         import vizdoom
 
         with self._answering(f"variable {name}"):
             return self._game.get_game_variable(_member(vizdoom.GameVariable, name))
 
-    def variables(self) -> list[float]:
-        """Values of the configured variables, in their order, now; after the player's death too."""
-        return [self.variable(name) for name in self.config.variables]
-
     def tic(self) -> int:
-        """Tics of the map so far, those before the episode's start included. Stands still once the player is dead."""
-        with self._answering("tic"):
-            return self._game.get_episode_time()
+        """Tics of the map so far, those before the episode's start included. Stands still once the player is dead.
+
+        Raises:
+            EngineError: the engine is not running.
+        """
+        self._require_running("tic")
+        return self._game.get_episode_time()
 
     def command(self, text: str) -> None:
         """Sends a console command; it takes effect with the next step."""
@@ -181,8 +209,7 @@ class Engine:
 
     @contextlib.contextmanager
     def _answering(self, what: str) -> Iterator[None]:
-        if not self._game.is_running():  # some calls of the library would read a null pointer
-            raise EngineError(f"engine {self._name}: {what}: it was closed, or died before")
+        self._require_running(what)
         self.deadline = time.monotonic() + self.config.step_timeout_s
         try:
             yield
@@ -190,6 +217,10 @@ class Engine:
             raise self._dead(what, error) from error
         finally:
             self.deadline = None
+
+    def _require_running(self, what: str) -> None:
+        if not self._game.is_running():  # some calls of the library would read a null pointer
+            raise EngineError(f"engine {self._name}: {what}: it was closed, or died before")
 
     def _dead(self, what: str, error: Exception) -> EngineError:
         why = f"no answer within {self.config.step_timeout_s:g} s, killed" if self._overdue else f"{error!r}"
@@ -245,6 +276,7 @@ def _make_game(config: EngineConfig) -> "DoomGame":
     game.set_console_enabled(True)  # the engine prints to its log; nothing of it is on the screen
     game.set_sound_enabled(False)
     game.set_mode(vizdoom.Mode.PLAYER)
+    game.set_seed(0)  # of the episode that an engine starts with, which nobody plays
     game.set_episode_start_time(config.start_tic)
     game.set_episode_timeout(0)  # the environment's, not the engine's: at its time-out the engine has no state
     return game
@@ -269,6 +301,22 @@ def _start(config: EngineConfig) -> "tuple[DoomGame, Path, Path]":
                 raise
         else:
             return game, directory, log
+
+
+def _map_screen(game: "DoomGame", instance_id: str) -> np.ndarray:
+    """The screen buffer within the engine's shared memory. Its place is not documented, so it is found by content.
+
+    Raises:
+        EngineError: it is not there, so this version of ViZDoom works otherwise.
+    """
+    state = game.get_state()
+    screen = None if state is None else state.screen_buffer
+    with (janitor.SHM_DIR / f"ViZDoomSM{instance_id}").open("rb") as file:
+        memory = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    offset = -1 if screen is None or screen.min() == screen.max() else memory.find(screen.tobytes())
+    if screen is None or offset < 0:
+        raise EngineError(f"engine {instance_id}: no screen in its shared memory; this ViZDoom is not supported")
+    return np.frombuffer(memory, np.uint8, screen.size, offset).reshape(screen.shape)
 
 
 @cache

@@ -5,6 +5,7 @@ gvz.errors, gvz.janitor and the standard library.
 """
 
 import contextlib
+import ctypes
 import fcntl
 import os
 import secrets
@@ -169,9 +170,12 @@ def end(game: Startable, directory: Path) -> None:
 
 
 def end_if_ours(game: Startable, directory: Path, owner_pid: int) -> None:
-    """`end`, unless this process is a fork of the owner, which inherited the object but not the engine."""
+    """`end`; but in a fork of the owner, which inherited the object and not the engine, nothing."""
     if os.getpid() == owner_pid:
         end(game, directory)
+    else:
+        # its destructor would close the owner's engine, and wait for a thread that is not in this process
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(game))
 
 
 def log_tail(log: Path, num_lines: int = 8) -> str:

@@ -6,6 +6,7 @@ Imports gymnasium, numpy and all of tier 1; no jax, and vizdoom only by way of g
 import dataclasses
 import time
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from typing import TYPE_CHECKING, Any, Literal
 
 import gymnasium
@@ -16,10 +17,10 @@ from gymnasium.spaces import Discrete
 from gvz.actions import action_buttons, num_actions
 from gvz.engine import Engine, EngineConfig, check_config
 from gvz.errors import ConfigError, EngineError
-from gvz.observation import Observation, observation_space, observe
+from gvz.observation import Observation, observation_space, observe_buffers, observe_screen
 from gvz.probe import ensure_loads
 from gvz.scenarios.base import BOOKKEEPING, Task
-from gvz.scenarios.compiler import compile_task
+from gvz.scenarios.compiler import compile_task, task_content
 from gvz.specs import EnvConfig
 from gvz.tasks import parse_task
 from gvz.viewer import Window
@@ -43,8 +44,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         `depth`, `labels` [H, W, 1] and `automap` [H, W, C].
     Actions: `action_meanings`, each held for `config.frame_skip` game tics.
     Reward: the sum of `info["reward_components"]`.
-    Termination: the agent died. ViZDoom draws nothing after that, so the final observation is the one before, once
-        more; its value is never used, because the discount is 0 there.
+    Termination: the agent died; the final observation is the moment of it. (The buffers are those before it.)
     Truncation: the time-out, with its true final observation; or the engine crashed (`info["engine_crash"]`), then
         the last observation is given once more and the reward is 0.
     Info, each step: score, normalized_score (percent of upper_bound), upper_bound, reward_components, variables
@@ -63,7 +63,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         *,
         render_mode: Literal["rgb_array", "human"] | None = None,
         reward_weights: Mapping[str, float] | None = None,
-        recycle_episodes: int = 0,
+        recycle_episodes: int | None = None,
         **fields: Any,
     ):
         """Compiles the task's map and proves that it loads; the engine itself starts with the first `reset`.
@@ -74,7 +74,9 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             render_mode: rgb_array: `render()` gives the screen, uint8 [render_height, render_width, 3];
                 human: a window shows the game at its true speed.
             reward_weights: component -> weight, in place of the scenario's.
-            recycle_episodes: restart the engine after so many episodes (0: never); nothing seen depends on it.
+            recycle_episodes: restart the engine after so many episodes (0: never). Default 0, but 1 for tasks with
+                fuzzy enemies: the engine's fuzz goes on from episode to episode, so only a fresh engine draws it
+                the same again. Nothing else that can be seen depends on it.
             **fields: single fields of EnvConfig, in place of those of `config`.
 
         Raises:
@@ -84,7 +86,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode: got {render_mode!r}, want None or one of {self.metadata['render_modes']}")
-        if recycle_episodes < 0:
+        if recycle_episodes is not None and recycle_episodes < 0:
             raise ValueError(f"recycle_episodes: got {recycle_episodes}, want 0 or more")
         self.task = parse_task(task) if isinstance(task, str) else task
         self.config = config = _with_fields(EnvConfig() if config is None else config, fields)
@@ -116,13 +118,16 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         ensure_loads(self._compiled.wad_path, self._compiled.map_name)
         self.action_space = Discrete(num_actions(scenario, config.action_set))
         self.observation_space = observation_space(config)
-        self._recycle_episodes = recycle_episodes
+        fuzzy = "STYLE_Fuzzy" in task_content(self.task, config.profile).entity.values()
+        self._recycle_episodes = int(fuzzy) if recycle_episodes is None else recycle_episodes
         self._window: Window | None = None
         self._show_at_s = 0.0
         self._engine: Engine | None = None
         self._engine_episodes = 0
         self._crashes = 0
+        self._screen: np.ndarray | None = None
         self._state: GameState | None = None
+        self._observation: Observation | None = None
         self._playing = False
 
     def reset(
@@ -150,15 +155,16 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             raise ValueError(f"reset: episode_seed {self._episode_seed}, want 0..{_EPISODE_SEEDS - 1}")
         if self._recycle_episodes and self._engine_episodes >= self._recycle_episodes:
             self._stop_engine()
-        self._state = state = self._begin()
+        engine = self._begin()
         self._engine_episodes += 1
-        self._start_tic = state.tic
-        self._note(_values(state), state.tic)
+        self._screen = engine.screen
+        self._start_tic = engine.tic()
+        self._read(engine)
         self._rewarder.reset(self._variables)
         self._playing = True
         if self.render_mode == "human":
             self._show(tics=0)
-        return self._observe(), self._info(dict.fromkeys(self._rewarder.weights, 0.0), False, False)
+        return self._observe(engine), self._info(dict.fromkeys(self._rewarder.weights, 0.0), False, False)
 
     def step(self, action: int | np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Holds the action's buttons for `frame_skip` tics, or what is left until the time-out.
@@ -168,22 +174,17 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             ValueError: no such action.
             EngineError: the engine crashed again and again.
         """
-        if not self._playing or self._engine is None:
+        engine = self._engine
+        if engine is None or not self._playing:
             raise ResetNeeded("DoomEnv.step: no episode is running; call reset first")
         if not 0 <= action < len(self._actions):
             raise ValueError(f"DoomEnv.step: action {action!r}, want 0..{len(self._actions) - 1}")
         tics = min(self.config.frame_skip, self._timeout_frames - self._frames)
         try:
-            state = self._engine.step(self._actions[action], tics)
-            if state is not None:
-                self._state = state
-                values, tic = _values(state), state.tic
-            else:
-                values, tic = self._engine.variables(), self._engine.tic()
+            terminated = not engine.advance(self._actions[action], tics)
         except EngineError as error:
             return self._crashed(error)
-        self._note(values, tic)
-        terminated = state is None
+        self._read(engine)
         truncated = not terminated and self._frames >= self._timeout_frames
         if terminated or truncated:
             self._playing = False
@@ -192,15 +193,15 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             self._show(tics)
         components = self._rewarder.step(self._variables, terminated)
         info = self._info(components, terminated, truncated)
-        return self._observe(), sum(components.values()), terminated, truncated, info
+        return self._observe(engine), sum(components.values()), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         """The screen as it was last rendered, uint8 [render_height, render_width, 3]; None in mode human."""
         if self.render_mode != "rgb_array":
             return None
-        if self._state is None:
+        if self._screen is None:
             raise ResetNeeded("DoomEnv.render: nothing was rendered yet; call reset first")
-        return self._state.screen_buffer.copy()
+        return self._screen.copy()
 
     def labels(self) -> "Sequence[Label]":
         """What was in sight at the last observation, with name and place on the rendered screen.
@@ -220,36 +221,47 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             self._window = None
         self._playing = False
 
-    def _begin(self) -> "GameState":
+    def _begin(self) -> Engine:
         """Starts the episode, on a new engine if there is none or the old one has died."""
         while True:
             if self._engine is None:
                 self._engine = Engine(self._engine_config)
             try:
-                state = self._engine.new_episode(self._episode_seed)
+                self._engine.new_episode(self._episode_seed)
+                magic = self._engine.variable(BOOKKEEPING["MAP_MAGIC"])
             except EngineError as error:
                 self._note_crash(error)
                 continue
-            magic = self._engine.variable(BOOKKEEPING["MAP_MAGIC"])
             if magic != self._compiled.map_magic:  # where a file has no such map, ViZDoom plays another one
                 self._stop_engine()
                 raise EngineError(
                     f"{self.task.id}: {self._compiled.wad_path} runs a map with magic number {magic:.0f}, "
                     f"want {self._compiled.map_magic}"
                 )
-            return state
+            return self._engine
 
-    def _note(self, values: list[float], tic: int) -> None:
+    def _read(self, engine: Engine) -> None:
         """Keeps what the game says after a decision."""
-        self._variables = dict(zip(self._names, values, strict=True))
-        self._frames = tic - self._start_tic
+        self._variables = dict(zip(self._names, engine.variables(), strict=True))
+        self._frames = engine.tic() - self._start_tic
+
+    def _observe(self, engine: Engine) -> Observation:
+        screen = observe_screen(engine.screen, self.config)
+        if not self.config.buffers:
+            self._observation = screen
+        else:
+            self._state = engine.state() or self._state
+            assert self._state is not None
+            self._observation = {"screen": screen, **observe_buffers(self._state, self.config)}
+        return self._observation
 
     def _crashed(self, error: EngineError) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """The engine died: what the episode was up to the last decision stands, cut off there."""
+        assert self._observation is not None
         self._note_crash(error)
         self._playing = False
         info = self._info(dict.fromkeys(self._rewarder.weights, 0.0), False, True)
-        return self._observe(), 0.0, False, True, {**info, "engine_crash": True, "engine_error": str(error)}
+        return deepcopy(self._observation), 0.0, False, True, {**info, "engine_crash": True, "engine_error": str(error)}
 
     def _note_crash(self, error: EngineError) -> None:
         self._stop_engine()
@@ -264,11 +276,6 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             self._engine.close()
         self._engine = None
         self._engine_episodes = 0
-
-    def _observe(self) -> Observation:
-        """The last state the engine gave, as a fresh observation."""
-        assert self._state is not None
-        return observe(self._state, self.config)
 
     def _info(self, components: dict[str, float], terminated: bool, truncated: bool) -> dict[str, Any]:
         variables, scenario = self._variables, self.task.scenario
@@ -290,14 +297,14 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         return info
 
     def _show(self, tics: int) -> None:
-        """Draws the last state in the window, when so many tics have passed on the viewer's clock."""
-        assert self._state is not None
+        """Draws the screen in the window, when so many tics have passed on the viewer's clock."""
+        assert self._screen is not None
         if self._window is None:
             self._window = Window(self.task.id, self.config.render_width, self.config.render_height)
         now = time.monotonic()
         self._show_at_s = max(self._show_at_s + tics / TICS_PER_SECOND, now)
         time.sleep(self._show_at_s - now)
-        self._window.show(self._state.screen_buffer)
+        self._window.show(self._screen)
 
 
 def make_env(task_id: str, env_config: Mapping[str, Any], **options: Any) -> DoomEnv:
@@ -315,8 +322,3 @@ def _with_fields(config: EnvConfig, fields: Mapping[str, Any]) -> EnvConfig:
     if unknown := sorted(fields.keys() - set(known)):
         raise ConfigError(f"env: unknown options {unknown}, want some of {', '.join(known)}")
     return dataclasses.replace(config, **fields)
-
-
-def _values(state: "GameState") -> list[float]:
-    assert state.game_variables is not None, "the engine has variables configured"
-    return state.game_variables.tolist()

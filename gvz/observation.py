@@ -22,7 +22,7 @@ _INTERPOLATIONS = {"linear": cv2.INTER_LINEAR, "area": cv2.INTER_AREA}
 
 
 def observation_space(config: EnvConfig) -> spaces.Space[Any]:
-    """The Gymnasium space of what `observe` returns."""
+    """The Gymnasium space of the observations."""
 
     def box(channels: int) -> spaces.Box:
         return spaces.Box(0, 255, (config.frame_height, config.frame_width, channels), np.uint8)
@@ -33,26 +33,23 @@ def observation_space(config: EnvConfig) -> spaces.Space[Any]:
     return spaces.Dict({"screen": box(config.channels), **{name: box(channels[name]) for name in config.buffers}})
 
 
-def observe(state: "GameState", config: EnvConfig) -> Observation:
-    """The observation of a state; new arrays with each call."""
-    screen = _picture(state.screen_buffer, config)
-    if not config.buffers:
-        return screen
-    found = {"screen": screen}
+def observe_screen(screen: np.ndarray, config: EnvConfig) -> np.ndarray:
+    """u8[H W 3] as rendered -> u8[frame_height frame_width C]; a new array with each call."""
+    size = (config.frame_width, config.frame_height)
+    frame = cv2.resize(screen, size, interpolation=_INTERPOLATIONS[config.interpolation])
+    return cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)[:, :, None] if config.grayscale else frame
+
+
+def observe_buffers(state: "GameState", config: EnvConfig) -> dict[str, np.ndarray]:
+    """The buffers that `config` asks for, each in the observation's size; new arrays with each call."""
+    found = {}
     if state.depth_buffer is not None:
         found["depth"] = _values(state.depth_buffer, config)
     if state.labels_buffer is not None:
         found["labels"] = _values(state.labels_buffer, config)
     if state.automap_buffer is not None:
-        found["automap"] = _picture(state.automap_buffer, config)
+        found["automap"] = observe_screen(state.automap_buffer, config)
     return found
-
-
-def _picture(pixels: np.ndarray, config: EnvConfig) -> np.ndarray:
-    """u8[H W 3] -> u8[frame_height frame_width C]."""
-    size = (config.frame_width, config.frame_height)
-    frame = cv2.resize(pixels, size, interpolation=_INTERPOLATIONS[config.interpolation])
-    return cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)[:, :, None] if config.grayscale else frame
 
 
 def _values(pixels: np.ndarray, config: EnvConfig) -> np.ndarray:

@@ -76,6 +76,18 @@ def test_an_episode_is_played_and_ends_with_the_players_death(engine: Engine):
     assert engine.tic() == died_at
 
 
+def test_the_screen_is_the_states_without_a_copy_and_goes_on_to_the_moment_of_death(engine: Engine):
+    state = engine.new_episode(seed=5)
+    last = np.empty(0)
+    while state is not None:
+        np.testing.assert_array_equal(engine.screen, state.screen_buffer)
+        last = state.screen_buffer
+        state = engine.step([0, 0, 0], 4)
+    assert (engine.screen != last).any()
+    with pytest.raises(ValueError, match="read-only"):
+        engine.screen[0, 0, 0] = 0
+
+
 def test_colours_are_red_green_blue(engine: Engine):
     ammo_and_health = engine.new_episode(seed=5).screen_buffer[-24:-8, 30:100].astype(int)  # red digits
     red, _green, blue = ammo_and_health.reshape(-1, 3).T
@@ -120,13 +132,14 @@ def test_the_interpreters_exit_leaves_nothing(ending: str, code: int):
     assert not Path(directory).exists()
 
 
-def test_a_forked_childs_exit_leaves_the_parents_engine_alone():
+@pytest.mark.parametrize("ending", ["sys.exit(0)", "del engine; sys.exit(0)"])
+def test_a_forked_childs_exit_leaves_the_parents_engine_alone(ending: str):
     done = run(
         "import os, sys, warnings\n"
         "warnings.simplefilter('ignore')  # Python 3.12 warns of any fork beside threads\n"
         "engine = Engine(config); engine.new_episode(1)\n"
         "child = os.fork()\n"
-        "if child == 0: sys.exit(0)\n"
+        f"if child == 0: {ending}\n"
         "assert os.waitpid(child, 0)[1] == 0\n"
         "assert engine.step([], 4) is not None\n"
     )
@@ -154,7 +167,7 @@ def test_a_settings_file_that_vizdoom_would_load_is_refused(tmp_path: Path, monk
 def test_a_killed_engine_raises(engine: Engine):
     engine.new_episode(1)
     engine.kill()
-    with pytest.raises(EngineError, match=r"engine \w+ \(pid \d+, defend_the_center.wad\): step: .*crash"):
+    with pytest.raises(EngineError, match=r"engine \w+ \(pid \d+, defend_the_center.wad\): advance: .*crash"):
         engine.step([1, 0, 0], 4)
     with pytest.raises(EngineError, match="not running"):
         engine.step([1, 0, 0], 4)
@@ -162,14 +175,14 @@ def test_a_killed_engine_raises(engine: Engine):
     assert traces(engine) == []
 
 
-@pytest.mark.parametrize("call", ["step", "new_episode"])
+@pytest.mark.parametrize("call", ["advance", "new_episode"])
 def test_a_hung_engine_is_killed_and_raises(call: str):
     engine = Engine(config(step_timeout_s=0.5))
     engine.new_episode(1)
     os.kill(engine.pid, signal.SIGSTOP)
     start = time.monotonic()
     with pytest.raises(EngineError, match=f"{call}: no answer within 0.5 s, killed"):
-        engine.step([1, 0, 0], 4) if call == "step" else engine.new_episode(2)
+        engine.advance([1, 0, 0], 4) if call == "advance" else engine.new_episode(2)
     assert time.monotonic() - start < 5
     engine.close()
     assert traces(engine) == []

@@ -1,0 +1,485 @@
+"""A task as a Gymnasium environment: what comes out of it, when it ends, seeds, crashes, registration."""
+
+import hashlib
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import cv2
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
+
+import gvz
+from gvz.env import DoomEnv, is_solved, make_env
+from gvz.errors import ConfigError, EngineError, ResourceError, TaskError
+from gvz.registration import gymnasium_id
+from gvz.tasks import named_tasks, parse_task
+
+pytestmark = pytest.mark.engine
+
+TURN = 1
+"""an action of Defend the Center that wastes no ammunition"""
+
+
+@pytest.fixture(scope="module")
+def shared() -> Iterator[DoomEnv]:
+    """One environment for all tests that leave it as good as they found it."""
+    env = DoomEnv("defend_the_center/default", render_mode="rgb_array")
+    yield env
+    env.close()
+
+
+def play(env: DoomEnv, episode_seed: int, max_steps: int = 60) -> tuple[np.ndarray, list[float], list[dict]]:
+    """Frames u8[T+1 H W C], rewards and infos of an episode, with actions drawn from its seed."""
+    rng = np.random.default_rng(episode_seed)
+    frame, info = env.reset(options={"episode_seed": episode_seed})
+    frames, rewards, infos = [frame], [], [info]
+    for _ in range(max_steps):
+        frame, reward, terminated, truncated, info = env.step(rng.integers(env.action_space.n))
+        frames.append(frame)
+        rewards.append(reward)
+        infos.append(info)
+        if terminated or truncated:
+            break
+    return np.stack(frames), rewards, infos
+
+
+def idle_to_the_end(env: DoomEnv, action: int = TURN) -> list[tuple]:
+    """All steps of one episode."""
+    steps = []
+    while not steps or not (steps[-1][2] or steps[-1][3]):
+        steps.append(env.step(action))
+    return steps
+
+
+def make_invulnerable(env: DoomEnv) -> None:
+    assert env._engine is not None
+    env._engine.command("god")
+
+
+# ------------------------------------------------------------------------------------------- what comes out
+
+
+def test_observations_are_the_rendered_screen_made_smaller(shared: DoomEnv):
+    observation, _ = shared.reset(seed=1)
+    screen = shared.render()
+    assert screen is not None
+    assert (screen.shape, screen.dtype) == ((144, 256, 3), np.uint8)
+    np.testing.assert_array_equal(observation, cv2.resize(screen, (84, 84), interpolation=cv2.INTER_LINEAR))
+    again, *_ = shared.step(TURN)
+    assert (again != observation).any()
+
+
+def test_sizes_colours_and_interpolation_are_as_configured():
+    fields = {"frame_height": 40, "frame_width": 60, "grayscale": True, "interpolation": "area"}
+    env = gvz.make("defend_the_center/default", render_mode="rgb_array", render_width=320, render_height=240, **fields)
+    observation, _ = env.reset(seed=1)
+    screen = env.render()
+    env.close()
+    assert screen is not None
+    assert screen.shape == (240, 320, 3)
+    assert observation.shape == (40, 60, 1)
+    small = cv2.resize(screen, (60, 40), interpolation=cv2.INTER_AREA).astype(float)
+    luminance = small @ [0.299, 0.587, 0.114]
+    assert np.abs(observation[:, :, 0] - luminance).max() <= 1
+
+
+def test_buffers_come_as_a_dict():
+    env = DoomEnv("defend_the_center/default", buffers=("depth", "labels", "automap"))
+    observation, _ = env.reset(seed=1)
+    assert isinstance(observation, dict)
+    assert {name: value.shape for name, value in observation.items()} == {
+        "screen": (84, 84, 3),
+        "depth": (84, 84, 1),
+        "labels": (84, 84, 1),
+        "automap": (84, 84, 3),
+    }
+    assert env.observation_space.contains(observation)
+    assert len(np.unique(observation["depth"])) > 10
+    seen = env.labels()
+    assert {label.object_name for label in seen} & {"MarineChainsawVzd", "Demon"}
+    assert set(np.unique(observation["labels"])) <= {0, 1, *(label.value for label in seen)}
+    env.close()
+
+
+def test_labels_need_their_buffer(shared: DoomEnv):
+    with pytest.raises(ValueError, match="want 'labels' among the buffers"):
+        shared.labels()
+
+
+def test_info_has_everything_and_the_reward_is_the_sum_of_its_components(shared: DoomEnv):
+    _, rewards, infos = play(shared, episode_seed=3, max_steps=400)
+    assert infos[0]["episode_frames"] == 0
+    for reward, info in zip(rewards, infos[1:], strict=True):
+        assert reward == pytest.approx(sum(info["reward_components"].values()))
+        assert info["score"] == info["episode_frames"]
+        assert info["normalized_score"] == pytest.approx(info["score"] / 11)
+        assert info["upper_bound"] == 1100
+        assert list(info["variables"]) == ["KILLCOUNT", "AMMO2", "HEALTH"]
+        assert info["kills"] == info["variables"]["KILLCOUNT"] >= info["player_kills"] >= 0
+        assert info["episode_seed"] == 3
+        assert info["engine_crash"] is False
+    assert infos[-1]["reward_components"]["death"] == -1
+    assert infos[-1]["solved_episode"] is False
+    assert "solved_episode" not in infos[-2]
+    assert sum(r["reward_components"]["ammo_spent"] for r in infos) < 0
+    json.dumps(infos)
+
+
+def test_reward_weights_can_be_chosen():
+    env = DoomEnv("defend_the_center/default", reward_weights={"death": -7.0, "kill": 0.5})
+    env.reset(seed=1)
+    assert idle_to_the_end(env)[-1][4]["reward_components"]["death"] == -7.0
+    env.close()
+    with pytest.raises(ConfigError, match="unknown components"):
+        DoomEnv("defend_the_center/default", reward_weights={"deth": 1.0})
+
+
+def test_kills_are_the_score_where_the_scenario_says_so():
+    env = DoomEnv("seek_and_kill/default", frame_skip=35)
+    env.reset(seed=1)
+    *_, info = env.step(0)
+    assert info["score"] == info["kills"]
+    assert info["normalized_score"] == 100 * info["kills"] / 20
+    env.close()
+
+
+def test_forbidden_actions_of_the_unified_set_do_nothing():
+    env = DoomEnv("defend_the_center/default", action_set="unified")
+    assert env.action_space.n == 7
+    frames = {}
+    for action in range(7):
+        env.reset(options={"episode_seed": 1})
+        frames[action] = np.stack([env.step(action)[0] for _ in range(5)])
+    env.close()
+    idle = [action for action, held in enumerate(env.action_meanings) if not held]
+    assert len(idle) == 4
+    for action in range(7):
+        assert (frames[action] == frames[idle[0]]).all() == (action in idle)
+
+
+# --------------------------------------------------------------------------------------------- how it ends
+
+
+def test_death_terminates_with_the_frame_of_its_moment(shared: DoomEnv):
+    shared.reset(seed=1)
+    steps = idle_to_the_end(shared)
+    observation, _, terminated, truncated, info = steps[-1]
+    assert (terminated, truncated) == (True, False)
+    assert info["variables"]["HEALTH"] <= 0
+    red, _, blue = (observation.astype(int) - steps[-2][0]).mean((0, 1))
+    assert red > blue, "the screen turns red"
+    assert 4 * (len(steps) - 1) < info["episode_frames"] <= 4 * len(steps)
+
+
+@pytest.mark.parametrize(("frame_skip", "decisions"), [(4, 275), (7, 158)])
+def test_the_time_out_truncates_exactly_there_with_its_own_frame(frame_skip: int, decisions: int):
+    env = DoomEnv("defend_the_center/default", render_mode="rgb_array", frame_skip=frame_skip)
+    env.reset(seed=1)
+    make_invulnerable(env)
+    steps = idle_to_the_end(env)
+    observation, _, terminated, truncated, info = steps[-1]
+    assert len(steps) == decisions
+    assert (terminated, truncated) == (False, True)
+    assert info["score"] == info["episode_frames"] == 1100
+    assert info["normalized_score"] == 100
+    assert info["solved_episode"] is True
+    assert (observation != steps[-2][0]).any()
+    np.testing.assert_array_equal(observation, cv2.resize(env.render(), (84, 84), interpolation=cv2.INTER_LINEAR))
+    env.close()
+
+
+def test_ten_episodes_in_a_row_solve():
+    assert is_solved([True] * 10)
+    assert is_solved([False] + [True] * 10)
+    assert not is_solved([True] * 9)
+    assert not is_solved([True] * 10 + [False])
+
+
+def test_steps_outside_an_episode_are_refused(shared: DoomEnv):
+    shared.reset(seed=1)
+    idle_to_the_end(shared)
+    with pytest.raises(ResetNeeded, match="no episode is running"):
+        shared.step(0)
+    with pytest.raises(ResetNeeded, match="nothing was rendered yet"):
+        DoomEnv("defend_the_center/default", render_mode="rgb_array").render()
+
+
+# --------------------------------------------------------------------------------------------------- seeds
+
+
+def fingerprint(env: DoomEnv, episode_seed: int) -> str:
+    frames, rewards, infos = play(env, episode_seed)
+    return hashlib.sha256(frames.tobytes() + json.dumps([rewards, infos]).encode()).hexdigest()
+
+
+@pytest.mark.parametrize("task", ["defend_the_center/complete", "health_gathering/lava+supreme+short_agent"])
+def test_an_episode_is_replayed_from_its_seed_alone(task: str):
+    env = DoomEnv(task)
+    first = fingerprint(env, 7)
+    assert fingerprint(env, 8) != first
+    assert fingerprint(env, 7) == first, "after another episode"
+    env.close()
+    recycled = DoomEnv(task, recycle_episodes=1)
+    assert fingerprint(recycled, 8) != first
+    assert fingerprint(recycled, 7) == first, "in a recycled engine"
+    recycled.close()
+    code = (
+        "import importlib.util, sys; spec = importlib.util.spec_from_file_location('t', sys.argv[1])\n"
+        "t = importlib.util.module_from_spec(spec); spec.loader.exec_module(t)\n"
+        "env = t.DoomEnv(sys.argv[2]); print(t.fingerprint(env, 7)); env.close()"
+    )
+    command = [sys.executable, "-c", code, __file__, task]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == first, "in another process"
+
+
+def test_without_fresh_engines_fuzzy_enemies_replay_the_same_game_but_for_their_shimmer():
+    env = DoomEnv("defend_the_center/fuzzy_enemies", recycle_episodes=0)
+    played = [play(env, 7) for _ in range(3)]
+    env.close()
+    for frames, rewards, infos in played[1:]:
+        assert (rewards, infos) == played[0][1:]
+        assert 0 < (frames != played[0][0]).any(-1).mean() < 0.02, "fresh engines would not be needed, or do not help"
+
+
+def test_a_seed_gives_a_sequence_of_episodes(shared: DoomEnv):
+    def seeds(seed: int | None) -> list[int]:
+        first = shared.reset(seed=seed)[1]["episode_seed"]
+        return [first, *(shared.reset()[1]["episode_seed"] for _ in range(3))]
+
+    one = seeds(5)
+    assert len(set(one)) == 4
+    assert seeds(5) == one
+    assert not set(seeds(6)) & set(one)
+    shared.reset(seed=5)
+    shared.reset(options={"episode_seed": 77})
+    assert shared.reset()[1]["episode_seed"] == one[1], "a replay does not move the sequence"
+
+
+# ------------------------------------------------------------------------------------------------- crashes
+
+
+def test_a_crash_truncates_the_episode_and_the_next_one_is_whole():
+    env = DoomEnv("defend_the_center/default")
+    whole = fingerprint(env, 7)
+    env.reset(seed=1)
+    before = env.step(TURN)
+    assert env._engine is not None
+    env._engine.kill()
+    observation, reward, terminated, truncated, info = env.step(TURN)
+    np.testing.assert_array_equal(observation, before[0])
+    assert (reward, terminated, truncated) == (0.0, False, True)
+    assert info["engine_crash"] is True
+    assert "crash" in info["engine_error"]
+    assert info["episode_frames"] == before[4]["episode_frames"]
+    assert set(info["reward_components"].values()) == {0.0}
+    with pytest.raises(ResetNeeded):
+        env.step(TURN)
+    assert fingerprint(env, 7) == whole
+    env.close()
+
+
+def test_an_engine_that_died_between_episodes_is_replaced():
+    env = DoomEnv("defend_the_center/default")
+    whole = fingerprint(env, 7)
+    assert env._engine is not None
+    env._engine.kill()
+    assert fingerprint(env, 7) == whole
+    env.close()
+
+
+def test_crash_upon_crash_is_an_error():
+    env = DoomEnv("defend_the_center/default")
+
+    def crash() -> dict:
+        env.reset(seed=1)
+        assert env._engine is not None
+        env._engine.kill()
+        return env.step(TURN)[4]
+
+    assert all(crash()["engine_crash"] for _ in range(3))
+    with pytest.raises(EngineError, match=r"default: 4 engine crashes without a whole episode between; the last:"):
+        crash()
+    env.close()
+
+
+def test_a_whole_episode_makes_crashes_forgotten():
+    env = DoomEnv("defend_the_center/default", frame_skip=35)
+    for _ in range(4):
+        env.reset(seed=1)
+        assert env._engine is not None
+        env._engine.kill()
+        env.step(TURN)
+        env.reset(seed=1)
+        idle_to_the_end(env)
+    env.close()
+
+
+def test_another_map_than_the_tasks_is_an_error():
+    env = DoomEnv("defend_the_center/default")
+    env._engine_config = DoomEnv("defend_the_center/gore")._engine_config
+    with pytest.raises(EngineError, match=r"default: .* runs a map with magic number \d+, want \d+"):
+        env.reset(seed=1)
+    env.close()
+
+
+def test_close_may_be_repeated_and_reset_starts_anew():
+    env = DoomEnv("defend_the_center/default")
+    env.close()
+    first = fingerprint(env, 7)
+    env.close()
+    env.close()
+    with pytest.raises(ResetNeeded):
+        env.step(0)
+    assert fingerprint(env, 7) == first
+    env.close()
+
+
+# ---------------------------------------------------------------------------------------- arguments, errors
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"task": "defend_the_center/blood"}, TaskError, "unknown attribute 'blood'"),
+        ({"frame_skp": 4}, ConfigError, r"unknown options \['frame_skp'\], want some of frame_height"),
+        ({"frame_skip": 0}, ConfigError, r"env.frame_skip: got 0, want 1\.\.35"),
+        ({"action_set": "all"}, ConfigError, "env.action_set: got 'all', want one of buttons, combinations, unified"),
+        ({"buffers": ("depth", "sound")}, ConfigError, "env.buffers: got .* want some of depth, labels, automap"),
+        ({"render_width": 300}, ConfigError, "got 300x144, want one of"),
+        ({"render_mode": "ansi"}, ValueError, "render_mode: got 'ansi'"),
+        ({"recycle_episodes": -1}, ValueError, "recycle_episodes: got -1, want 0 or more"),
+    ],
+)
+def test_wrong_arguments_fail_at_construction(options: dict, error: type[Exception], message: str):
+    with pytest.raises(error, match=message):
+        DoomEnv(**{"task": "defend_the_center/default", **options})
+
+
+def test_wrong_calls_say_what_is_wanted(shared: DoomEnv):
+    for options, message in (
+        ({"sed": 1}, r"unknown options \['sed'\]"),
+        ({"episode_seed": 2**31}, r"want 0\.\.2147483647"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            shared.reset(options=options)
+    shared.reset(seed=1)
+    for action in (-1, 3):
+        with pytest.raises(ValueError, match=f"action {action}, want 0..2"):
+            shared.step(action)
+
+
+def test_plain_data_makes_an_environment():
+    env = make_env("defend_the_center/default", {"frame_height": 42, "frame_width": 42, "buffers": []})
+    assert env.reset(seed=1)[0].shape == (42, 42, 3)
+    env.close()
+
+
+# ------------------------------------------------------------------------------------------------ rendering
+
+
+def test_human_mode_shows_a_window_at_game_speed(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = DoomEnv("defend_the_center/default", render_mode="human", frame_skip=7)
+    env.reset(seed=1)
+    window = env._window
+    assert window is not None
+    shown = window._pygame.surfarray.array3d(window._surface).swapaxes(0, 1)
+    assert env._engine is not None
+    scale = len(shown) // 144
+    np.testing.assert_array_equal(shown[::scale, ::scale], env._engine.screen)
+    start = time.monotonic()
+    for _ in range(5):
+        env.step(TURN)
+    assert 0.9 <= time.monotonic() - start < 3, "5 decisions of 7 tics are one second"
+    assert env.render() is None
+    env.close()
+
+
+def test_human_mode_without_a_display_says_so(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "no such driver")
+    env = DoomEnv("defend_the_center/default", render_mode="human")
+    with pytest.raises(ResourceError, match="render_mode human: no window can be opened"):
+        env.reset(seed=1)
+    env.close()
+
+
+# ------------------------------------------------------------------------------------------------- Gymnasium
+
+
+@pytest.mark.parametrize("task", named_tasks(), ids=str)
+def test_gymnasiums_checker_passes(task):
+    env = DoomEnv(task)
+    check_env(env, skip_render_check=True)
+    env.close()
+
+
+def test_gymnasiums_checker_passes_in_every_form():
+    for fields in (
+        {"action_set": "combinations"},
+        {"action_set": "unified", "buffers": ("depth",)},
+        {"grayscale": True},
+    ):
+        env = DoomEnv("seek_and_kill/default", render_mode="rgb_array", **fields)
+        check_env(env, skip_render_check=True)
+        env.close()
+
+
+def test_ids_are_names():
+    ids = [gymnasium_id(task) for task in named_tasks()]
+    assert len(set(ids)) == len(ids) == 76
+    assert gymnasium_id(parse_task("defend_the_center/default")) == "GViZDoom/DefendTheCenter-Default-v0"
+    assert (
+        gymnasium_id(parse_task("defend_the_center/mossy_bricks+gore"))
+        == "GViZDoom/DefendTheCenter-Gore-MossyBricks-v0"
+    )
+    assert gymnasium_id(parse_task("seek_and_kill/complete")) == "GViZDoom/SeekAndKill-Complete-v0"
+
+
+def test_every_named_task_is_registered():
+    gvz.register_envs()
+    gvz.register_envs()
+    for task in named_tasks():
+        spec = gymnasium.spec(gymnasium_id(task))
+        assert spec.kwargs == {"task": task.id}
+    env = gymnasium.make("GViZDoom/DefendTheCenter-Gore-v0", frame_skip=2, render_mode="rgb_array")
+    assert isinstance(env.unwrapped, DoomEnv)
+    env.reset(seed=1)
+    assert env.step(TURN)[4]["episode_frames"] == 2
+    assert env.render().shape == (144, 256, 3)
+    env.close()
+
+
+def test_gymnasium_knows_the_ids_without_importing_gvz():
+    code = "import gymnasium; print(gymnasium.spec('GViZDoom/DefendTheCenter-Gore-v0').entry_point)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "gvz.env:DoomEnv"
+
+
+def test_a_vector_environment_resets_itself_and_keeps_the_final_frame():
+    envs = gymnasium.vector.SyncVectorEnv(
+        [lambda: DoomEnv("defend_the_center/default", frame_skip=35)] * 2,
+        autoreset_mode=gymnasium.vector.AutoresetMode.SAME_STEP,
+    )
+    envs.reset(seed=1)
+    for _ in range(40):
+        observations, _, terminated, _, infos = envs.step(np.array([TURN, TURN]))
+        if terminated.any():
+            break
+    done = int(terminated.argmax())
+    assert infos["final_obs"][done].shape == (84, 84, 3)
+    assert (infos["final_obs"][done] != observations[done]).any()
+    envs.close()
+
+
+def test_frame_stacking_is_gymnasiums():
+    env = gymnasium.wrappers.FrameStackObservation(DoomEnv("defend_the_center/default"), 4)
+    observation, _ = env.reset(seed=1)
+    assert observation.shape == (4, 84, 84, 3)
+    env.close()
