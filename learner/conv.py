@@ -18,21 +18,19 @@ def conv2d(
     x: Float[Array, "B H W C"], kernel: Float[Array, "k k C F"], stride: int, form: Literal["direct", "shifted"]
 ) -> Float[Array, "B h w F"]:
     """Convolution without padding; h = (H - k) // stride + 1."""
-    return _shifted(x, kernel, stride) if form == "shifted" else _direct(x, kernel, stride)
-
-
-def _direct(x: Array, kernel: Array, stride: int) -> Array:
+    if form == "shifted":
+        return _shifted(x, kernel, stride)
     return jax.lax.conv_general_dilated(
         x, kernel, (stride, stride), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
     )
 
 
 def _shifted(x: Array, kernel: Array, stride: int) -> Array:
-    """One matrix product over all positions, then the sum of its shifted parts.
+    """One matrix product, with the k x k window's sum done by shifts before or after it.
 
-    With s = stride and q = ceil(k / s): the image becomes a grid of s x s blocks (s*s*C channels), the kernel a
-    q x q kernel of stride 1 over blocks. One product gives every block's contribution to each of the q*q offsets;
-    the output is the sum of the q*q parts, each read at its offset.
+    With s = stride and q = ceil(k / s), the image becomes a grid of s x s blocks (s*s*C channels), the kernel a q x q
+    kernel of stride 1 over blocks. What is moved by the q * q shifts is whichever is smaller: outputs (project every
+    block onto q*q*F outputs, then add up shifted parts) or inputs (put q*q shifted blocks side by side, then project).
     """
     b, height, width, c = x.shape
     k, _, _, f = kernel.shape
@@ -41,13 +39,15 @@ def _shifted(x: Array, kernel: Array, stride: int) -> Array:
     grid_h, grid_w = out_h + q - 1, out_w + q - 1
     pad_h, pad_w = max(0, grid_h * s - height), max(0, grid_w * s - width)
     x = jnp.pad(x[:, : grid_h * s, : grid_w * s], ((0, 0), (0, pad_h), (0, pad_w), (0, 0)))
-    x = x.reshape(b, grid_h, s, grid_w, s * c).swapaxes(2, 3).reshape(b * grid_h * grid_w, s * s * c)
+    x = x.reshape(b, grid_h, s, grid_w, s * c).swapaxes(2, 3).reshape(b, grid_h, grid_w, s * s * c)
     kernel = jnp.pad(kernel, ((0, q * s - k), (0, q * s - k), (0, 0), (0, 0)))
-    kernel = kernel.reshape(q, s, q, s, c, f).transpose(1, 3, 4, 0, 2, 5).reshape(s * s * c, q * q * f)
-    parts = (x @ kernel).reshape(b, grid_h, grid_w, q, q, f)
-    return sum(  # pyright: ignore[reportReturnType]
-        parts[:, i : i + out_h, j : j + out_w, i, j] for i in range(q) for j in range(q)
-    )
+    kernel = kernel.reshape(q, s, q, s, c, f).transpose(1, 3, 4, 0, 2, 5).reshape(s * s * c, q, q, f)
+    shifts = [(i, j) for i in range(q) for j in range(q)]
+    if f < s * s * c:
+        parts = jnp.einsum("bhwc,cijf->bhwijf", x, kernel)
+        return sum(parts[:, i : i + out_h, j : j + out_w, i, j] for i, j in shifts)  # pyright: ignore
+    windows = jnp.stack([x[:, i : i + out_h, j : j + out_w] for i, j in shifts], axis=-1)
+    return jnp.einsum("bhwcq,cqf->bhwf", windows, kernel.reshape(s * s * c, q * q, f))
 
 
 class Conv(nn.Module):
@@ -76,7 +76,7 @@ class Conv(nn.Module):
         y = jax.lax.platform_dependent(
             x,
             kernel,
-            cpu=lambda x, w: _shifted(x, w, self.stride),
-            default=lambda x, w: _direct(x, w, self.stride),
+            cpu=lambda x, w: conv2d(x, w, self.stride, "shifted"),
+            default=lambda x, w: conv2d(x, w, self.stride, "direct"),
         )
         return y + bias

@@ -1,8 +1,10 @@
 """The Q-network: convolutions, then one or two streams of (noisy) dense layers. May import jax, flax, learner.conv.
 
 One module with switches serves every agent. Parameters are float32; activations may be bfloat16; outputs are
-float32. Noise is explicit: a layer is noisy only when it is given a key.
+float32. Noise is explicit: `add_noise` moves the parameters, or the network is given a key.
 """
+
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -13,59 +15,81 @@ from gvz.errors import ConfigError
 from learner.config import AgentConfig, Noisy
 from learner.conv import Conv
 
+Params = Any
+"""A pytree of float32 arrays: {"params": {layer: {name: array}}}."""
+
 
 class NoisyDense(nn.Module):
     """Dense layer y = (b + W x) + (b_noisy * eps_b + (W_noisy * eps_w) x). Source: thesis eq. 4.14.
 
-    Factorized noise is eps_w = f(e_in) f(e_out)^T, eps_b = f(e_out), f(e) = sign(e) sqrt|e|, e ~ N(0, 1); the noisy
-    product is then ((x * f(e_in)) W_noisy) * f(e_out), a second matrix product without a noisy copy of the weights,
-    and every row of the batch may have noise of its own. Independent noise draws every entry of eps_w, eps_b.
+    Factorized noise is eps_w = f(e_in) f(e_out)^T and eps_b = f(e_out) with f(e) = sign(e) sqrt|e| and e ~ N(0, 1);
+    independent noise is N(0, 1) for every entry. Source: Fortunato et al. 2018, section 3.
 
-    Source: Fortunato et al. 2018, sections 3 (a) and (b). Differs: sigma starts at `noisy_sigma` in both forms (the
-    paper has 0.017 for independent and 0.5 / sqrt(inputs) for factorized noise, 0.009 and 0.022 for this network's
-    layers of 3136 and 512 inputs; the thesis's text asks for 0.017), and the means start He-uniform (thesis 4.1.5).
+    One draw for a whole batch is `add_noise`. With a key, this layer itself draws factorized noise for every row of
+    the batch: ((x * f(e_in)) W_noisy) * f(e_out) needs no copy of the weights per row.
+
+    Differs: sigma starts at `sigma` in both forms (the paper has 0.017 for independent noise and 0.5 / sqrt(inputs)
+    for factorized, 0.009 and 0.022 for this network's layers of 3136 and 512 inputs; the thesis asks for 0.017), and
+    the means start He-uniform (thesis 4.1.5).
 
     Attributes:
         features: number of outputs.
-        noisy: form of the noise; off makes it a plain dense layer.
+        noisy: whether the layer has noisy weights at all.
         sigma: initial value of every noisy weight and bias.
     """
 
     features: int
-    noisy: Noisy
+    noisy: bool
     sigma: float
 
     @nn.compact
-    def __call__(
-        self, x: Float[Array, "B P"], key: PRNGKeyArray | None, *, noise_per_sample: bool = False
-    ) -> Float[Array, "B Q"]:
-        """Applies the layer.
-
-        Args:
-            x: inputs.
-            key: draws the noise; None uses the means alone.
-            noise_per_sample: a draw for every row (factorized only), else one for the whole batch.
-        """
+    def __call__(self, x: Float[Array, "B P"], key: PRNGKeyArray | None = None) -> Float[Array, "B Q"]:
+        """Applies the layer: by its means, or with a key by noise of each row's own."""
         shape = (x.shape[-1], self.features)
         kernel = self.param("kernel", nn.initializers.he_uniform(), shape).astype(x.dtype)
         bias = self.param("bias", nn.initializers.zeros, shape[1:]).astype(x.dtype)[None]
         y = x @ kernel + bias
-        if self.noisy == "off":
+        if not self.noisy:
             return y
         sigma = nn.initializers.constant(self.sigma)
         kernel_sigma = self.param("kernel_sigma", sigma, shape).astype(x.dtype)
         bias_sigma = self.param("bias_sigma", sigma, shape[1:]).astype(x.dtype)[None]
         if key is None:
             return y
-        key_in, key_out = jax.random.split(key)
-        if self.noisy == "independent":
-            eps_w = jax.random.normal(key_in, shape, x.dtype)
-            eps_b = jax.random.normal(key_out, (1, self.features), x.dtype)
-            return y + x @ (kernel_sigma * eps_w) + bias_sigma * eps_b
-        rows = x.shape[0] if noise_per_sample else 1
-        eps_in = _signed_sqrt(jax.random.normal(key_in, (rows, shape[0]), x.dtype))
-        eps_out = _signed_sqrt(jax.random.normal(key_out, (rows, shape[1]), x.dtype))
-        return y + ((x * eps_in) @ kernel_sigma + bias_sigma) * eps_out
+        e = _signed_sqrt(jax.random.normal(key, (x.shape[0], sum(shape)), x.dtype))
+        e_in, e_out = e[:, : shape[0]], e[:, shape[0] :]
+        return y + ((x * e_in) @ kernel_sigma + bias_sigma) * e_out
+
+
+def add_noise(params: Params, key: PRNGKeyArray, noisy: Noisy) -> Params:
+    """Parameters whose means are moved by one draw of noise: the network of these, applied without a key, is noisy.
+
+    Differentiable in both the means and the sigmas. One draw serves any number of batches.
+
+    Args:
+        params: of a `QNetwork`.
+        key: draws the noise of all layers.
+        noisy: form of the noise; off returns `params`.
+
+    Source: thesis eq. 4.14, W + W_noisy * eps_w and b + b_noisy * eps_b.
+    """
+    layers = {name: layer for name, layer in params["params"].items() if "kernel_sigma" in layer}
+    if noisy == "off":
+        return params
+    moved = {}
+    for (name, layer), key_layer in zip(layers.items(), jax.random.split(key, len(layers)), strict=True):
+        P, Q = layer["kernel"].shape
+        if noisy == "factorized":
+            e = _signed_sqrt(jax.random.normal(key_layer, (P + Q,)))
+            eps_w, eps_b = e[:P, None] * e[None, P:], e[P:]
+        else:
+            e = jax.random.normal(key_layer, (P + 1, Q))
+            eps_w, eps_b = e[:P], e[P]
+        moved[name] = layer | {
+            "kernel": layer["kernel"] + layer["kernel_sigma"] * eps_w,
+            "bias": layer["bias"] + layer["bias_sigma"] * eps_b,
+        }
+    return {"params": params["params"] | moved}
 
 
 def _signed_sqrt(e: Array) -> Array:
@@ -90,43 +114,34 @@ class QNetwork(nn.Module):
 
     @nn.compact
     def __call__(
-        self,
-        obs: UInt8[Array, "B H W C"],
-        task: Int[Array, "B"],
-        key: PRNGKeyArray | None = None,
-        *,
-        noise_per_sample: bool = False,
+        self, obs: UInt8[Array, "B H W C"], task: Int[Array, "B"], key: PRNGKeyArray | None = None
     ) -> Float[Array, "B A N"]:
+        """Applies the network: by its means, or with a key by noise of each row's own."""
         config, dtype = self.config, jnp.dtype(self.config.activation_dtype)
         x = obs.astype(dtype) / 255
-        for i, (channels, kernel, stride) in enumerate(
-            zip(config.conv_channels, config.conv_kernels, config.conv_strides, strict=True)
-        ):
+        layers = zip(config.conv_channels, config.conv_kernels, config.conv_strides, strict=True)
+        for i, (channels, kernel, stride) in enumerate(layers):
             x = nn.relu(Conv(channels, kernel, stride, config.conv_form, name=f"conv_{i}")(x))
         x = x.reshape(x.shape[0], -1)
         if config.task_conditioned:
             x = jnp.concatenate([x, jax.nn.one_hot(task, self.num_tasks, dtype=dtype)], axis=-1)
+        keys = (None, None) if key is None else jax.random.split(key)
         num_atoms = config.num_atoms if config.distributional else 1
         if not config.dueling:
-            q = self._stream("q", x, self.num_actions * num_atoms, key, noise_per_sample)
+            q = self._stream("q", x, self.num_actions * num_atoms, keys[0])
             return q.reshape(-1, self.num_actions, num_atoms).astype(jnp.float32)
-        value = self._stream("value", x, num_atoms, key, noise_per_sample)[:, None, :]  # [B, 1, N]
-        advantage = self._stream("advantage", x, self.num_actions * num_atoms, key, noise_per_sample)
+        value = self._stream("value", x, num_atoms, keys[0])[:, None, :]  # [B, 1, N]
+        advantage = self._stream("advantage", x, self.num_actions * num_atoms, keys[1])
         advantage = advantage.reshape(-1, self.num_actions, num_atoms)  # [B, A, N]
         return (value + advantage - advantage.mean(axis=1, keepdims=True)).astype(jnp.float32)
 
-    def _stream(self, name: str, x: Array, outputs: int, key: PRNGKeyArray | None, noise_per_sample: bool) -> Array:
-        """Hidden layer, rectifier, output layer; each layer's noise has a key of its own."""
-        config = self.config
-        if key is None:
-            keys = (None, None)
-        else:
-            keys = tuple(jax.random.split(jax.random.fold_in(key, 1 if name == "advantage" else 0)))
-        for layer, features, layer_key in zip(("hidden", "output"), (config.hidden_units, outputs), keys, strict=True):
-            dense = NoisyDense(features, config.noisy, config.noisy_sigma, name=f"{name}_{layer}")
-            x = dense(x, layer_key, noise_per_sample=noise_per_sample)
-            x = nn.relu(x) if layer == "hidden" else x
-        return x
+    def _stream(self, name: str, x: Array, num_outputs: int, key: PRNGKeyArray | None) -> Array:
+        """Hidden layer, rectifier, output layer."""
+        config, noisy = self.config, self.config.noisy != "off"
+        keys = (None, None) if key is None else jax.random.split(key)
+        hidden = NoisyDense(config.hidden_units, noisy, config.noisy_sigma, name=f"{name}_hidden")
+        output = NoisyDense(num_outputs, noisy, config.noisy_sigma, name=f"{name}_output")
+        return output(nn.relu(hidden(x, keys[0])), keys[1])
 
 
 def check_fits(config: AgentConfig, height: int, width: int) -> None:

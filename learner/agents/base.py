@@ -1,11 +1,11 @@
-"""What an agent is: four pure functions. May import jax, learner.config, learner.replay, gvz.registry.
+"""What an agent is: four pure functions. May import jax, learner.networks, learner.replay, gvz.registry.
 
 A third agent is one file beside this one that sets `AGENT` to something callable as `AGENT(config, spec)` which
 returns an `Agent`; its file name is its `agent.name`.
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +14,8 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
 from gvz.errors import ConfigError
 from gvz.registry import discover
 from learner.config import AgentConfig
+from learner.networks import Params
 from learner.replay import Transitions
-
-Params = Any
-"""A pytree of float32 arrays."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -14,7 +14,7 @@ from gvz.errors import ConfigError
 from learner import losses
 from learner.agents.base import AgentLoss, AgentSpec, Evaluation, Params, epsilon_greedy
 from learner.config import AgentConfig
-from learner.networks import QNetwork, check_fits
+from learner.networks import QNetwork, add_noise, check_fits
 from learner.replay import Transitions
 
 
@@ -42,12 +42,10 @@ class Rainbow:
         obs: UInt8[Array, "B H W C"],
         task: Int[Array, "B"],
         key: PRNGKeyArray | None = None,
-        *,
-        noise_per_sample: bool = False,
     ) -> Float[Array, "B A N"]:
-        """Logits of the return distributions; Q values (N = 1) if not distributional. No noise without a key."""
+        """Logits of the return distributions; Q values (N = 1) if not distributional. A key draws noise per row."""
         network = QNetwork(self.config, self.spec.num_actions, self.spec.num_tasks)
-        return jnp.asarray(network.apply(params, obs, task, key, noise_per_sample=noise_per_sample))
+        return jnp.asarray(network.apply(params, obs, task, key))
 
     def q_values(self, logits: Float[Array, "B A N"]) -> Float[Array, "B A"]:
         if not self.config.distributional:
@@ -66,9 +64,14 @@ class Rainbow:
         task: Int[Array, "B"],
         epsilon: Float[Array, ""],
     ) -> Int[Array, "B"]:
-        """Greedy in a freshly drawn noisy network (per game if factorized), then epsilon-greedy."""
-        key_noise, key_epsilon = (None, key) if self.config.noisy == "off" else jax.random.split(key)
-        logits = self.logits(params, obs, task, key_noise, noise_per_sample=True)
+        """Greedy in a freshly drawn noisy network, each game with noise of its own if factorized."""
+        if self.config.noisy == "off":
+            return epsilon_greedy(key, self.q_values(self.logits(params, obs, task)), epsilon)
+        key_noise, key_epsilon = jax.random.split(key)
+        if self.config.noisy == "factorized":
+            logits = self.logits(params, obs, task, key_noise)
+        else:
+            logits = self.logits(add_noise(params, key_noise, "independent"), obs, task)
         return epsilon_greedy(key_epsilon, self.q_values(logits), epsilon)
 
     def evaluate(self, params: Params, obs: UInt8[Array, "B H W C"], task: Int[Array, "B"]) -> Evaluation:
@@ -81,12 +84,13 @@ class Rainbow:
     def loss(self, online_params: Params, target_params: Params, key: PRNGKeyArray, batch: Transitions) -> AgentLoss:
         """One noise sample a batch for the online network, a fresh one for the target (Fortunato et al. 2018)."""
         key_online, key_target = jax.random.split(key)
-        logits_tm1 = self.logits(online_params, batch.obs_tm1, batch.task, key_online)
-        logits_t = self.logits(target_params, batch.obs_t, batch.task, key_target)
+        online = add_noise(online_params, key_online, self.config.noisy)
+        target = add_noise(target_params, key_target, self.config.noisy)
+        logits_tm1 = self.logits(online, batch.obs_tm1, batch.task)
+        logits_t = self.logits(target, batch.obs_t, batch.task)
         q_t_selector = None
         if self.config.double:
-            q_t_selector = self.q_values(self.logits(online_params, batch.obs_t, batch.task, key_online))
-            q_t_selector = jax.lax.stop_gradient(q_t_selector)
+            q_t_selector = self.q_values(self.logits(online, batch.obs_t, batch.task))
         q_tm1 = self.q_values(logits_tm1)
         if self.config.distributional:
             loss, priority = losses.categorical_q_learning(
