@@ -101,6 +101,7 @@ class ActorLoop:
 
     def step(self) -> None:
         """One decision for every game: writes one record each, then plays on. The ring must have the room."""
+        self._ring.beat(WriterState.ACTING)
         actions = self._policy.act(self._obs, self._tasks)
         self._write(actions)
         for game, action in zip(self.games, actions.tolist(), strict=True):
