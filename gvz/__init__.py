@@ -1,12 +1,17 @@
-"""GViZDoom: graded visual generalization in Doom, and a trainer for it."""
+"""GViZDoom: graded visual generalization in Doom, and a trainer for it.
+
+`import gvz` makes every named task known to Gymnasium: gymnasium.make("GViZDoom/DefendTheCenter-Gore-v0").
+"""
 
 from typing import TYPE_CHECKING, Any
+
+from gvz.registration import register_with_gymnasium
 
 if TYPE_CHECKING:
     from gvz.env import DoomEnv
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "make", "register_envs"]
+__all__ = ["__version__", "make"]
 
 
 def make(task: str, **options: Any) -> "DoomEnv":
@@ -21,8 +26,4 @@ def make(task: str, **options: Any) -> "DoomEnv":
     return DoomEnv(task, **options)
 
 
-def register_envs() -> None:
-    """Makes every named task known to gymnasium.make, where the installed plugin has not done it already."""
-    from gvz.registration import register_envs
-
-    register_envs()
+register_with_gymnasium()

@@ -1,12 +1,18 @@
-"""Gymnasium ids of the named tasks. Imports gvz.tasks; gymnasium when called."""
+"""Gymnasium ids of the named tasks. Imports the standard library; gymnasium and gvz.tasks when it registers."""
 
-from gvz.scenarios.base import Task
-from gvz.tasks import named_tasks
+import sys
+from importlib.machinery import ModuleSpec
+from importlib.util import find_spec
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from gvz.scenarios.base import Task
 
 NAMESPACE = "GViZDoom"
 
 
-def gymnasium_id(task: Task) -> str:
+def gymnasium_id(task: "Task") -> str:
     """The id of a task: "GViZDoom/DefendTheCenter-Gore-MossyBricks-v0"."""
     scenario = task.scenario.title.title().replace(" ", "")
     words = [word.replace("_", " ").title().replace(" ", "") for word in task.name.split("+")]
@@ -14,10 +20,43 @@ def gymnasium_id(task: Task) -> str:
 
 
 def register_envs() -> None:
-    """Makes every named task known to gymnasium.make. Gymnasium calls it by itself where gvizdoom is installed."""
+    """Makes every named task known to gymnasium.make."""
     import gymnasium
+
+    from gvz.tasks import named_tasks
 
     for task in named_tasks():
         name = gymnasium_id(task)
         if name not in gymnasium.registry:
             gymnasium.register(name, entry_point="gvz.env:DoomEnv", kwargs={"task": task.id})
+
+
+def register_with_gymnasium() -> None:
+    """`register_envs` now if gymnasium is loaded, else as soon as it is.
+
+    Gymnasium 1 has no plugins: a package registers when it is imported. But loading gymnasium for that takes half a
+    second, which the learner and `--help` need not pay.
+    """
+    if "gymnasium" in sys.modules:
+        register_envs()
+    elif not any(isinstance(finder, _GymnasiumFinder) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _GymnasiumFinder())
+
+
+class _GymnasiumFinder:
+    """An import hook, used once: finds gymnasium as ever and has the tasks registered after it is loaded."""
+
+    def find_spec(self, name: str, _path: object = None, _target: object = None) -> ModuleSpec | None:
+        if name != "gymnasium":
+            return None
+        sys.meta_path.remove(self)
+        spec = find_spec(name)
+        if spec is not None and spec.loader is not None:
+            load = spec.loader.exec_module
+
+            def load_and_register(module: ModuleType) -> None:
+                load(module)
+                register_envs()
+
+            spec.loader.exec_module = load_and_register
+        return spec

@@ -443,8 +443,6 @@ def test_ids_are_names():
 
 
 def test_every_named_task_is_registered():
-    gvz.register_envs()
-    gvz.register_envs()
     for task in named_tasks():
         spec = gymnasium.spec(gymnasium_id(task))
         assert spec.kwargs == {"task": task.id}
@@ -456,10 +454,28 @@ def test_every_named_task_is_registered():
     env.close()
 
 
-def test_gymnasium_knows_the_ids_without_importing_gvz():
-    code = "import gymnasium; print(gymnasium.spec('GViZDoom/DefendTheCenter-Gore-v0').entry_point)"
+@pytest.mark.parametrize(
+    ("imports", "prefix"),
+    [
+        ("import gymnasium, gvz", ""),
+        ("import gvz, gymnasium", ""),
+        ("import gvz.errors, gymnasium.spaces", ""),
+        ("import gymnasium", "gvz:"),
+        ("import gvz, gymnasium", "gvz:"),
+    ],
+)
+def test_ids_are_known_in_whatever_order_of_imports(imports: str, prefix: str):
+    code = f"{imports}; env = gymnasium.make('{prefix}GViZDoom/DefendTheCenter-Gore-v0'); print(env.unwrapped.task)"
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.stdout.strip() == "defend_the_center/gore", done.stderr
+
+
+def test_import_gvz_alone_loads_no_gymnasium():
+    code = "import gvz, sys; print([m for m in ('gymnasium', 'numpy', 'cv2') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout.strip() == "gvz.env:DoomEnv"
+    assert done.stdout.strip() == "[]"
 
 
 def test_a_vector_environment_resets_itself_and_keeps_the_final_frame():
