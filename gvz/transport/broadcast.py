@@ -12,7 +12,7 @@ import time
 
 import numpy as np
 
-from gvz.errors import WaitTimeoutError
+from gvz.errors import TransportError, WaitTimeoutError
 from gvz.transport.messages import ParamsHeader
 from gvz.transport.segment import ALIGN_BYTES, Fence, Segment, aligned, hash_layout
 
@@ -128,6 +128,7 @@ class BroadcastReader(_Board):
 
         Raises:
             WaitTimeoutError: overtaken by the writer again and again.
+            TransportError: the control words contradict each other.
         """
         if self._count[0] == self._seen:
             return None
@@ -148,6 +149,11 @@ class BroadcastReader(_Board):
                 layout_hash=self.layout_hash,
             )
             self._fence()
+            if ticket == 0:
+                raise TransportError(
+                    f"broadcast {self.name}: {count} publications, but slot {slot} was never written; its control "
+                    "words are damaged"
+                )
             if ticket % 2 == 0 and words[_TICKET] == ticket:
                 self._seen = count
                 return params, header

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from gvz.errors import TransportError, WaitTimeoutError
 from gvz.transport import broadcast
@@ -118,6 +120,19 @@ def test_a_version_that_never_becomes_whole_is_named(
     monkeypatch.setattr(broadcast, "_READ_TIMEOUT_S", 0.05)
     with pytest.raises(WaitTimeoutError, match="reader waited 0 s for a whole version; the writer overtook every"):
         reader.read()
+
+
+@settings(max_examples=100, deadline=None)
+@given(count=st.integers(1, 2**64 - 1))
+def test_publications_that_never_were_are_found(count: int):
+    name = f"gvz-test-{secrets.token_hex(6)}"
+    writer = BroadcastWriter.create(name, NUM_PARAMS, LAYOUT)
+    try:
+        np.memmap(Path("/dev/shm") / name, np.uint64, "r+", HEADER_BYTES, (8,))[0] = count
+        with pytest.raises(TransportError, match=f"{count} publications, but slot {(count - 1) % 3} was never written"):
+            BroadcastReader.attach(name, NUM_PARAMS, LAYOUT).read()
+    finally:
+        writer.close()
 
 
 def test_closing_removes_the_queue_and_can_be_repeated(writer: BroadcastWriter, reader: BroadcastReader, name: str):
