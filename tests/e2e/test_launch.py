@@ -106,7 +106,7 @@ def test_a_run_trains_to_its_end_and_goes_on_when_asked_for_more(tmp_path):
         verify(run / "checkpoints" / str(step))
     metrics = rows(run, "metrics.jsonl")
     assert [row["num_updates"] for row in metrics] == list(range(20, 201, 20))
-    for name in ("learner/loss", "actors/decisions_per_s", "actors/staleness_mean_updates", "replay/fill_share"):
+    for name in ("learner/loss", "actors/decisions_per_s", "actors/staleness_mean_versions", "replay/fill_share"):
         assert all(name in row for row in metrics), name
     episodes = rows(run, "episodes.jsonl")
     assert {row["task"] for row in episodes} <= {
