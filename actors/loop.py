@@ -78,6 +78,7 @@ class ActorLoop:
         """Starts every game: at its first episode, or where `state` says.
 
         Raises:
+            ConfigError: the environment's frames are not what the spec says.
             ResumeError: a game does not come to where it was.
         """
         spec = self._spec

@@ -18,6 +18,7 @@ import psutil
 import pytest
 from fake_env import FRAME_SHAPE, Checker, config
 
+from actors import supervisor
 from actors.config import ActorsConfig
 from actors.pool import ActorPool, PoolConfig
 from gvz import janitor
@@ -151,6 +152,24 @@ def test_a_dead_actor_is_replaced_and_nothing_published_is_lost(tmp_path: Path, 
     if fault == "segfault":
         assert "Fatal Python error: Segmentation fault" in died.traceback
         assert "fake_env.py" in died.traceback
+
+
+def test_many_kills_lose_nothing_and_leak_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(supervisor, "_STABLE_S", 0.0)  # no waiting: this actor is not to blame
+    pool_config = config(tmp_path, {})
+    with ActorPool(pool_config) as pool:
+        run = Run(pool, pool_config)
+        run.until_all_ready()
+        me = psutil.Process()
+        before = (me.num_fds(), len(me.children()), len(segments()))
+        for kill in range(6):
+            os.kill(pool.writer_statuses()[kill % 2].pid, signal.SIGKILL)
+            run.until(lambda wanted=kill + 1: pool.statistics().restarts == wanted)
+            run.until_all_ready()
+            run.play(300)
+        after = (me.num_fds(), len(me.children()), len(segments()))
+        assert pool.statistics().restarts == 6
+    assert after == before
 
 
 @pytest.mark.parametrize("fault", ["stop", "hang"])
