@@ -4,6 +4,7 @@ An engine that fails before its first frame takes its client with it. So a file 
 trusted. `python -m gvz.probe` is the sub-process.
 """
 
+import contextlib
 import re
 import resource
 import subprocess
@@ -78,7 +79,8 @@ def ensure_loads(wad: Path, map_name: str = "MAP01", timeout_s: float = 60.0) ->
     with one_of([f"probe-{place}"], time.monotonic() + timeout_s):
         if not marker.exists():
             probe_wad(wad, map_name, timeout_s)
-            marker.touch()
+            with contextlib.suppress(OSError):  # a directory we cannot write: probed again the next time
+                marker.touch()
 
 
 def _main(wad: str, map_name: str, log: str, timeout_s: float) -> None:

@@ -188,6 +188,10 @@ def test_a_hung_engine_is_killed_and_raises(call: str):
     assert traces(engine) == []
 
 
+def test_the_terminals_ctrl_c_is_not_for_the_engine(engine: Engine):
+    assert os.getpgid(engine.pid) == engine.pid != os.getpgid(0)
+
+
 def test_a_hung_engine_can_be_closed(engine: Engine):
     os.kill(engine.pid, signal.SIGSTOP)
     start = time.monotonic()
