@@ -248,6 +248,17 @@ def test_without_fresh_engines_fuzzy_enemies_replay_the_same_game_but_for_their_
         assert 0 < (frames != played[0][0]).any(-1).mean() < 0.02, "fresh engines would not be needed, or do not help"
 
 
+def test_engines_are_recycled_after_so_many_episodes():
+    env = DoomEnv("defend_the_center/default", recycle_episodes=2)
+    engines = []
+    for _ in range(5):
+        env.reset()
+        assert env._engine is not None
+        engines.append(env._engine.pid)
+    env.close()
+    assert engines[0] == engines[1] != engines[2] == engines[3] != engines[4]
+
+
 def test_a_seed_gives_a_sequence_of_episodes(shared: DoomEnv):
     def seeds(seed: int | None) -> list[int]:
         first = shared.reset(seed=seed)[1]["episode_seed"]
