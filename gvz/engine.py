@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from vizdoom import DoomGame, GameState
     from vizdoom import Label as Label
 
-
 _START_ATTEMPTS = 3
 _LOG_BYTES = 2**20
 """the engine prints a few lines an episode; beyond this size its log is emptied"""
@@ -107,7 +106,7 @@ class Engine:
         self._end = weakref.finalize(self, engine_process.end_if_ours, game, directory, os.getpid())
         instance = janitor.read_instance(directory)
         assert instance is not None, "an engine that answered has written its instance file"
-        self.pid, _, self.instance_id = instance
+        self.pid, self._process_start, self.instance_id = instance
         self._variables = game.get_available_game_variables()
         self.screen = _map_screen(game, self.instance_id)
         engine_process.watch(self)
@@ -196,7 +195,8 @@ class Engine:
     def kill(self) -> None:
         """Ends the engine's process at once, as a crash would. The object stays, to be closed."""
         with contextlib.suppress(ProcessLookupError):
-            os.kill(self.pid, signal.SIGKILL)
+            if janitor.process_start(self.pid) == self._process_start:  # else it is dead, and its number another's
+                os.kill(self.pid, signal.SIGKILL)
 
     def kill_overdue(self) -> None:
         """The watchdog's: ends the engine because it has not answered in time; the blocked call raises."""
@@ -253,9 +253,8 @@ def _make_game(config: EngineConfig) -> "DoomGame":
         sizes = ", ".join(f"{width}x{height}" for width, height in screen_resolutions())
         raise ConfigError(f"env.render_width, render_height: got {config.width}x{config.height}, want one of {sizes}")
     game = vizdoom.DoomGame()
-    game.set_doom_game_path(
-        str(Path(vizdoom.root_path, "freedoom2.wad"))
-    )  # else a doom2.wad lying about would be taken
+    # said, because else a doom2.wad in the working directory would be taken
+    game.set_doom_game_path(str(Path(vizdoom.root_path, "freedoom2.wad")))
     game.set_doom_scenario_path(str(config.wad.resolve()))
     game.set_doom_map(config.map_name)
     game.set_doom_skill(config.skill)

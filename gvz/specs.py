@@ -36,7 +36,7 @@ class EnvConfig:
     profile: Profile = "thesis"
     """whose numbers where they differ: the thesis's text, or LevDoom's maps and settings"""
     interpolation: Interpolation = "linear"
-    """how the rendered screen is shrunk; linear is ten times cheaper and loses nothing that matters (see observation.py)"""
+    """how the rendered screen is shrunk; linear is ten times cheaper and loses no enemy (see observation.py)"""
     buffers: tuple[Buffer, ...] = ()
     """more than the screen: observations become a dict of `screen` and these"""
 
