@@ -1,0 +1,91 @@
+"""Both forms of the convolution are one function with one set of parameters."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from learner.conv import Conv, conv2d
+
+# (image, channels, kernel, stride, features): the thesis's three layers, and shapes that do not divide evenly
+LAYERS = [
+    (84, 12, 8, 4, 32),
+    (20, 32, 4, 2, 64),
+    (9, 64, 3, 1, 64),
+    (43, 3, 5, 3, 6),
+    (11, 2, 3, 4, 5),
+    (6, 1, 6, 2, 2),
+]
+
+
+def oracle(x: np.ndarray, kernel: np.ndarray, stride: int) -> np.ndarray:
+    """The defining sum, in float64."""
+    k = kernel.shape[0]
+    out_h, out_w = ((n - k) // stride + 1 for n in x.shape[1:3])
+    y = np.zeros((len(x), out_h, out_w, kernel.shape[3]))
+    for i in range(out_h):
+        for j in range(out_w):
+            window = x[:, i * stride : i * stride + k, j * stride : j * stride + k].astype(np.float64)
+            y[:, i, j] = np.tensordot(window, kernel.astype(np.float64), axes=3)
+    return y
+
+
+@pytest.mark.parametrize("layer", LAYERS, ids=str)
+def test_forms_agree_to_float32_rounding_forward_and_backward(layer: tuple[int, int, int, int, int]):
+    size, channels, k, stride, features = layer
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(2, size, size, channels)).astype(np.float32)
+    kernel = rng.normal(size=(k, k, channels, features)).astype(np.float32)
+    wanted = oracle(x, kernel, stride)
+    g = rng.normal(size=wanted.shape).astype(np.float32)
+
+    @jax.jit
+    def both(x, kernel, g):
+        def run(form):
+            y, pull = jax.vjp(lambda x, kernel: conv2d(x, kernel, stride, form), x, kernel)
+            return y, *pull(g)
+
+        return run("direct"), run("shifted")
+
+    direct, shifted = both(x, kernel, g)
+    rounding = 3e-6 * np.sqrt(k * k * channels)
+    np.testing.assert_allclose(shifted[0], wanted, atol=rounding * 2, rtol=1e-5)
+    for name, a, b in zip(("output", "into x", "into kernel"), direct, shifted, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-6 * np.abs(a).max(), err_msg=name)
+
+
+@settings(max_examples=8, deadline=None)
+@given(
+    size=st.integers(3, 14),
+    k=st.integers(1, 6),
+    stride=st.integers(1, 5),
+    channels=st.integers(1, 3),
+    features=st.integers(1, 8),
+)
+def test_shifted_equals_the_defining_sum(size: int, k: int, stride: int, channels: int, features: int):
+    k = min(k, size)
+    rng = np.random.default_rng(size * 1000 + k * 100 + stride)
+    x = rng.normal(size=(1, size, size + 2, channels)).astype(np.float32)
+    kernel = rng.normal(size=(k, k, channels, features)).astype(np.float32)
+    y = jax.jit(conv2d, static_argnums=(2, 3))(x, kernel, stride, "shifted")
+    np.testing.assert_allclose(y, oracle(x, kernel, stride), atol=1e-4)
+
+
+def test_every_form_has_the_same_parameters():
+    x = jnp.zeros((1, 20, 20, 3))
+    trees = [jax.jit(Conv(6, 4, 2, form).init)(jax.random.key(0), x) for form in ("auto", "direct", "shifted")]
+    for tree in trees[1:]:
+        jax.tree.map(np.testing.assert_array_equal, trees[0], tree)
+    assert {name: leaf.shape for name, leaf in trees[0]["params"].items()} == {"kernel": (4, 4, 3, 6), "bias": (6,)}
+
+
+def test_auto_is_shifted_on_a_cpu_and_direct_elsewhere():
+    x = jax.ShapeDtypeStruct((1, 20, 20, 3), jnp.float32)
+    conv = Conv(6, 4, 2, "auto")
+    params = jax.eval_shape(conv.init, jax.random.key(0), x)
+    apply = jax.jit(conv.apply)
+    for platform, has_convolution in (("cpu", False), ("cuda", True)):
+        exported = jax.export.export(apply, platforms=[platform])(params, x)
+        assert ("stablehlo.convolution" in exported.mlir_module()) == has_convolution, platform

@@ -1,0 +1,187 @@
+"""The Q-network: sizes against the thesis, noise against its definition, dueling against eq. 4.10."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gvz.errors import ConfigError
+from learner.config import AgentConfig
+from learner.networks import NoisyDense, QNetwork, add_noise, check_fits
+
+DQN = AgentConfig(name="dqn", double=False, dueling=False, noisy="off", distributional=False)
+TINY = replace(
+    DQN, conv_channels=(3,), conv_kernels=(4,), conv_strides=(2,), hidden_units=6, num_atoms=5, noisy_sigma=0.5
+)
+OBS = (10, 10, 2)
+
+
+def shapes(config: AgentConfig, obs_shape: tuple[int, ...] = (84, 84, 12), num_tasks: int = 1) -> dict[str, dict]:
+    network = QNetwork(config, num_actions=3, num_tasks=num_tasks)
+    obs, task = jax.ShapeDtypeStruct((1, *obs_shape), jnp.uint8), jax.ShapeDtypeStruct((1,), jnp.int32)
+    params = jax.eval_shape(network.init, jax.random.key(0), obs, task)["params"]
+    return {layer: {name: leaf.shape for name, leaf in leaves.items()} for layer, leaves in params.items()}
+
+
+def count(tree: dict[str, dict]) -> int:
+    return sum(int(np.prod(shape)) for layer in tree.values() for shape in layer.values())
+
+
+@cache
+def tiny(config: AgentConfig):
+    """A small network: its parameters, apply(params, obs, task, key=None), observations and tasks."""
+    network = QNetwork(config, num_actions=3, num_tasks=2)
+    obs = jnp.asarray(np.random.default_rng(0).integers(0, 256, (4, *OBS), dtype=np.uint8))
+    task = jnp.array([0, 1, 0, 1])
+    return jax.jit(network.init)(jax.random.key(0), obs, task), jax.jit(network.apply), obs, task
+
+
+def test_dqn_has_the_thesis_layers():
+    # 4.1.5: three convolutions with a falling kernel size, flattened to 7 * 7 * 64, one hidden layer, one output each.
+    assert shapes(DQN) == {
+        "conv_0": {"kernel": (8, 8, 12, 32), "bias": (32,)},
+        "conv_1": {"kernel": (4, 4, 32, 64), "bias": (64,)},
+        "conv_2": {"kernel": (3, 3, 64, 64), "bias": (64,)},
+        "q_hidden": {"kernel": (3136, 512), "bias": (512,)},
+        "q_output": {"kernel": (512, 3), "bias": (3,)},
+    }
+
+
+@pytest.mark.parametrize(
+    ("config", "wanted"),
+    [
+        (DQN, 94_368 + 1_606_144 + 1_539),
+        (replace(DQN, hidden_units=4096), 94_368 + 12_849_152 + 12_291),
+        (replace(DQN, dueling=True), 94_368 + 2 * 1_606_144 + 1_539 + 513),
+        (replace(DQN, noisy="factorized"), 94_368 + 2 * (1_606_144 + 1_539)),
+        (replace(DQN, distributional=True), 94_368 + 1_606_144 + 51 * 1_539),
+        (AgentConfig(), 94_368 + 2 * (2 * 1_606_144 + 51 * (1_539 + 513))),
+    ],
+    ids=["dqn", "hidden 4096", "dueling", "noisy", "distributional", "rainbow"],
+)
+def test_parameter_counts_are_the_sums_worked_by_hand(config: AgentConfig, wanted: int):
+    # Convolutions have 24,608 + 32,832 + 36,928 = 94,368, the hidden layer 3136 * 512 + 512 = 1,606,144 parameters.
+    assert count(shapes(config)) == wanted
+
+
+def test_task_conditioning_appends_a_one_hot_of_the_task():
+    config = replace(TINY, task_conditioned=True)
+    assert shapes(config, OBS, num_tasks=2)["q_hidden"]["kernel"] == (4 * 4 * 3 + 2, 6)
+    params, apply, obs, _ = tiny(config)
+    plain = [apply(params, obs, jnp.full(4, z)) for z in (0, 1)]
+    assert float(jnp.abs(plain[0] - plain[1]).max()) > 1e-4
+    # Without the rows that the one-hot selects, the task makes no difference.
+    hidden = params["params"]["q_hidden"]
+    deaf = params["params"] | {"q_hidden": hidden | {"kernel": hidden["kernel"].at[-2:].set(0.0)}}
+    np.testing.assert_array_equal(*[apply({"params": deaf}, obs, jnp.full(4, z)) for z in (0, 1)])
+
+
+def test_without_task_conditioning_the_task_is_ignored():
+    params, apply, obs, _ = tiny(TINY)
+    np.testing.assert_array_equal(apply(params, obs, jnp.zeros(4, int)), apply(params, obs, jnp.ones(4, int)))
+
+
+def test_weights_start_he_uniform_and_biases_zero():
+    obs = jnp.zeros((1, 84, 84, 12), jnp.uint8)
+    params = jax.jit(QNetwork(DQN, 3, 1).init)(jax.random.key(0), obs, jnp.zeros(1, int))
+    for name, fan_in in (("conv_0", 768), ("conv_1", 512), ("conv_2", 576), ("q_hidden", 3136), ("q_output", 512)):
+        kernel, bound = np.asarray(params["params"][name]["kernel"]), np.sqrt(6 / fan_in)
+        assert np.abs(kernel).max() <= bound
+        assert abs(kernel.std() / (bound / np.sqrt(3)) - 1) < 0.03, name
+        assert not np.any(params["params"][name]["bias"])
+
+
+def test_dueling_takes_off_the_mean_advantage():
+    config = replace(TINY, dueling=True, distributional=True)
+    params, apply, obs, task = tiny(config)
+    logits = apply(params, obs, task)
+    assert logits.shape == (4, 3, 5)
+    # The mean over actions of V + A - mean A is V: no advantage can change it, and no value a difference of actions.
+    p = params["params"]
+    louder = p | {"advantage_output": jax.tree.map(lambda w: 3 * w, p["advantage_output"])}
+    changed = apply({"params": louder}, obs, task)
+    assert float(jnp.abs(changed - logits).max()) > 0.01
+    np.testing.assert_allclose(changed.mean(1), logits.mean(1), rtol=1e-4, atol=1e-5)
+    higher = p | {"value_output": p["value_output"] | {"bias": p["value_output"]["bias"] + 2}}
+    np.testing.assert_allclose(apply({"params": higher}, obs, task), logits + 2, rtol=1e-5, atol=1e-5)
+
+
+def test_pixels_are_scaled_to_one():
+    params, apply, _, task = tiny(TINY)
+    p = jax.tree.map(np.asarray, params["params"])
+    # A white image is all ones, and its convolution the kernel's sum at each of 4 x 4 positions.
+    features = np.tile(np.maximum(p["conv_0"]["kernel"].sum(axis=(0, 1, 2)), 0), 16)
+    q = np.maximum(features @ p["q_hidden"]["kernel"], 0) @ p["q_output"]["kernel"]
+    white = jnp.full((4, *OBS), 255, jnp.uint8)
+    np.testing.assert_allclose(apply(params, white, task)[0, :, 0], q, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("noisy", ["factorized", "independent"])
+def test_noise_moves_weights_by_sigma_times_epsilon(noisy):
+    layer = {
+        "kernel": jnp.zeros((300, 200)),
+        "bias": jnp.zeros(200),
+        "kernel_sigma": jnp.full((300, 200), 2.0),
+        "bias_sigma": jnp.full(200, 3.0),
+    }
+    params = {"params": {"hidden": layer, "conv": {"kernel": jnp.ones((1, 1, 1, 1))}}}
+    moved = jax.jit(add_noise, static_argnums=2)(params, jax.random.key(3), noisy)["params"]
+    np.testing.assert_array_equal(moved["conv"]["kernel"], params["params"]["conv"]["kernel"])
+    eps_w, eps_b = np.asarray(moved["hidden"]["kernel"] / 2.0), np.asarray(moved["hidden"]["bias"] / 3.0)
+    if noisy == "independent":
+        assert np.linalg.matrix_rank(eps_w) == 200
+        assert abs(eps_w.std() - 1) < 0.02
+    else:
+        # f(e_in) f(e_out)^T has rank 1, and its bias noise is f(e_out): every row is a multiple of eps_b.
+        assert np.linalg.matrix_rank(eps_w) == 1
+        f_in = eps_w[:, 0] / eps_b[0]
+        np.testing.assert_allclose(eps_w, np.outer(f_in, eps_b), rtol=1e-4, atol=1e-5)
+        # E[f(e)^2] = E|e| = sqrt(2 / pi)
+        assert abs((f_in**2).mean() - np.sqrt(2 / np.pi)) < 0.1
+    assert abs(eps_w.mean()) < 0.1
+
+
+def test_noise_per_row_equals_noise_on_the_parameters_row_by_row():
+    layer = NoisyDense(7, noisy=True, sigma=0.3)
+    x = np.random.default_rng(0).normal(size=(3, 5)).astype(np.float32)
+    variables = jax.jit(layer.init)(jax.random.key(1), x)
+    key, apply = jax.random.key(2), jax.jit(layer.apply)
+    y = apply(variables, x, key)
+    p = jax.tree.map(np.asarray, variables["params"])
+    e = np.asarray(jax.random.normal(key, (3, 12)))
+    f = np.sign(e) * np.sqrt(np.abs(e))
+    for row in range(3):
+        kernel = p["kernel"] + p["kernel_sigma"] * np.outer(f[row, :5], f[row, 5:])
+        bias = p["bias"] + p["bias_sigma"] * f[row, 5:]
+        np.testing.assert_allclose(y[row], x[row] @ kernel + bias, rtol=1e-4, atol=1e-5)
+    assert len(np.unique(np.asarray(apply(variables, x[:1].repeat(3, 0), key))[:, 0])) == 3
+
+
+def test_noise_is_different_for_every_key_and_gone_without_one():
+    params, apply, obs, task = tiny(replace(TINY, noisy="factorized", dueling=True))
+    a, b = (apply(params, obs, task, jax.random.key(i)) for i in (0, 1))
+    assert float(jnp.abs(a - b).max()) > 1e-3
+    np.testing.assert_array_equal(apply(params, obs, task), apply(params, obs, task))
+    quiet = jax.tree_util.tree_map_with_path(lambda path, w: w * ("sigma" not in jax.tree_util.keystr(path)), params)
+    np.testing.assert_allclose(apply(quiet, obs, task, jax.random.key(0)), apply(params, obs, task), atol=1e-6)
+
+
+def test_bfloat16_activations_keep_float32_parameters_and_outputs():
+    config = replace(TINY, dueling=True, noisy="factorized", distributional=True)
+    params, apply, obs, task = tiny(config)
+    half_params, half_apply, _, _ = tiny(replace(config, activation_dtype="bfloat16"))
+    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(half_params))
+    logits = half_apply(params, obs, task)
+    assert logits.dtype == jnp.float32
+    np.testing.assert_allclose(logits, apply(params, obs, task), atol=0.05)
+    assert float(jnp.abs(logits - apply(params, obs, task)).max()) > 0
+
+
+def test_frames_too_small_for_the_convolutions_are_refused():
+    check_fits(DQN, 84, 84)
+    check_fits(DQN, 36, 36)
+    with pytest.raises(ConfigError, match=r"conv_kernels\[2\]: got 3, want at most 2, .* 2x3 image"):
+        check_fits(DQN, 35, 36)
