@@ -78,21 +78,27 @@ class ReplayOracle:
             t -= 1
         return t
 
-    def anchors(self) -> dict[int, tuple[int, int]]:
-        """Slot -> (lane, index in its stream) of every transition that is complete and still stored."""
-        found = {}
+    def drawable(self) -> set[int]:
+        """The slots of all transitions that are complete and still stored."""
+        found = set()
         L = self.spec.lane_capacity
         for lane, stream in enumerate(self.streams):
             oldest = max(0, len(stream) - L)
             for t in range(oldest, len(stream)):
                 oldest_frame = max(self.episode_start(lane, t), t - self.spec.stack_size + 1)
                 if oldest_frame >= oldest and self.window(lane, t) is not None:
-                    found[lane * L + t % L] = (lane, t)
+                    found.add(lane * L + t % L)
         return found
 
-    def transition(self, lane: int, t: int) -> Expected:
-        stream, m = self.streams[lane], self.window(lane, t)
-        assert m is not None
+    def transition(self, slot: int) -> Expected:
+        """What the newest record in a slot is the anchor of."""
+        lane, position = divmod(slot, self.spec.lane_capacity)
+        stream = self.streams[lane]
+        t = len(stream) - 1
+        while t % self.spec.lane_capacity != position:
+            t -= 1
+        m = self.window(lane, t)
+        assert m is not None, f"slot {slot} holds no complete transition"
         return Expected(
             obs_tm1=stream[t].observation,
             a_tm1=stream[t].action,
