@@ -118,8 +118,8 @@ class InlinePool:
             waited_for_records_s=0.0,
         )
 
-    def close(self) -> None:
-        """Closes every game. Can be repeated."""
+    def close(self, *, grace_s: float = 0.0) -> None:
+        """Closes every game, now: `grace_s` is for processes, of which there are none. Can be repeated."""
         self._loop.close()
         self._writer.close()
         self._ring.close()

@@ -89,6 +89,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except GvzError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:  # a second signal while the run was being set up or taken down
+        print("stopped at once", file=sys.stderr)
+        return 130
 
 
 if __name__ == "__main__":

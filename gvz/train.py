@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from actors.inline import InlinePool
-from actors.pool import ActorPool
+from actors.pool import STOP_TIMEOUT_S, ActorPool
 from gvz import bill, janitor
 from gvz.assemble import Parts, Pool, assemble
 from gvz.cache import xla_cache_directory
@@ -131,10 +131,10 @@ class Trainer:
         self._save(force=True)
 
     def close(self, *, abandon_save: bool = False) -> None:
-        """Ends every actor, waits for the checkpoint (or abandons it), closes the records. Can be repeated."""
-        self._pool.close()
+        """Ends every actor, waits for the checkpoint (or abandons both), closes the records. Can be repeated."""
         if abandon_save:
             self._checkpointer.abandon()
+        self._pool.close(grace_s=0.0 if abandon_save else STOP_TIMEOUT_S)
         self._checkpointer.wait()
         self._report_save()
         self._telemetry.close()
