@@ -8,9 +8,9 @@ import jax
 
 from actors.inline import InlinePool
 from actors.pool import ActorPool, PoolConfig
+from gvz.actions import num_actions
 from gvz.bill import Bill
 from gvz.config import RunConfig
-from gvz.env import num_actions
 from gvz.scenarios.compiler import compile_task
 from learner import replay
 from learner.agents.base import Agent, AgentSpec, make_agent

@@ -88,6 +88,8 @@ class RunConfig:
         if not 0 <= self.seed < 2**31:
             raise ConfigError(f"seed: got {self.seed}, want 0..{2**31 - 1}")
         _check_finite("", self)
+        if self.env.buffers:
+            raise ConfigError(f"env.buffers: got {self.env.buffers}, want none: the trainer's agents see frames alone")
         self.resolved_tasks()
         if self.learner.warmup_steps > self.replay.capacity:
             raise ConfigError(

@@ -105,6 +105,7 @@ BAD = {
     "--actors.num-actors 1 --actors.games-per-actor 2": "every task needs a game: want at least 4",
     "--checkpoint.keep 0": "checkpoint.keep: got 0",
     "--log.period-updates 0": "log.period_updates: got 0",
+    "--env.buffers depth": "env.buffers: got ('depth',), want none",
     "--env.frame-skip 99": "env.frame_skip: got 99",
     "--name a/b": "name: got 'a/b'",
 }
