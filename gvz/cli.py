@@ -65,8 +65,8 @@ class Evaluate:
               gvz evaluate --run runs/rainbow_4task/seed_1111 --checkpoint newest --split test
     """
 
-    player: Literal["random", "idle"] | None = None
-    """random: uniformly random buttons; idle: presses nothing"""
+    player: Literal["random", "idle", "scripted"] | None = None
+    """random: uniformly random buttons; idle: presses nothing; scripted: the scenario's simple script"""
     run: Path | None = None
     """a run directory: its policy plays greedily, noise off; by default the test tasks of its scenario"""
     checkpoint: str = "newest"

@@ -1,5 +1,5 @@
-"""Who plays an evaluation episode: chance, nobody, or a trained policy. Imports numpy, actors.preprocess;
-actors.policy where there is a policy to load.
+"""Who plays an evaluation episode: chance, nobody, a script, or a trained policy. Imports numpy, gymnasium,
+gvz.evaluation.scripted; actors.policy where there is a policy to load.
 
 A `PlayerSpec` is data that travels to worker processes; `make_player` makes the player there.
 """
@@ -12,6 +12,7 @@ import numpy as np
 
 from actors.preprocess import push_frame, start_stack
 from gvz.errors import ConfigError
+from gvz.evaluation.scripted import ScriptedPlayer
 from gvz.specs import EnvConfig
 from gvz.transport.messages import ParamsHeader
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from gvz.env import DoomEnv
     from gvz.observation import Observation
 
-PlayerKind = Literal["random", "idle", "policy"]
+PlayerKind = Literal["random", "idle", "scripted", "policy"]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -118,6 +119,8 @@ def make_player(spec: PlayerSpec) -> Player:
             return RandomPlayer()
         case "idle":
             return IdlePlayer()
+        case "scripted":
+            return ScriptedPlayer()
         case "policy":
             return PolicyPlayer(spec)
         case _:
@@ -125,11 +128,20 @@ def make_player(spec: PlayerSpec) -> Player:
 
 
 def player_env(kind: PlayerKind, env: EnvConfig) -> EnvConfig:
-    """`env` with what a player of this kind needs: the idle one a button-free action."""
+    """`env` as a player of this kind needs it.
+
+    Chance and nobody look at nothing: they get the smallest screen, which changes no score. The idle one needs the
+    action without a button, the scripted one labels on the default screen, by whose pixels it aims.
+    """
+    blind = dataclasses.replace(env, render_width=160, render_height=120)
     match kind:
+        case "random":
+            return blind
         case "idle":
-            return dataclasses.replace(env, action_set="combinations")
-        case "random" | "policy":
+            return dataclasses.replace(blind, action_set="combinations")
+        case "scripted":
+            return dataclasses.replace(env, action_set="buttons", buffers=("labels",))
+        case "policy":
             return env
         case _:
             assert_never(kind)

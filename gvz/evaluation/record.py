@@ -94,6 +94,9 @@ def play_and_record(
     Raises:
         GvzError: an episode could not be played.
     """
-    for row in play(jobs, spec, dataclasses.asdict(env), num_workers=num_workers):
+    options = dataclasses.asdict(env)
+    if spec.kind != "policy":
+        options["recycle_episodes"] = 0  # a fresh engine makes fuzz look the same again: only a policy looks at it
+    for row in play(jobs, spec, options, num_workers=num_workers):
         file.append({**identity, **row})
         yield file.rows[-1]
