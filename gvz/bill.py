@@ -11,12 +11,12 @@ from gvz.errors import ResourceError
 SHARED_MEMORY = Path("/dev/shm")
 ENGINE_SHM_BYTES = 11_000_000
 """the engine's own shared files; measured 10.8 MB at every render size (vizdoom 1.3.2)"""
-ENGINE_MEMORY_BYTES = 110_000_000
-"""resident memory of one engine and its client side, without shared files (measured 2026-11, x86-64)"""
-ACTOR_MEMORY_BYTES = 330_000_000
-"""resident memory of an actor process with jax loaded (measured 2026-11, x86-64)"""
-LEARNER_MEMORY_BYTES = 900_000_000
-"""resident memory of the learner with jax and its compiled programs, without replay (measured 2026-11, x86-64)"""
+ENGINE_MEMORY_BYTES = 20_000_000
+"""proportional set size of one engine and its client side, without shared files (measured 2026-11, x86-64)"""
+ACTOR_MEMORY_BYTES = 270_000_000
+"""proportional set size of an actor process with jax loaded (measured 2026-11, x86-64)"""
+LEARNER_MEMORY_BYTES = 700_000_000
+"""proportional set size of the learner with its compiled programs, without replay (measured 2026-11, x86-64)"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
