@@ -12,9 +12,13 @@ true exactly while
 - every frame of its stack is still stored.
 
 An empty slot counts as the last record of an episode, so that no window or stack reaches into one.
+
+The pytrees are `no_type_check`: their shapes hold for what functions take and return (and are checked there), while
+jax also builds them of numpy arrays, of shapes alone, and with batch axes.
 """
 
 from dataclasses import dataclass, replace
+from typing import no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -77,6 +81,7 @@ class ReplaySpec:
 
 
 @jax.tree_util.register_dataclass
+@no_type_check
 @dataclass(frozen=True, kw_only=True, slots=True)
 class StepArrays:
     """A block of step records (gvz.transport.messages.STEP_DTYPE), in the order of each lane's stream.
@@ -96,6 +101,7 @@ class StepArrays:
 
 
 @jax.tree_util.register_dataclass
+@no_type_check
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ReplayState:
     """Everything stored, K = num_slots."""
@@ -123,6 +129,7 @@ class ReplayState:
 
 
 @jax.tree_util.register_dataclass
+@no_type_check
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Transitions:
     """A batch of n-step transitions; subscript t is where each window ends.
@@ -143,6 +150,7 @@ class Transitions:
 
 
 @jax.tree_util.register_dataclass
+@no_type_check
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SampleInfo:
     """Where a batch came from.

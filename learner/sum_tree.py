@@ -11,7 +11,7 @@ down, so that a leaf far smaller than the total's rounding step still gets its s
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +33,8 @@ jax 0.10.2, minimum of 9), against flashbax 0.1.3's binary tree with its CPU set
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["nodes"], meta_fields=["num_leaves"])
-@dataclass(frozen=True)
+@no_type_check  # jax also builds pytrees of numpy arrays and of shapes alone
+@dataclass(frozen=True, slots=True)
 class SumTree:
     """The sums of all levels; make one with `init`."""
 

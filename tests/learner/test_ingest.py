@@ -125,7 +125,7 @@ def test_memory_that_was_handed_on_is_never_written_again():
     frames = [arrays.frames for arrays in packed]
     assert not any(np.shares_memory(a, b) for a, b in itertools.combinations(frames, 2))
     held = [jax.device_put(arrays) for arrays in packed]
-    ingest.arrays([step_block(some_records(8, lane=1))], params_version=0)
+    list(ingest.arrays([step_block(some_records(8, lane=1))], params_version=0))
     np.testing.assert_array_equal(np.concatenate([h.frames for h in held]), np.stack([r.frame for r in records]))
     np.testing.assert_array_equal(
         np.concatenate([h.reward for h in held]), np.float32([record.reward for record in records])

@@ -14,7 +14,7 @@ from gvz.errors import ConfigError
 from gvz.transport.messages import StepBlock
 from learner import replay, sum_tree
 from learner.ingest import Ingest
-from learner.replay import ReplaySpec, StepArrays
+from learner.replay import ReplaySpec
 from tests.oracles import Record, ReplayOracle, play, step_block
 
 FRAME_SHAPE = (4, 5, 3)
@@ -329,11 +329,7 @@ def test_what_does_not_fit_is_refused():
     with pytest.raises(ConfigError, match=r"replay.capacity: got 20 records over 3 games, 6 each; want at least 21"):
         make_spec(capacity=20)
     spec = make_spec(capacity=30)
-    block = StepArrays(
-        **dict.fromkeys(("frames", "reward", "lane", "task", "first", "terminated", "truncated"), jnp.zeros(5)),
-        action=jnp.zeros(5, jnp.int32),
-        num_valid=jnp.int32(5),
-    )
+    (block,) = Ingest(make_spec(), 5).arrays([step_block([record(first=True)] * 5)], params_version=0)
     message = r"replay.add: got a block of 5 records, want at most 4 with 10 slots a game, stacks of 4 and windows of 3"
     with pytest.raises(ValueError, match=message):
         replay.add(spec, replay.init(spec), block)
