@@ -24,11 +24,11 @@ install-cuda: install ## add JAX for NVIDIA GPUs
 train: install   ## run the main job (ARGS="--learner.total-updates 5000 ...")
 	$(BIN)/python -m gvz.launch --config rainbow_4task.py $(ARGS)
 
-test: install    ## all tests but the slow lane (under 20 minutes on 2 cores)
-	$(BIN)/python -m pytest -m "not slow" $(ARGS)
+test: install    ## all tests but the slow lane, in two processes (under 20 minutes on 2 cores)
+	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadgroup $(ARGS)
 
 test-fast: install ## unit tests that start no engine
-	$(BIN)/python -m pytest -m "not slow and not engine and not e2e" $(ARGS)
+	$(BIN)/python -m pytest -m "not slow and not engine and not e2e" -n 2 --dist loadgroup $(ARGS)
 
 test-slow: install ## learning and fault tests that take minutes each
 	$(BIN)/python -m pytest -m slow --timeout 1800 $(ARGS)
