@@ -13,7 +13,7 @@ import tyro
 from gvz.errors import CheckpointError, ConfigError, GvzError, ResourceError, TaskError
 from gvz.scenarios.base import Split, Task
 from gvz.specs import EnvConfig, Profile
-from gvz.tasks import named_tasks, parse_task
+from gvz.tasks import named_tasks, parse_task, scenario_named, scenarios
 
 if TYPE_CHECKING:
     from gvz.evaluation.play import Row
@@ -56,6 +56,18 @@ class Tasks:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Gallery:
+    """Draw a contact sheet of each scenario: a frame of every named task, same seed and pose."""
+
+    out: Path = Path("gallery")
+    """directory for gallery_<scenario>.png"""
+    scenario: str | None = None
+    """only this one"""
+    moving: bool = False
+    """also agents.webp: the scripted agents of all scenarios at play, level after level"""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Evaluate:
     """Play evaluation episodes and append a row for each to a record file.
 
@@ -89,6 +101,7 @@ class Train:
 
 Command = (
     Annotated[Tasks, tyro.conf.subcommand("tasks")]
+    | Annotated[Gallery, tyro.conf.subcommand("gallery")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Train, tyro.conf.subcommand("train")]
 )
@@ -111,6 +124,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         match command:
             case Tasks():
                 list_tasks(command)
+            case Gallery():
+                draw_gallery(command)
             case Evaluate():
                 return evaluate(command)
             case Train():
@@ -153,6 +168,21 @@ def list_tasks(command: Tasks) -> None:
     width = max(len(name) for name, _, _ in table)
     for name, level, sets in table:
         print(f"{name:{width}}  {level:5}  {sets}".rstrip())
+
+
+def draw_gallery(command: Gallery) -> None:
+    """Writes the pictures and says where they are."""
+    chosen = scenarios().values() if command.scenario is None else [scenario_named(command.scenario)]
+    try:
+        command.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out: {command.out} cannot be made: {error.strerror}") from error
+    from gvz.gallery import write_contact_sheet, write_moving_picture
+
+    for scenario in chosen:
+        print(write_contact_sheet(scenario, command.out))
+    if command.moving:
+        print(write_moving_picture(command.out / "agents.webp"))
 
 
 def evaluate(command: Evaluate) -> int:
