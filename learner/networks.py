@@ -1,7 +1,7 @@
 """The Q-network: convolutions, then one or two streams of (noisy) dense layers. May import jax, flax, learner.conv.
 
 One module with switches serves every agent. Parameters are float32; activations may be bfloat16; outputs are
-float32. Noise is explicit: `add_noise` moves the parameters, or the network is given a key.
+float32. Noise is explicit: `add_noise` moves the parameters, or the network is given what `draw_noise` drew.
 """
 
 from typing import Any
@@ -9,6 +9,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
 
 from gvz.errors import ConfigError
@@ -25,8 +26,8 @@ class NoisyDense(nn.Module):
     Factorized noise is eps_w = f(e_in) f(e_out)^T and eps_b = f(e_out) with f(e) = sign(e) sqrt|e| and e ~ N(0, 1);
     independent noise is N(0, 1) for every entry. Source: Fortunato et al. 2018, section 3.
 
-    One draw for a whole batch is `add_noise`. With a key, this layer itself draws factorized noise for every row of
-    the batch: ((x * f(e_in)) W_noisy) * f(e_out) needs no copy of the weights per row.
+    One draw for a whole batch is `add_noise`. Given `noise`, the layer has factorized noise for every row of the batch:
+    ((x * f(e_in)) W_noisy) * f(e_out) needs no copy of the weights per row.
 
     Differs: sigma starts at `sigma` in both forms (the paper has 0.017 for independent noise and 0.5 / sqrt(inputs)
     for factorized, 0.009 and 0.022 for this network's layers of 3136 and 512 inputs; the thesis asks for 0.017), and
@@ -43,8 +44,8 @@ class NoisyDense(nn.Module):
     sigma: float
 
     @nn.compact
-    def __call__(self, x: Float[Array, "B P"], key: PRNGKeyArray | None = None) -> Float[Array, "B Q"]:
-        """Applies the layer: by its means, or with a key by noise of each row's own."""
+    def __call__(self, x: Float[Array, "B P"], noise: Float[Array, "B P+Q"] | None = None) -> Float[Array, "B Q"]:
+        """Applies the layer: by its means, or with each row's own f(e_in), f(e_out) side by side in `noise`."""
         shape = (x.shape[-1], self.features)
         kernel = self.param("kernel", nn.initializers.he_uniform(), shape).astype(x.dtype)
         bias = self.param("bias", nn.initializers.zeros, shape[1:]).astype(x.dtype)[None]
@@ -54,15 +55,23 @@ class NoisyDense(nn.Module):
         sigma = nn.initializers.constant(self.sigma)
         kernel_sigma = self.param("kernel_sigma", sigma, shape).astype(x.dtype)
         bias_sigma = self.param("bias_sigma", sigma, shape[1:]).astype(x.dtype)[None]
-        if key is None:
+        if noise is None:
             return y
-        e = _signed_sqrt(jax.random.normal(key, (x.shape[0], sum(shape)), x.dtype))
-        e_in, e_out = e[:, : shape[0]], e[:, shape[0] :]
-        return y + ((x * e_in) @ kernel_sigma + bias_sigma) * e_out
+        f_in, f_out = jnp.split(noise.astype(x.dtype), [shape[0]], axis=1)
+        return y + ((x * f_in) @ kernel_sigma + bias_sigma) * f_out
+
+
+def draw_noise(params: Params, key: PRNGKeyArray, num_rows: int) -> dict[str, Float[Array, "B P+Q"]]:
+    """Factorized noise f(e_in), f(e_out) of every noisy layer, for each of `num_rows` rows. One draw for all layers."""
+    shapes = {name: layer["kernel"].shape for name, layer in _noisy_layers(params).items()}
+    widths = [P + Q for P, Q in shapes.values()]
+    e = jax.random.normal(key, (num_rows, sum(widths)))
+    parts = jnp.split(jnp.sign(e) * jnp.sqrt(jnp.abs(e)), np.cumsum(widths)[:-1], axis=1)
+    return dict(zip(shapes, parts, strict=True))
 
 
 def add_noise(params: Params, key: PRNGKeyArray, noisy: Noisy) -> Params:
-    """Parameters whose means are moved by one draw of noise: the network of these, applied without a key, is noisy.
+    """Parameters whose means are moved by one draw of noise: the network of these, applied without noise, is noisy.
 
     Differentiable in both the means and the sigmas. One draw serves any number of batches.
 
@@ -73,17 +82,17 @@ def add_noise(params: Params, key: PRNGKeyArray, noisy: Noisy) -> Params:
 
     Source: thesis eq. 4.14, W + W_noisy * eps_w and b + b_noisy * eps_b.
     """
-    layers = {name: layer for name, layer in params["params"].items() if "kernel_sigma" in layer}
     if noisy == "off":
         return params
+    noise = draw_noise(params, key, 1) if noisy == "factorized" else {}
     moved = {}
-    for (name, layer), key_layer in zip(layers.items(), jax.random.split(key, len(layers)), strict=True):
+    for i, (name, layer) in enumerate(_noisy_layers(params).items()):
         P, Q = layer["kernel"].shape
         if noisy == "factorized":
-            e = _signed_sqrt(jax.random.normal(key_layer, (P + Q,)))
-            eps_w, eps_b = e[:P, None] * e[None, P:], e[P:]
+            f_in, f_out = jnp.split(noise[name][0], [P])
+            eps_w, eps_b = f_in[:, None] * f_out[None, :], f_out
         else:
-            e = jax.random.normal(key_layer, (P + 1, Q))
+            e = jax.random.normal(jax.random.fold_in(key, i), (P + 1, Q))
             eps_w, eps_b = e[:P], e[P]
         moved[name] = layer | {
             "kernel": layer["kernel"] + layer["kernel_sigma"] * eps_w,
@@ -92,8 +101,8 @@ def add_noise(params: Params, key: PRNGKeyArray, noisy: Noisy) -> Params:
     return {"params": params["params"] | moved}
 
 
-def _signed_sqrt(e: Array) -> Array:
-    return jnp.sign(e) * jnp.sqrt(jnp.abs(e))
+def _noisy_layers(params: Params) -> Params:
+    return {name: layer for name, layer in params["params"].items() if "kernel_sigma" in layer}
 
 
 class QNetwork(nn.Module):
@@ -114,9 +123,12 @@ class QNetwork(nn.Module):
 
     @nn.compact
     def __call__(
-        self, obs: UInt8[Array, "B H W C"], task: Int[Array, "B"], key: PRNGKeyArray | None = None
+        self,
+        obs: UInt8[Array, "B H W C"],
+        task: Int[Array, "B"],
+        noise: dict[str, Float[Array, "B _"]] | None = None,
     ) -> Float[Array, "B A N"]:
-        """Applies the network: by its means, or with a key by noise of each row's own."""
+        """Applies the network: by its means, or by each row's own noise, see `draw_noise`."""
         config, dtype = self.config, jnp.dtype(self.config.activation_dtype)
         x = obs.astype(dtype) / 255
         layers = zip(config.conv_channels, config.conv_kernels, config.conv_strides, strict=True)
@@ -125,23 +137,22 @@ class QNetwork(nn.Module):
         x = x.reshape(x.shape[0], -1)
         if config.task_conditioned:
             x = jnp.concatenate([x, jax.nn.one_hot(task, self.num_tasks, dtype=dtype)], axis=-1)
-        keys = (None, None) if key is None else jax.random.split(key)
+        noise = {} if noise is None else noise
         num_atoms = config.num_atoms if config.distributional else 1
         if not config.dueling:
-            q = self._stream("q", x, self.num_actions * num_atoms, keys[0])
+            q = self._stream("q", x, self.num_actions * num_atoms, noise)
             return q.reshape(-1, self.num_actions, num_atoms).astype(jnp.float32)
-        value = self._stream("value", x, num_atoms, keys[0])[:, None, :]  # [B, 1, N]
-        advantage = self._stream("advantage", x, self.num_actions * num_atoms, keys[1])
+        value = self._stream("value", x, num_atoms, noise)[:, None, :]  # [B, 1, N]
+        advantage = self._stream("advantage", x, self.num_actions * num_atoms, noise)
         advantage = advantage.reshape(-1, self.num_actions, num_atoms)  # [B, A, N]
         return (value + advantage - advantage.mean(axis=1, keepdims=True)).astype(jnp.float32)
 
-    def _stream(self, name: str, x: Array, num_outputs: int, key: PRNGKeyArray | None) -> Array:
+    def _stream(self, name: str, x: Array, num_outputs: int, noise: dict[str, Array]) -> Array:
         """Hidden layer, rectifier, output layer."""
         config, noisy = self.config, self.config.noisy != "off"
-        keys = (None, None) if key is None else jax.random.split(key)
         hidden = NoisyDense(config.hidden_units, noisy, config.noisy_sigma, name=f"{name}_hidden")
         output = NoisyDense(num_outputs, noisy, config.noisy_sigma, name=f"{name}_output")
-        return output(nn.relu(hidden(x, keys[0])), keys[1])
+        return output(nn.relu(hidden(x, noise.get(f"{name}_hidden"))), noise.get(f"{name}_output"))
 
 
 def check_fits(config: AgentConfig, height: int, width: int) -> None:

@@ -5,11 +5,9 @@ CPU wherever the learner runs. An actor calls them without importing this packag
 """
 
 import hashlib
-from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import export
 from jaxtyping import Array, Float
 
@@ -17,19 +15,8 @@ from learner.agents.base import Agent, Params
 
 
 def flatten_params(params: Params) -> Float[Array, "P"]:
-    """All leaves in tree order as one float32 vector."""
+    """All leaves in tree order, which is the order that `export_policy` takes them in, as one float32 vector."""
     return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(params)])
-
-
-def unflatten_params(flat: Float[Array, "P"], template: Params) -> Params:
-    """The inverse of `flatten_params`; `template` gives structure and shapes (arrays or ShapeDtypeStructs)."""
-    leaves, treedef = jax.tree.flatten(template)
-    sizes = [leaf.size for leaf in leaves]
-    if flat.shape != (sum(sizes),):
-        raise ValueError(f"flat parameters: got shape {flat.shape}, want ({sum(sizes)},), the template's size")
-    offsets = np.cumsum([0, *sizes])
-    parts = [flat[start:stop] for start, stop in pairwise(offsets)]
-    return jax.tree.unflatten(treedef, [part.reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)])
 
 
 def layout_hash(params: Params) -> int:

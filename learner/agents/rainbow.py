@@ -14,7 +14,7 @@ from gvz.errors import ConfigError
 from learner import losses
 from learner.agents.base import AgentLoss, AgentSpec, Evaluation, Params, epsilon_greedy
 from learner.config import AgentConfig
-from learner.networks import QNetwork, add_noise, check_fits
+from learner.networks import QNetwork, add_noise, check_fits, draw_noise
 from learner.replay import Transitions
 
 
@@ -41,11 +41,11 @@ class Rainbow:
         params: Params,
         obs: UInt8[Array, "B H W C"],
         task: Int[Array, "B"],
-        key: PRNGKeyArray | None = None,
+        noise: dict[str, Float[Array, "B _"]] | None = None,
     ) -> Float[Array, "B A N"]:
-        """Logits of the return distributions; Q values (N = 1) if not distributional. A key draws noise per row."""
+        """Logits of the return distributions; Q values (N = 1) if not distributional. `noise` is each row's own."""
         network = QNetwork(self.config, self.spec.num_actions, self.spec.num_tasks)
-        return jnp.asarray(network.apply(params, obs, task, key))
+        return jnp.asarray(network.apply(params, obs, task, noise))
 
     def q_values(self, logits: Float[Array, "B A N"]) -> Float[Array, "B A"]:
         if not self.config.distributional:
@@ -69,7 +69,7 @@ class Rainbow:
             return epsilon_greedy(key, self.q_values(self.logits(params, obs, task)), epsilon)
         key_noise, key_epsilon = jax.random.split(key)
         if self.config.noisy == "factorized":
-            logits = self.logits(params, obs, task, key_noise)
+            logits = self.logits(params, obs, task, draw_noise(params, key_noise, obs.shape[0]))
         else:
             logits = self.logits(add_noise(params, key_noise, "independent"), obs, task)
         return epsilon_greedy(key_epsilon, self.q_values(logits), epsilon)

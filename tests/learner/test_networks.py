@@ -10,7 +10,7 @@ import pytest
 
 from gvz.errors import ConfigError
 from learner.config import AgentConfig
-from learner.networks import NoisyDense, QNetwork, add_noise, check_fits
+from learner.networks import NoisyDense, QNetwork, add_noise, check_fits, draw_noise
 
 DQN = AgentConfig(name="dqn", double=False, dueling=False, noisy="off", distributional=False)
 TINY = replace(
@@ -32,11 +32,14 @@ def count(tree: dict[str, dict]) -> int:
 
 @cache
 def tiny(config: AgentConfig):
-    """A small network: its parameters, apply(params, obs, task, key=None), observations and tasks."""
+    """A small network: made-up parameters, apply(params, obs, task, noise=None), observations and tasks."""
+    rng = np.random.default_rng(0)
     network = QNetwork(config, num_actions=3, num_tasks=2)
-    obs = jnp.asarray(np.random.default_rng(0).integers(0, 256, (4, *OBS), dtype=np.uint8))
-    task = jnp.array([0, 1, 0, 1])
-    return jax.jit(network.init)(jax.random.key(0), obs, task), jax.jit(network.apply), obs, task
+    obs = rng.integers(0, 256, (4, *OBS), dtype=np.uint8)
+    task = np.array([0, 1, 0, 1])
+    shapes = jax.eval_shape(network.init, jax.random.key(0), obs, task)
+    params = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(0, 0.3, leaf.shape), leaf.dtype), shapes)
+    return params, jax.jit(network.apply), obs, task
 
 
 def test_dqn_has_the_thesis_layers():
@@ -113,8 +116,9 @@ def test_pixels_are_scaled_to_one():
     params, apply, _, task = tiny(TINY)
     p = jax.tree.map(np.asarray, params["params"])
     # A white image is all ones, and its convolution the kernel's sum at each of 4 x 4 positions.
-    features = np.tile(np.maximum(p["conv_0"]["kernel"].sum(axis=(0, 1, 2)), 0), 16)
-    q = np.maximum(features @ p["q_hidden"]["kernel"], 0) @ p["q_output"]["kernel"]
+    features = np.tile(np.maximum(p["conv_0"]["kernel"].sum(axis=(0, 1, 2)) + p["conv_0"]["bias"], 0), 16)
+    hidden = np.maximum(features @ p["q_hidden"]["kernel"] + p["q_hidden"]["bias"], 0)
+    q = hidden @ p["q_output"]["kernel"] + p["q_output"]["bias"]
     white = jnp.full((4, *OBS), 255, jnp.uint8)
     np.testing.assert_allclose(apply(params, white, task)[0, :, 0], q, rtol=1e-4, atol=1e-5)
 
@@ -144,29 +148,39 @@ def test_noise_moves_weights_by_sigma_times_epsilon(noisy):
     assert abs(eps_w.mean()) < 0.1
 
 
-def test_noise_per_row_equals_noise_on_the_parameters_row_by_row():
+def test_noise_per_row_is_eq_4_14_row_by_row():
     layer = NoisyDense(7, noisy=True, sigma=0.3)
     x = np.random.default_rng(0).normal(size=(3, 5)).astype(np.float32)
     variables = jax.jit(layer.init)(jax.random.key(1), x)
-    key, apply = jax.random.key(2), jax.jit(layer.apply)
-    y = apply(variables, x, key)
+    noise = np.random.default_rng(1).normal(size=(3, 5 + 7)).astype(np.float32)
+    y = jax.jit(layer.apply)(variables, x, noise)
     p = jax.tree.map(np.asarray, variables["params"])
-    e = np.asarray(jax.random.normal(key, (3, 12)))
-    f = np.sign(e) * np.sqrt(np.abs(e))
     for row in range(3):
-        kernel = p["kernel"] + p["kernel_sigma"] * np.outer(f[row, :5], f[row, 5:])
-        bias = p["bias"] + p["bias_sigma"] * f[row, 5:]
-        np.testing.assert_allclose(y[row], x[row] @ kernel + bias, rtol=1e-4, atol=1e-5)
-    assert len(np.unique(np.asarray(apply(variables, x[:1].repeat(3, 0), key))[:, 0])) == 3
+        f_in, f_out = noise[row, :5], noise[row, 5:]
+        kernel = p["kernel"] + p["kernel_sigma"] * np.outer(f_in, f_out)
+        np.testing.assert_allclose(y[row], x[row] @ kernel + p["bias"] + p["bias_sigma"] * f_out, rtol=1e-4, atol=1e-5)
 
 
-def test_noise_is_different_for_every_key_and_gone_without_one():
+def test_a_row_of_noise_is_the_noise_that_moves_the_parameters():
     params, apply, obs, task = tiny(replace(TINY, noisy="factorized", dueling=True))
-    a, b = (apply(params, obs, task, jax.random.key(i)) for i in (0, 1))
-    assert float(jnp.abs(a - b).max()) > 1e-3
-    np.testing.assert_array_equal(apply(params, obs, task), apply(params, obs, task))
+    key = jax.random.key(0)
+    noise = {
+        name: jnp.repeat(e, 4, axis=0) for name, e in jax.jit(draw_noise, static_argnums=2)(params, key, 1).items()
+    }
+    moved = jax.jit(add_noise, static_argnums=2)(params, key, "factorized")
+    np.testing.assert_allclose(apply(params, obs, task, noise), apply(moved, obs, task), rtol=1e-4, atol=1e-5)
+
+
+def test_noise_is_different_for_every_key_and_row_and_nothing_without_sigma():
+    params, apply, obs, task = tiny(replace(TINY, noisy="factorized", dueling=True))
+    draw = jax.jit(draw_noise, static_argnums=2)
+    one, other = draw(params, jax.random.key(0), 4), draw(params, jax.random.key(1), 4)
+    assert set(one) == {"value_hidden", "value_output", "advantage_hidden", "advantage_output"}
+    drawn = np.concatenate([np.concatenate([np.asarray(e).ravel() for e in noise.values()]) for noise in (one, other)])
+    assert len(np.unique(drawn)) == len(drawn)
     quiet = jax.tree_util.tree_map_with_path(lambda path, w: w * ("sigma" not in jax.tree_util.keystr(path)), params)
-    np.testing.assert_allclose(apply(quiet, obs, task, jax.random.key(0)), apply(params, obs, task), atol=1e-6)
+    np.testing.assert_allclose(apply(quiet, obs, task, one), apply(params, obs, task), atol=1e-6)
+    assert float(np.abs(np.asarray(apply(params, obs, task, one)) - apply(params, obs, task, other)).max()) > 1e-3
 
 
 def test_bfloat16_activations_keep_float32_parameters_and_outputs():

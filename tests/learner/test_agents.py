@@ -1,0 +1,226 @@
+"""Agents: the contract of everything discovered, DQN as Rainbow without its parts, each part's effect."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gvz.errors import ConfigError
+from gvz.registry import discover
+from learner import losses
+from learner.agents.base import Agent, AgentSpec, epsilon_greedy, make_agent
+from learner.config import AgentConfig
+from learner.networks import add_noise
+from learner.replay import Transitions
+
+B, A = 6, 3
+SPEC = AgentSpec(obs_shape=(10, 10, 2), num_actions=A, num_tasks=2, v_min=-2.0, v_max=3.0)
+RAINBOW = AgentConfig(
+    conv_channels=(4,), conv_kernels=(4,), conv_strides=(2,), hidden_units=8, num_atoms=11, noisy_sigma=0.3
+)
+ALL_OFF = replace(RAINBOW, double=False, dueling=False, noisy="off", distributional=False)
+AGENT_NAMES = [name for name, module in discover("learner.agents").items() if hasattr(module, "AGENT")]
+
+
+def plain_config(name: str) -> AgentConfig:
+    """A small configuration that agent `name` accepts."""
+    return RAINBOW if name == "rainbow" else replace(ALL_OFF, name=name)
+
+
+def batch(seed: int = 0) -> Transitions:
+    rng = np.random.default_rng(seed)
+    obs = rng.integers(0, 256, (2, B, *SPEC.obs_shape), dtype=np.uint8)
+    return Transitions(
+        obs_tm1=jnp.asarray(obs[0]),
+        a_tm1=jnp.asarray(rng.integers(0, A, B), jnp.int32),
+        r_t=jnp.asarray(rng.normal(size=B), jnp.float32),
+        discount_t=jnp.asarray(rng.choice([0.0, 0.97], B), jnp.float32),
+        obs_t=jnp.asarray(obs[1]),
+        task=jnp.asarray(rng.integers(0, 2, B), jnp.int32),
+    )
+
+
+@cache
+def jitted(config: AgentConfig):
+    """The agent, and its functions compiled when first called."""
+    agent = make_agent(config, SPEC)
+    return agent, jax.jit(agent.act), jax.jit(agent.evaluate), jax.jit(agent.loss)
+
+
+def made_up_params(agent: Agent, seed: int, sigma: float = 0.3):
+    """Parameters without the compilation of `init`."""
+    rng = np.random.default_rng(seed)
+
+    def leaf(path, shape):
+        noisy = "sigma" in jax.tree_util.keystr(path)
+        return np.full(shape.shape, sigma, np.float32) if noisy else rng.normal(0, 0.2, shape.shape).astype(np.float32)
+
+    return jax.tree_util.tree_map_with_path(leaf, jax.eval_shape(agent.init, jax.random.key(0)))
+
+
+def test_both_examples_are_discovered():
+    assert {"rainbow", "dqn"} <= set(AGENT_NAMES)
+
+
+@pytest.mark.parametrize("name", AGENT_NAMES)
+def test_every_agent_keeps_the_contract(name: str):
+    agent, act, evaluate, loss = jitted(plain_config(name))
+    init = jax.jit(agent.init)
+    assert hash(agent) == hash(make_agent(plain_config(name), SPEC)), "two agents of one configuration are equal"
+    assert agent.spec == SPEC
+    params, target = init(jax.random.key(0)), init(jax.random.key(1))
+    jax.tree.map(np.testing.assert_array_equal, params, init(jax.random.key(0)))
+    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(params))
+    b = batch()
+    action = act(params, jax.random.key(2), b.obs_t, b.task, jnp.float32(0.5))
+    assert action.shape == (B,)
+    assert action.dtype == jnp.int32
+    assert set(np.asarray(action).tolist()) <= set(range(A))
+    evaluation = evaluate(params, b.obs_t, b.task)
+    assert evaluation.q_values.shape == (B, A)
+    np.testing.assert_array_equal(evaluation.action, np.asarray(evaluation.q_values).argmax(-1))
+    result = loss(params, target, jax.random.key(3), b)
+    for value in (result.loss, result.priority, result.q_tm1):
+        assert value.shape == (B,)
+        assert np.isfinite(value).all()
+    assert (np.asarray(result.priority) >= 0).all()
+
+
+@pytest.mark.parametrize("name", AGENT_NAMES)
+def test_no_gradient_reaches_the_target_parameters(name: str):
+    agent, _, _, _ = jitted(plain_config(name))
+    params, target = (made_up_params(agent, seed) for seed in (0, 1))
+
+    def total(online, target):
+        return agent.loss(online, target, jax.random.key(3), batch()).loss.sum()
+
+    into_online, into_target = jax.jit(jax.grad(total, argnums=(0, 1)))(params, target)
+    assert all(not np.any(leaf) for leaf in jax.tree.leaves(into_target))
+    assert all(np.any(leaf) for leaf in jax.tree.leaves(into_online))
+
+
+def test_rainbow_with_every_part_off_is_dqn_to_the_last_bit():
+    for config in (ALL_OFF, replace(ALL_OFF, task_conditioned=True)):
+        rainbow, dqn = jitted(config), jitted(replace(config, name="dqn"))
+        assert jax.eval_shape(rainbow[0].init, jax.random.key(0)) == jax.eval_shape(dqn[0].init, jax.random.key(0))
+        params, target, b = made_up_params(dqn[0], 0), made_up_params(dqn[0], 1), batch()
+        for epsilon in (0.0, 0.5):
+            args = (params, jax.random.key(5), b.obs_t, b.task, jnp.float32(epsilon))
+            np.testing.assert_array_equal(rainbow[1](*args), dqn[1](*args))
+        ours, theirs = (agent[3](params, target, jax.random.key(2), b) for agent in (rainbow, dqn))
+        jax.tree.map(np.testing.assert_array_equal, ours, theirs)
+        ours, theirs = (agent[2](params, b.obs_t, b.task) for agent in (rainbow, dqn))
+        jax.tree.map(np.testing.assert_array_equal, ours, theirs)
+
+
+def test_dqn_loss_is_algorithm_1_with_the_huber_loss():
+    agent, _, evaluate, loss = jitted(replace(ALL_OFF, name="dqn"))
+    params, target, b = made_up_params(agent, 0), made_up_params(agent, 1), batch()
+    result = loss(params, target, jax.random.key(0), b)
+    q_tm1 = np.asarray(evaluate(params, b.obs_tm1, b.task).q_values, np.float64)[np.arange(B), b.a_tm1]
+    q_t = np.asarray(evaluate(target, b.obs_t, b.task).q_values, np.float64).max(1)
+    td = np.asarray(b.r_t) + np.asarray(b.discount_t) * q_t - q_tm1
+    np.testing.assert_allclose(result.priority, np.abs(td), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(result.loss, np.where(np.abs(td) < 1, td**2 / 2, np.abs(td) - 0.5), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(result.q_tm1, q_tm1, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("double", "distributional"), [(True, True), (False, True), (True, False)])
+def test_rainbow_loss_is_its_equations_with_one_noise_for_online_and_a_fresh_one_for_target(
+    double: bool, distributional: bool
+):
+    config = replace(RAINBOW, double=double, distributional=distributional)
+    agent, _, _, loss = jitted(config)
+    params, target, b = made_up_params(agent, 0), made_up_params(agent, 1), batch()
+    result = loss(params, target, jax.random.key(7), b)
+
+    @jax.jit
+    def by_hand(params, target):
+        key_online, key_target = jax.random.split(jax.random.key(7))
+        # A network whose means are the noisy weights, evaluated without noise, is the noisy network.
+        online = add_noise(params, key_online, "factorized")
+        at_tm1, online_t = (agent.evaluate(online, obs, b.task) for obs in (b.obs_tm1, b.obs_t))
+        target_t = agent.evaluate(add_noise(target, key_target, "factorized"), b.obs_t, b.task)
+        selector, rest = online_t.q_values if double else None, (b.a_tm1, b.r_t, b.discount_t)
+        if distributional:
+            logits_tm1, logits_t = jnp.log(at_tm1.probabilities), jnp.log(target_t.probabilities)
+            return losses.categorical_q_learning(logits_tm1, *rest, logits_t, at_tm1.atoms, selector)
+        td = losses.q_learning_td(at_tm1.q_values, *rest, target_t.q_values, selector)
+        return losses.huber(td), jnp.abs(td)
+
+    wanted, priority = by_hand(params, target)
+    np.testing.assert_allclose(result.loss, wanted, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(result.priority, priority, rtol=1e-3, atol=1e-4)
+
+
+def test_distribution_masses_sum_to_one_and_their_mean_is_q():
+    agent, _, evaluate, _ = jitted(RAINBOW)
+    result = evaluate(made_up_params(agent, 0), batch().obs_t, batch().task)
+    np.testing.assert_allclose(result.atoms, np.linspace(-2, 3, 11), atol=1e-6)
+    probabilities = np.asarray(result.probabilities)
+    np.testing.assert_allclose(probabilities.sum(-1), 1.0, rtol=1e-5)
+    np.testing.assert_allclose(probabilities @ np.asarray(result.atoms), result.q_values, atol=1e-5)
+
+
+def test_configured_value_range_overrides_the_scenario_range():
+    agent = make_agent(replace(RAINBOW, v_max=10.0), SPEC)
+    np.testing.assert_allclose(np.asarray(agent.atoms)[[0, -1]], [-2.0, 10.0])
+    with pytest.raises(ConfigError, match=r"v_min, v_max: got 3\.5, 3\.0, want v_min < v_max"):
+        make_agent(replace(RAINBOW, v_min=3.5), SPEC)
+
+
+@pytest.mark.parametrize("noisy", ["factorized", "independent"])
+def test_acting_draws_fresh_noise_every_step(noisy):
+    agent, act, evaluate, _ = jitted(replace(RAINBOW, noisy=noisy))
+    params, b = made_up_params(agent, 0, sigma=3.0), batch()
+    acts = np.stack([act(params, jax.random.key(i), b.obs_t, b.task, jnp.float32(0)) for i in range(20)])
+    assert all(len(set(column)) > 1 for column in acts.T), "noise this large must change every game's action"
+    greedy = [evaluate(params, b.obs_t, b.task).action for _ in range(2)]
+    np.testing.assert_array_equal(*greedy)
+
+
+def test_games_of_one_call_have_noise_of_their_own():
+    agent, act, _, _ = jitted(RAINBOW)
+    same = np.repeat(np.asarray(batch().obs_t)[:1], B, axis=0)
+    acts = act(made_up_params(agent, 0, sigma=3.0), jax.random.key(1), same, np.zeros(B, np.int32), jnp.float32(0))
+    assert len(set(np.asarray(acts).tolist())) > 1
+
+
+def test_epsilon_is_the_share_of_uniformly_random_actions():
+    q = np.tile(np.float32([[0.0, 0.0, 1.0]]), (6000, 1))
+    draw = jax.jit(epsilon_greedy)
+    assert (np.asarray(draw(jax.random.key(0), q, jnp.float32(0.0))) == 2).all()
+    for epsilon in (0.3, 1.0):
+        counts = np.bincount(draw(jax.random.key(1), q, jnp.float32(epsilon)), minlength=3) / 6000
+        np.testing.assert_allclose(counts, [epsilon / 3, epsilon / 3, 1 - 2 * epsilon / 3], atol=0.025)
+
+
+def test_unknown_agent_is_refused_with_the_known_ones():
+    with pytest.raises(ConfigError, match=r"agent\.name: got 'rainbw', want one of .*dqn, .*rainbow"):
+        make_agent(replace(RAINBOW, name="rainbw"), SPEC)
+
+
+@pytest.mark.parametrize(
+    "part", [{"double": True}, {"dueling": True}, {"noisy": "factorized"}, {"distributional": True}]
+)
+def test_dqn_refuses_parts_it_does_not_have(part: dict):
+    (name,) = part
+    with pytest.raises(ConfigError, match=rf"agent\.{name}: got .*dqn has no such part; set {name}="):
+        make_agent(replace(ALL_OFF, name="dqn", **part), SPEC)
+
+
+def test_wrong_spec_is_refused():
+    with pytest.raises(ConfigError, match=r"AgentSpec\.v_min, v_max: got 1\.0, 1\.0"):
+        replace(SPEC, v_min=1.0, v_max=1.0)
+    with pytest.raises(ConfigError, match=r"AgentSpec\.num_actions: got 0, want at least 1"):
+        replace(SPEC, num_actions=0)
+    with pytest.raises(ConfigError, match=r"conv_kernels\[0\]: got 4, want at most 3"):
+        make_agent(RAINBOW, replace(SPEC, obs_shape=(3, 10, 2)))
+
+
+def test_agents_meet_the_protocol():
+    agents: list[Agent] = [make_agent(plain_config(name), SPEC) for name in AGENT_NAMES]
+    assert len(agents) == len(AGENT_NAMES)
