@@ -164,10 +164,11 @@ def list_tasks(command: Tasks) -> None:
         for row in rows:
             print(json.dumps(row))
         return
-    table = [("task", "level", "sets"), *((row["task"], str(row["level"]), " ".join(row["sets"])) for row in rows)]
-    width = max(len(name) for name, _, _ in table)
-    for name, level, sets in table:
-        print(f"{name:{width}}  {level:5}  {sets}".rstrip())
+    table = [("task", "level", "attributes", "sets")]
+    table += [(r["task"], str(r["level"]), "+".join(r["attributes"]), " ".join(r["sets"])) for r in rows]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    for cells in table:
+        print("  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip())
 
 
 def draw_gallery(command: Gallery) -> None:
