@@ -1,6 +1,7 @@
 """The replay: step records in, batches of n-step transitions out, all of it on the device. Imports jax and sum_tree.
 
-Pure functions over `ReplayState`; jit them once at the edge, with the state donated.
+Pure functions over `ReplayState`; jit them once at the edge, with the state donated. They read an array that they
+also write only where what is written depends on what was read: then XLA writes in place, else it copies the array.
 
 Every lane (one game) owns `lane_capacity` consecutive slots, written in a circle. Frames are stored once; stacks,
 returns and discounts are put together when a batch is drawn. A *transition* is named by its anchor, the slot of o_t
@@ -124,8 +125,6 @@ class ReplayState:
     newest: Int[Array, "num_newest"]
     """anchors of the newest transitions, a circle; num_slots where there is none yet"""
     newest_head: Int[Array, ""]
-    records_per_task: Int[Array, "num_tasks"]
-    """records stored of each task"""
 
 
 @jax.tree_util.register_dataclass
@@ -179,7 +178,6 @@ def init(spec: ReplaySpec) -> ReplayState:
         max_priority=jnp.ones((), jnp.float32),
         newest=jnp.full(spec.num_newest, K, jnp.int32),
         newest_head=jnp.zeros((), jnp.int32),
-        records_per_task=jnp.zeros(spec.num_tasks, jnp.int32),
     )
 
 
@@ -225,7 +223,7 @@ def add(spec: ReplaySpec, state: ReplayState, block: StepArrays) -> ReplayState:
         jnp.concatenate([stale.ravel(), completed.ravel()]),
         jnp.concatenate([jnp.zeros(stale.size), jnp.full(completed.size, state.max_priority)]),
     )
-    newest, newest_head = _keep_newest(spec, state, completed.ravel())
+    newest, newest_head = _keep_newest(spec, state, stale.ravel(), completed.ravel())
     return ReplayState(
         frames=state.frames.at[slot].set(block.frames.reshape(N, -1), mode="drop"),
         action=state.action.at[slot].set(block.action, mode="drop"),
@@ -239,10 +237,6 @@ def add(spec: ReplaySpec, state: ReplayState, block: StepArrays) -> ReplayState:
         max_priority=state.max_priority,
         newest=newest,
         newest_head=newest_head,
-        records_per_task=state.records_per_task.at[state.task.at[slot].get(mode="fill", fill_value=spec.num_tasks)]
-        .add(-1, mode="drop")
-        .at[jnp.where(valid, block.task, spec.num_tasks)]
-        .add(1, mode="drop"),
     )
 
 
@@ -263,8 +257,8 @@ def sample(
         is_exponent: beta of the importance-sampling weights, 0..1.
 
     Returns:
-        The batch, and where it came from. The newest transitions were not drawn, so their weight is 1: there is
-        nothing to correct. As long as there are fewer than num_newest of them, drawn ones stand in.
+        The batch, and where it came from. The newest transitions are in every batch: their probability is 1, and
+        their weight is 1, for there is nothing to correct. While there are fewer of them, drawn ones stand in.
 
     Raises:
         ValueError: the newest transitions leave no room for drawn ones.
@@ -279,11 +273,11 @@ def sample(
     weights = (probabilities.min() / probabilities) ** is_exponent  # (1 / N P(i))^beta over its maximum: N drops out
     if spec.num_newest > 0:
         stand_in = jnp.arange(spec.num_newest) % num_drawn
-        there = sum_tree.get(state.tree, state.newest) > 0
-        newest = jnp.where(there, state.newest, slots[stand_in])
-        slots = jnp.concatenate([slots, newest])
-        weights = jnp.concatenate([weights, jnp.where(there, 1.0, weights[stand_in])])
-        probabilities = sum_tree.get(state.tree, slots) / sum_tree.total(state.tree)
+        there = state.newest < spec.num_slots
+        slots, weights, probabilities = (
+            jnp.concatenate([drawn, jnp.where(there, newest, drawn[stand_in])])
+            for drawn, newest in ((slots, state.newest), (weights, 1.0), (probabilities, 1.0))
+        )
     return _transitions(spec, state, slots), SampleInfo(slots=slots, weights=weights, probabilities=probabilities)
 
 
@@ -299,15 +293,20 @@ def update_priorities(
     if not spec.prioritized:
         return state
     priorities = (jnp.abs(td_errors) + spec.min_priority) ** spec.priority_exponent
-    priorities = jnp.where(sum_tree.get(state.tree, slots) > 0, priorities, 0.0)
+    drawable = sum_tree.get(state.tree, slots) > 0
     return replace(
         state,
-        tree=sum_tree.set(state.tree, slots, priorities),
-        max_priority=jnp.maximum(state.max_priority, priorities.max()),
+        tree=sum_tree.set(state.tree, jnp.where(drawable, slots, spec.num_slots), priorities),
+        max_priority=jnp.maximum(state.max_priority, jnp.where(drawable, priorities, 0.0).max()),
     )
 
 
-def check_can_sample(state: ReplayState) -> None:
+def records_per_task(spec: ReplaySpec, state: ReplayState) -> Int[Array, "num_tasks"]:
+    """Counts the stored records of each task. Reads all task numbers: for the log, not for every step."""
+    return jnp.zeros(spec.num_tasks, jnp.int32).at[state.task].add(1, mode="drop")
+
+
+def check_can_sample(spec: ReplaySpec, state: ReplayState) -> None:
     """Refuses, on the host, a replay without a complete transition. Waits for the device.
 
     More than num_lanes * n_steps decisions always hold one.
@@ -317,8 +316,8 @@ def check_can_sample(state: ReplayState) -> None:
     """
     if not float(sum_tree.total(state.tree)) > 0:
         raise ValueError(
-            f"replay: no complete transition among {int(state.records_per_task.sum())} records, nothing can be drawn; "
-            "raise learner.warmup_steps above (number of games) * agent.n_steps"
+            f"replay: no complete transition among {int(records_per_task(spec, state).sum())} records, nothing can be "
+            "drawn; raise learner.warmup_steps above (number of games) * agent.n_steps"
         )
 
 
@@ -356,17 +355,19 @@ def _reading(spec: ReplaySpec, first: Bool[Array, "K"], slot: Int[Array, "N"]) -
     return jnp.concatenate([slot[:, None], jnp.where(reaches_back, ahead, spec.num_slots)], axis=1)
 
 
-def _keep_newest(spec: ReplaySpec, state: ReplayState, completed: Int[Array, "M"]) -> tuple[Array, Array]:
-    """Puts completed anchors into the circle of the newest."""
+def _keep_newest(
+    spec: ReplaySpec, state: ReplayState, stale: Int[Array, "R"], completed: Int[Array, "M"]
+) -> tuple[Array, Array]:
+    """Takes stale anchors out of the circle of the newest, and puts completed ones in."""
     if spec.num_newest == 0:
         return state.newest, state.newest_head
+    newest = jnp.where(jnp.isin(state.newest, stale), spec.num_slots, state.newest)
     there = completed < spec.num_slots
     order = jnp.cumsum(there) - 1
-    count = there.sum()
+    count = there.sum(dtype=jnp.int32)
     kept = there & (order >= count - spec.num_newest)
     place = jnp.where(kept, (state.newest_head + order) % spec.num_newest, spec.num_newest)
-    head = ((state.newest_head + count) % spec.num_newest).astype(jnp.int32)
-    return state.newest.at[place].set(completed, mode="drop"), head
+    return newest.at[place].set(completed, mode="drop"), (state.newest_head + count) % spec.num_newest
 
 
 def _transitions(spec: ReplaySpec, state: ReplayState, anchors: Int[Array, "B"]) -> Transitions:

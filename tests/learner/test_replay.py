@@ -125,7 +125,9 @@ def test_every_sample_is_what_the_actor_saw_and_the_oracle_says(changes, mean_st
     assert num_drawn > num_records / 2
     assert (np.asarray(replayed.state.heads) == [len(s) % spec.lane_capacity for s in oracle.streams]).all()
     stored = [r.task for s in oracle.streams for r in s[-spec.lane_capacity :]]
-    np.testing.assert_array_equal(replayed.state.records_per_task, np.bincount(stored, minlength=spec.num_tasks))
+    np.testing.assert_array_equal(
+        replay.records_per_task(spec, replayed.state), np.bincount(stored, minlength=spec.num_tasks)
+    )
 
 
 @pytest.mark.parametrize("num_newest", [0, 3])
@@ -261,8 +263,7 @@ def test_the_newest_transitions_stand_at_the_tail_of_the_batch():
     assert sorted(info.slots[-3:].tolist()) == [0, 33, 34]
     np.testing.assert_array_equal(info.weights[-3:], 1)
     assert info.weights[:5].max() == 1
-    largest = 50.01**0.6
-    np.testing.assert_allclose(info.probabilities[-3:], np.where(info.slots[-3:] == 34, 1, largest) / (1 + 2 * largest))
+    np.testing.assert_array_equal(info.probabilities[-3:], 1)
 
 
 def test_an_empty_replay_refuses_to_be_sampled():
@@ -270,10 +271,10 @@ def test_an_empty_replay_refuses_to_be_sampled():
     replayed.add([record(first=t == 0) for t in range(3)])
     message = r"no complete transition among 3 records, nothing can be drawn; raise learner.warmup_steps above"
     with pytest.raises(ValueError, match=message):
-        replay.check_can_sample(replayed.state)
+        replay.check_can_sample(replayed.spec, replayed.state)
     assert np.isnan(replayed.sample()[1].weights).all(), "inside a jit the weights must spoil the loss"
     replayed.add([record()])
-    replay.check_can_sample(replayed.state)
+    replay.check_can_sample(replayed.spec, replayed.state)
     assert np.isfinite(replayed.sample()[1].weights).all()
 
 
@@ -286,7 +287,7 @@ def test_more_decisions_than_lanes_times_n_steps_always_hold_a_transition():
             decisions += not one.last
             if decisions > spec.num_lanes * spec.n_steps:
                 break
-        replay.check_can_sample(replayed.state)
+        replay.check_can_sample(replayed.spec, replayed.state)
 
 
 def test_memory_bill_is_exact():
@@ -297,18 +298,32 @@ def test_memory_bill_is_exact():
 
 
 def test_insertion_and_updates_are_done_in_place():
+    """Buffers stay where they are, and what a call needs besides does not grow with the capacity."""
     replayed = Replay(make_spec())
-    some = [record(first=True)]
 
     def addresses():
         return {leaf.unsafe_buffer_pointer() for leaf in (replayed.state.frames, replayed.state.tree.nodes)}
 
-    replayed.add(some)
+    replayed.add([record(first=True)])
     before = addresses()
     for _ in range(3):
-        replayed.add(some)
+        replayed.add([record()])
         replayed.update([0, 1], [1.0, 2.0])
         assert addresses() == before
+
+    def step(spec, state, block, key):
+        state = replay.add(spec, state, block)
+        batch, info = replay.sample(spec, state, key, 8, 0.5)
+        return replay.update_priorities(spec, state, info.slots, batch.r_t), (batch, info)
+
+    (block,) = Ingest(replayed.spec, 16).arrays([step_block([record(first=True)])], params_version=0)
+    scratch_bytes = []
+    for capacity in (3_000, 30_000):
+        spec = make_spec(num_newest=3, capacity=capacity)
+        state = jax.eval_shape(lambda spec=spec: replay.init(spec))
+        lowered = jax.jit(step, static_argnums=0, donate_argnums=1).lower(spec, state, block, jax.random.key(0))
+        scratch_bytes.append(lowered.compile().memory_analysis().temp_size_in_bytes)
+    assert scratch_bytes[1] - scratch_bytes[0] < 10_000, "an array that grows with the capacity is copied"
 
 
 @pytest.mark.slow

@@ -142,9 +142,10 @@ def test_a_target_at_the_end_of_a_row_finds_the_last_positive_child():
     row = np.zeros((4, FANOUT), np.float32)
     row[:, 2], row[:, 5] = 1.0, 2.0
     target = np.array([0.0, 1.0, 3.0, 4.0], np.float32)
-    child, start = sum_tree._choose_child(jnp.asarray(row), jnp.asarray(target))
+    child, start, value = sum_tree._choose_child(jnp.asarray(row), jnp.asarray(target))
     np.testing.assert_array_equal(child, [2, 5, 5, 5])
     np.testing.assert_array_equal(start, [0, 1, 1, 1])
+    np.testing.assert_array_equal(value, [1, 2, 2, 2])
 
 
 def test_the_largest_of_repeated_values_wins_in_any_order():
