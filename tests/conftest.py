@@ -1,9 +1,18 @@
-"""Settings of every test: strict JAX, and a private cache of compiled maps shared by the whole test run."""
+"""Settings of every test process: strict JAX, and a runtime directory of its own, so that tests in other processes
+do not stand in its engine starts or in its records.
+"""
 
+import atexit
 import os
+import shutil
+import tempfile
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ["XDG_RUNTIME_DIR"] = tempfile.mkdtemp(prefix="gvz-tests-")
+atexit.register(shutil.rmtree, os.environ["XDG_RUNTIME_DIR"], ignore_errors=True)
 
-import jax
 
-jax.config.update("jax_numpy_rank_promotion", "raise")
+def pytest_configure() -> None:
+    import jax  # after the environment is set
+
+    jax.config.update("jax_numpy_rank_promotion", "raise")
