@@ -22,13 +22,14 @@ from jaxtyping import Float, Int, Key
 FANOUT = 16
 """Children of a node: one cache line of float32.
 
-Measured, sample + set in one jitted scan, donated, microseconds a step (2026-11-21, one core of a 2-core AMD EPYC,
-jax 0.10.2, minimum of 9), against flashbax 0.1.3's binary tree with its CPU setter:
+Measured, sample + set in one jitted scan, donated, microseconds of CPU time a step, median (2026-11-21, one core of a
+busy 2-core AMD EPYC, jax 0.10.2), beside flashbax 0.1.3's binary tree with its CPU setter in the same run:
 
-    leaves, batch   flashbax   fan-out 4     8    16    32    64
-    100K,  32           12.1        11.2   6.2   6.7   8.4   9.8
-    1M,    32           14.7        15.0   7.7   7.2   9.6  15.3
-    1M,   512          122.2       161.4  61.2  60.5  91.6 163.7
+    leaves, batch   100K, 32   100K, 512   1M, 32   1M, 512
+    flashbax            19.9       111.9     25.3     159.1
+    this                 9.5        77.5     12.2      80.5
+
+At 1M, 512 a fan-out of 8 takes as long as 16; 32 takes 1.5 times as long, 4 and 64 take 2.7 times.
 """
 
 
