@@ -8,13 +8,20 @@ can go wrong at run time has a class here, and its message says what, where, got
 class GvzError(Exception):
     """Base of all errors of this project."""
 
+    exit_code = 1
+    """of a command that ends with this error: 2 if what the user gave cannot be run, else 1"""
+
 
 class ConfigError(GvzError, ValueError):
     """A configuration that cannot be run: names the field, the value, what is allowed."""
 
+    exit_code = 2
+
 
 class TaskError(GvzError, ValueError):
     """An unknown scenario, task or attribute, or a set of attributes that cannot be combined."""
+
+    exit_code = 2
 
 
 class AcsError(GvzError, ValueError):
@@ -49,6 +56,8 @@ class WorkerError(GvzError):
 class ResourceError(GvzError):
     """The run does not fit this machine (memory, /dev/shm, disk): says how much is needed and how to get it."""
 
+    exit_code = 2
+
 
 class CheckpointError(GvzError):
     """A checkpoint cannot be written or read."""
@@ -56,6 +65,8 @@ class CheckpointError(GvzError):
 
 class ResumeError(GvzError):
     """A run directory cannot be continued with this configuration: names every differing field."""
+
+    exit_code = 2
 
 
 class NonFiniteError(GvzError):

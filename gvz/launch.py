@@ -14,11 +14,10 @@ from typing import Annotated
 import tyro
 
 from gvz.config import RunConfig, load_config
-from gvz.errors import ConfigError, GvzError, ResourceError, ResumeError, TaskError
+from gvz.errors import GvzError
 from gvz.rundir import RunDir, move_aside
 
 DEFAULT_CONFIG = "rainbow_4task.py"
-EXIT_BAD_INPUT = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,12 +82,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             from gvz.train import train  # imports jax: only once the input is known to be good
 
             return train(config, run)
-    except (ConfigError, TaskError, ResumeError, ResourceError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_BAD_INPUT
     except GvzError as error:
         print(f"error: {error}", file=sys.stderr)
-        return 1
+        return error.exit_code
     except KeyboardInterrupt:  # a second signal while the run was being set up or taken down
         print("stopped at once", file=sys.stderr)
         return 130

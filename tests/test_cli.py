@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from gvz import cli
+from gvz.registry import discover
 from gvz.rundir import read_records
 
 
@@ -23,7 +24,7 @@ def test_help_loads_neither_jax_nor_vizdoom_nor_anything_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert done.stderr.strip() == "[]"
-    for command in ("tasks", "gallery", "evaluate", "train"):
+    for command in discover("gvz.commands"):
         assert f"• {command} " in done.stdout
 
 
@@ -54,12 +55,12 @@ def test_tasks_prints_a_table(capsys):
         ("tasks --tasks seek_and_kill/blue --split test", "--tasks: got ids and also --scenario or --split"),
         ("gallery --scenario nowhere", "unknown scenario 'nowhere'"),
         ("gallery --out {file}/below", "cannot be made: Not a directory"),
-        ("evaluate", "evaluate: want one of --player and --run"),
-        ("evaluate --player idle --run {file}", "evaluate: want one of --player and --run"),
+        ("evaluate", "evaluate: want a run directory or --player"),
+        ("evaluate {file} --player idle", "evaluate: want a run directory or --player"),
         ("evaluate --player idle --episodes 0", "--episodes: got 0, want at least 1"),
         ("evaluate --player idle --workers 0", "--workers: got 0, want at least 1"),
         ("evaluate --player idle --out {file}/below/rows.jsonl", "cannot be written: Not a directory"),
-        ("evaluate --run {file}", "is not a run directory"),
+        ("evaluate {file}", "is not a run directory"),
         ("train --config no_such", "no config 'no_such'"),
     ],
 )
@@ -79,7 +80,7 @@ def test_a_checkpoint_that_is_no_number_is_bad_input(capsys, tmp_path):
 
     with RunDir(tmp_path / "run") as run:
         run.write_config(RunConfig(name="small"))
-    assert cli.main(["evaluate", "--run", str(tmp_path / "run"), "--checkpoint", "last"]) == 2
+    assert cli.main(["evaluate", str(tmp_path / "run"), "--checkpoint", "last"]) == 2
     assert "--checkpoint: got 'last', want newest or a number of gradient steps" in capsys.readouterr().err
 
 

@@ -38,9 +38,9 @@ def read_run_config(run_dir: Path) -> RunConfig:
     try:
         return config_from_dict(json.loads(file.read_text()))
     except OSError as error:
-        raise ConfigError(f"--run: {run_dir} is not a run directory ({file.name}: {error.strerror})") from error
+        raise ConfigError(f"{run_dir} is not a run directory ({file.name}: {error.strerror})") from error
     except ValueError as error:
-        raise ConfigError(f"--run: {file} cannot be read: {error}") from error
+        raise ConfigError(f"{file} cannot be read: {error}") from error
 
 
 def check_tasks(config: RunConfig, tasks: Sequence[Task]) -> None:
@@ -82,7 +82,7 @@ def read_trained_player(run_dir: Path, config: RunConfig, checkpoint: int | Lite
     policies = run_dir / "policies"
     known = checkpoints.checkpoint_steps(policies)
     if not known:
-        raise ConfigError(f"--run: {policies} holds no policy yet; the first comes with the first checkpoint")
+        raise ConfigError(f"{policies} holds no policy yet; the first comes with the first checkpoint")
     num_updates = known[-1] if checkpoint == "newest" else checkpoint
     if num_updates not in known:
         raise ConfigError(f"--checkpoint: got {num_updates}, want newest or one of {', '.join(map(str, known))}")

@@ -1,0 +1,37 @@
+"""`gvz gallery`: pictures of the tasks. Imports gvz.gallery once it runs."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from gvz.errors import ConfigError
+from gvz.tasks import scenario_named, scenarios
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gallery:
+    """Draw a contact sheet of each scenario: a frame of every named task, same seed and pose."""
+
+    out: Path = Path("gallery")
+    """directory for gallery_<scenario>.png"""
+    scenario: str | None = None
+    """only this one"""
+    moving: bool = False
+    """also agents.webp: the scripted agents of all scenarios at play, level after level"""
+
+    def run(self) -> int:
+        """Writes the pictures and says where they are."""
+        chosen = scenarios().values() if self.scenario is None else [scenario_named(self.scenario)]
+        try:
+            self.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"--out: {self.out} cannot be made: {error.strerror}") from error
+        from gvz.gallery import write_contact_sheet, write_moving_picture
+
+        for scenario in chosen:
+            print(write_contact_sheet(scenario, self.out))
+        if self.moving:
+            print(write_moving_picture(self.out / "agents.webp"))
+        return 0
+
+
+COMMAND = Gallery
