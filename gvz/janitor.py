@@ -87,20 +87,43 @@ def clean_dead_instances() -> list[str]:
         One line for each thing removed, and for each record that cannot be read (these are left alone).
     """
     done: list[str] = []
-    for path in sorted(runtime_dir().glob("*.json")):
+    for path in _records():
         try:
-            content = json.loads(path.read_text())
-            kind, name = content["kind"], content["name"]
-            _check_name(kind, name)
-            if content["machine"] != _machine() or process_start(content["owner_pid"]) == content["owner_start"]:
-                continue
-            done += clean_engine(Path(name)) if kind == "engine" else _unlink_shm(name)
-            path.unlink(missing_ok=True)
+            dead = _read_dead(path)
+            if dead is not None:
+                kind, name = dead
+                done += clean_engine(Path(name)) if kind == "engine" else _unlink_shm(name)
+                path.unlink(missing_ok=True)
         except FileNotFoundError:
             continue  # its owner, or another janitor, was faster
         except (ValueError, KeyError, TypeError) as error:
             done.append(f"left alone: unreadable record {path} ({error})")
     return done
+
+
+def dead_instances() -> list[str]:
+    """What `clean_dead_instances` would remove: private directories of engines and names in /dev/shm."""
+    found: list[str] = []
+    for path in _records():
+        with contextlib.suppress(FileNotFoundError, ValueError, KeyError, TypeError):
+            dead = _read_dead(path)
+            if dead is not None:
+                found.append(dead[1])
+    return found
+
+
+def _records() -> list[Path]:
+    return sorted(runtime_dir().glob("*.json"))
+
+
+def _read_dead(path: Path) -> tuple[str, str] | None:
+    """Kind and name of a record whose owner is gone; None if it lives, or belongs to another machine."""
+    content = json.loads(path.read_text())
+    kind, name = content["kind"], content["name"]
+    _check_name(kind, name)
+    if content["machine"] != _machine() or process_start(content["owner_pid"]) == content["owner_start"]:
+        return None
+    return kind, name
 
 
 def clean_engine(directory: Path) -> list[str]:

@@ -16,6 +16,7 @@ TIER_3 = (
     "gvz.cli",
     "gvz.commands",
     "gvz.config",
+    "gvz.doctor",
     "gvz.evaluation",
     "gvz.experiments",
     "gvz.gallery",

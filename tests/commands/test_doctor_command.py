@@ -1,0 +1,46 @@
+"""gvz doctor, as it is called."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gvz import cli, doctor
+
+
+@pytest.mark.engine
+def test_json_has_a_line_for_every_check(capsys):
+    assert cli.main(["doctor", "--json"]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert len(rows) == len(doctor.CHECKS)
+    assert all(set(row) == {"name", "state", "found", "remedy"} for row in rows)
+
+
+def test_a_bad_finding_gives_exit_code_1_and_its_remedy(capsys, monkeypatch, tmp_path):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path / "file" / "below"))
+    monkeypatch.setattr(doctor, "CHECKS", (doctor.check_cache,))
+    assert cli.main(["doctor"]) == 1
+    out = capsys.readouterr().out
+    assert out.startswith("bad   cache")
+    assert "-> set GVZ_CACHE_DIR" in out
+
+
+def test_clean_removes_what_a_dead_run_left(capsys, monkeypatch, tmp_path):
+    tmp_path.chmod(0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(doctor, "CHECKS", (doctor.check_leftovers,))
+    segment = Path("/dev/shm") / f"gvz-test-doctor-{os.getpid()}"
+    code = f"from gvz import janitor; janitor.record('segment', {segment.name!r}); open({str(segment)!r}, 'w')"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    assert cli.main(["doctor"]) == 0
+    assert f"1: {segment.name}" in capsys.readouterr().out
+    assert segment.exists()
+    assert cli.main(["doctor", "--clean"]) == 0
+    out = capsys.readouterr().out
+    assert f"removed shared memory {segment.name}" in out
+    assert "none" in out
+    assert not segment.exists()
