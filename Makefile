@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 ARGS   ?=
 
-.PHONY: help install install-cuda train test test-fast test-slow lint format lock bench clean
+.PHONY: help install install-cuda train test test-fast test-slow test-browser lint format lock bench clean
 
 help:            ## show this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -25,13 +25,16 @@ train: install   ## run the main job (ARGS="--learner.total-updates 5000 ...")
 	$(BIN)/python -m gvz.launch --config rainbow_4task.py $(ARGS)
 
 test: install    ## all tests but the slow lane, in two processes (under 20 minutes on 2 cores)
-	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadgroup $(ARGS)
+	$(BIN)/python -m pytest -m "not slow and not browser" -n 2 --dist loadgroup $(ARGS)
 
 test-fast: install ## unit tests that start no engine
-	$(BIN)/python -m pytest -m "not slow and not engine and not e2e" -n 2 --dist loadgroup $(ARGS)
+	$(BIN)/python -m pytest -m "not slow and not engine and not e2e and not browser" -n 2 --dist loadgroup $(ARGS)
 
 test-slow: install ## learning and fault tests that take minutes each
 	$(BIN)/python -m pytest -m slow --timeout 1800 $(ARGS)
+
+test-browser: install ## reports opened in headless Chromium (Debian: apt-get install chromium)
+	$(BIN)/python -m pytest -m browser $(ARGS)
 
 lint: install    ## format check, lint, types
 	$(BIN)/ruff format --check .
