@@ -9,12 +9,13 @@ from gvz.registration import register_with_gymnasium
 
 if TYPE_CHECKING:
     from gvz.env import DoomEnv
+    from gvz.scenarios.base import Task
 
 __version__ = "0.1.0"
 __all__ = ["__version__", "make"]
 
 
-def make(task: str, **options: Any) -> "DoomEnv":
+def make(task: "str | Task", **options: Any) -> "DoomEnv":
     """The Gymnasium environment of a task.
 
     Args:
