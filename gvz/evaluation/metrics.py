@@ -1,15 +1,38 @@
-"""Statistics of scores, as pure functions. Imports numpy only.
+"""Statistics of scores, as pure functions on arrays. Imports numpy only.
 
-Source: thesis 3.2 and 5.1 (scores, performance indicators); Agarwal et al. 2021, "Deep RL at the edge of the
-statistical precipice" (interquartile mean, stratified bootstrap).
+The unit of comparison between agents is the *run*: one training seed. Scores of several runs on several tasks are a
+matrix [S, T] (seeds, tasks) of means over evaluation episodes; the statistics are of such matrices, with any axes
+before, and of plain vectors, which are matrices of one run. An interval is a percentile bootstrap interval, and it
+says what was drawn anew: episodes (how well are these very agents known?) or runs (what would other seeds give?).
+
+Source: thesis 3.1 (performance indicators, eq. 3.1 and 3.2) and 3.1.4 (solved); Agarwal et al. 2021, "Deep RL at the
+edge of the statistical precipice" (interquartile mean, probability of improvement, stratified bootstrap).
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal, assert_never
 
 import numpy as np
 
-Statistic = Callable[[np.ndarray], float]
+Statistic = Callable[..., np.ndarray]
+"""f(scores [..., S, T], one such array for each group) -> [...]"""
+
+Cells = Sequence[Sequence[np.ndarray]]
+"""scores of single episodes: cells[s][t] is float64[E] of run s on task t; E may differ from cell to cell"""
+
+Redraw = Literal["episodes", "runs", "runs_by_task"]
+"""what a bootstrap draws anew, with replacement
+
+episodes: episodes within each task and run. runs: whole runs, each with its scores on all tasks: right where one agent
+was evaluated on all of them. runs_by_task: runs within each task, independently of the other tasks: right where every
+task has agents of its own (Agarwal et al.'s stratified bootstrap)."""
+
+SOLVED_EPISODES = 10
+"""consecutive time-outs after which a survival task counts as solved"""
+
+_BLOCK_NUMBERS = 4_000_000
+"""numbers that a bootstrap holds at once"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -28,16 +51,93 @@ class Estimate:
         return self.low <= other.high and other.low <= self.high
 
 
-def mean(scores: np.ndarray) -> float:
-    """Arithmetic mean of all scores."""
-    return float(np.mean(scores))
+# ------------------------------------------------------------------------------------------------ statistics
 
 
-def interquartile_mean(scores: np.ndarray) -> float:
-    """Mean of the middle half of all scores; a quarter of them is cut at each end."""
-    ordered = np.sort(np.ravel(scores))
-    cut = len(ordered) // 4
-    return float(np.mean(ordered[cut : len(ordered) - cut]))
+def normalize(score: float, upper_bound: float) -> float:
+    """A score in percent of the best possible one."""
+    return 100 * score / upper_bound
+
+
+def mean(scores: np.ndarray) -> np.ndarray:
+    """Mean over runs and tasks, [..., S, T] -> [...]: P_i of a scenario, if the tasks are its test tasks.
+
+    Source: thesis eq. 3.1.
+    """
+    return np.mean(np.atleast_2d(scores), axis=(-2, -1))
+
+
+def median(scores: np.ndarray) -> np.ndarray:
+    """Median over tasks of the mean over runs, [..., S, T] -> [...]."""
+    return np.median(np.mean(np.atleast_2d(scores), axis=-2), axis=-1)
+
+
+def interquartile_mean(scores: np.ndarray) -> np.ndarray:
+    """Mean of the middle half of all scores, [..., S, T] -> [...]; a quarter of them is cut at each end."""
+    scores = np.atleast_2d(scores)
+    ordered = np.sort(scores.reshape(*scores.shape[:-2], -1), axis=-1)
+    cut = ordered.shape[-1] // 4
+    return np.mean(ordered[..., cut : ordered.shape[-1] - cut], axis=-1)
+
+
+def mean_over_scenarios(*scores: np.ndarray) -> np.ndarray:
+    """P_norm: the mean over scenarios of each one's mean, however many tasks it has.
+
+    Args:
+        scores: one matrix [..., S, T] a scenario, in percent of its upper bound.
+
+    Source: thesis eq. 3.2.
+    """
+    return np.mean(np.stack([mean(one) for one in scores]), axis=0)
+
+
+def difference(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """Difference of two agents' means, [..., S, T] and [..., S', T'] -> [...]."""
+    return mean(ours) - mean(theirs)
+
+
+def generalization_gap(scores: np.ndarray, num_train: int) -> np.ndarray:
+    """How much of what was learned is lost on other tasks: mean over training tasks less mean over test tasks.
+
+    Args:
+        scores: [..., S, T] of the same runs on both, the training tasks first.
+        num_train: training tasks, 1..T-1.
+    """
+    return mean(scores[..., :num_train]) - mean(scores[..., num_train:])
+
+
+def probability_of_improvement(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """How probable it is that a run of ours beats one of theirs on a task, ties counting half; mean over tasks.
+
+    Args:
+        ours: [..., S, T].
+        theirs: [..., S', T], the same tasks.
+
+    Returns: [...], 0..1.
+
+    Source: Agarwal et al. 2021, section 4.3 (the Mann-Whitney statistic of each task).
+    """
+    x, y = np.atleast_2d(ours)[..., :, None, :], np.atleast_2d(theirs)[..., None, :, :]  # [..., S, S', T]
+    return np.mean((x > y) + 0.5 * (x == y), axis=(-3, -2, -1))
+
+
+def solved(timed_out: np.ndarray) -> bool:
+    """SOLVED_EPISODES consecutive episodes, in the order they were played, reached the time-out.
+
+    Args:
+        timed_out: bool[E] of one agent on one task of a survival scenario.
+
+    Source: thesis 3.1.4.
+    """
+    streak = 0
+    for one in timed_out:
+        streak = streak + 1 if one else 0
+        if streak == SOLVED_EPISODES:
+            return True
+    return False
+
+
+# ------------------------------------------------------------------------------------------------- intervals
 
 
 def bootstrap(
@@ -48,11 +148,11 @@ def bootstrap(
     num_resamples: int = 2000,
     seed: int = 0,
 ) -> Estimate:
-    """A statistic of all scores with a percentile interval from a stratified bootstrap.
+    """A statistic of all scores together, with a percentile interval from a stratified bootstrap.
 
     Args:
-        strata: scores of each stratum (task, or task and seed); each is resampled within itself.
-        statistic: of the scores of all strata together.
+        strata: scores of each stratum (task, or task and seed), float[E]; each is drawn anew within itself.
+        statistic: of the scores of all strata as one vector.
         confidence: of the interval, 0..1.
         num_resamples: bootstrap samples.
         seed: of the resampling.
@@ -62,12 +162,90 @@ def bootstrap(
     """
     if not strata or any(len(s) == 0 for s in strata):
         raise ValueError("bootstrap: got no scores in a stratum, want at least one in each")
-    if not 0 < confidence < 1:
-        raise ValueError(f"bootstrap: got confidence {confidence}, want between 0 and 1")
     rng = np.random.default_rng(seed)
     arrays = [np.asarray(s, np.float64) for s in strata]
-    samples = [
-        statistic(np.concatenate([a[rng.integers(len(a), size=len(a))] for a in arrays])) for _ in range(num_resamples)
+    together = np.concatenate(arrays)
+    samples = []
+    for num in _blocks(num_resamples, len(together)):
+        drawn = np.concatenate([a[rng.integers(len(a), size=(num, len(a)))] for a in arrays], axis=1)
+        samples.append(statistic(drawn[:, None, :]))
+    return _percentile_interval(statistic(together), np.concatenate(samples), confidence)
+
+
+def bootstrap_runs(
+    groups: Sequence[Cells],
+    statistic: Statistic = mean,
+    *,
+    redraw: Redraw = "runs",
+    confidence: float = 0.95,
+    num_resamples: int = 2000,
+    seed: int = 0,
+) -> Estimate:
+    """A statistic of the runs' mean scores, with a percentile interval.
+
+    Args:
+        groups: what the statistic takes, each drawn anew by itself: one scenario's runs each, or ours and theirs.
+        statistic: f(scores [..., S, T] of each group) -> [...].
+        redraw: what is drawn anew. With fewer than two runs in each group only episodes can be.
+        confidence: of the interval, 0..1.
+        num_resamples: bootstrap samples.
+        seed: of the resampling.
+
+    Raises:
+        ValueError: no groups, a cell without episodes, runs with different numbers of tasks, or a confidence outside
+            0..1.
+    """
+    for cells in groups:
+        if not cells or not cells[0] or any(len(run) != len(cells[0]) or not all(map(len, run)) for run in cells):
+            raise ValueError("bootstrap_runs: want runs with the same tasks, at least one episode in each")
+    if not groups:
+        raise ValueError("bootstrap_runs: got no groups of runs, want at least one")
+    rng = np.random.default_rng(seed)
+    means = [np.array([[np.mean(cell) for cell in run] for run in cells]) for cells in groups]  # [S, T] each
+    drawn = [
+        _redraw_episodes(cells, num_resamples, rng)
+        if redraw == "episodes"
+        else _redraw_runs(m, redraw, num_resamples, rng)
+        for cells, m in zip(groups, means, strict=True)
     ]
+    return _percentile_interval(statistic(*means), statistic(*drawn), confidence)
+
+
+def _redraw_episodes(cells: Cells, num_resamples: int, rng: np.random.Generator) -> np.ndarray:
+    """Means of episodes drawn anew within each cell, float64[R, S, T]."""
+    return np.stack([np.stack([_means_of_redrawn(cell, num_resamples, rng) for cell in run], -1) for run in cells], -2)
+
+
+def _means_of_redrawn(scores: np.ndarray, num_resamples: int, rng: np.random.Generator) -> np.ndarray:
+    scores = np.asarray(scores, np.float64)
+    blocks = _blocks(num_resamples, len(scores))
+    return np.concatenate([scores[rng.integers(len(scores), size=(num, len(scores)))].mean(axis=1) for num in blocks])
+
+
+def _redraw_runs(
+    scores: np.ndarray, redraw: Literal["runs", "runs_by_task"], num_resamples: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Runs drawn anew, float64[R, S, T]."""
+    num_runs, num_tasks = scores.shape
+    match redraw:
+        case "runs":
+            chosen = rng.integers(num_runs, size=(num_resamples, num_runs, 1))
+        case "runs_by_task":
+            chosen = rng.integers(num_runs, size=(num_resamples, num_runs, num_tasks))
+        case _:
+            assert_never(redraw)
+    return scores[chosen, np.arange(num_tasks)]
+
+
+def _blocks(num_resamples: int, width: int) -> list[int]:
+    """`num_resamples` cut into blocks of at most _BLOCK_NUMBERS numbers."""
+    most = max(1, _BLOCK_NUMBERS // width)
+    whole, rest = divmod(num_resamples, most)
+    return [most] * whole + [rest] * (rest > 0)
+
+
+def _percentile_interval(value: np.ndarray, samples: np.ndarray, confidence: float) -> Estimate:
+    if not 0 < confidence < 1:
+        raise ValueError(f"bootstrap: got confidence {confidence}, want between 0 and 1")
     low, high = np.quantile(samples, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return Estimate(value=statistic(np.concatenate(arrays)), low=float(low), high=float(high))
+    return Estimate(value=float(value), low=float(low), high=float(high))
