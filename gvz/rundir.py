@@ -7,10 +7,12 @@ checkpoint, so that a resumed run drops (into `discarded/`) what a killed one wr
 """
 
 import fcntl
+import gzip
 import json
 import os
 import shutil
 import time
+import zlib
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
@@ -154,7 +156,7 @@ def move_aside(path: Path) -> Path | None:
 
 
 def read_records(file: Path) -> tuple[list[dict[str, Any]], list[str]]:
-    """Reads a JSON-lines record file; everything readable is returned.
+    """Reads a JSON-lines record file (`.gz`: compressed); everything readable is returned.
 
     Returns: rows, and one message for each line that is damaged or of another schema.
 
@@ -165,18 +167,21 @@ def read_records(file: Path) -> tuple[list[dict[str, Any]], list[str]]:
         raise GvzError(f"{file}: no such record file; is {file.parent} a run directory?")
     rows: list[dict[str, Any]] = []
     problems: list[str] = []
-    with file.open(errors="replace") as stream:
-        for number, line in enumerate(stream, 1):
-            try:
-                row = json.loads(line)
-            except (ValueError, RecursionError):
-                problems.append(f"{file}, line {number}: not JSON (half-written?)")
-                continue
-            if not isinstance(row, dict) or row.get("schema") != RECORDS_SCHEMA:
-                got = row.get("schema") if isinstance(row, dict) else type(row).__name__
-                problems.append(f"{file}, line {number}: schema {got!r}, want {RECORDS_SCHEMA}")
-                continue
-            rows.append(row)
+    try:
+        with gzip.open(file, "rt", errors="replace") if file.suffix == ".gz" else file.open(errors="replace") as stream:
+            for number, line in enumerate(stream, 1):
+                try:
+                    row = json.loads(line)
+                except (ValueError, RecursionError):
+                    problems.append(f"{file}, line {number}: not JSON (half-written?)")
+                    continue
+                if not isinstance(row, dict) or row.get("schema") != RECORDS_SCHEMA:
+                    got = row.get("schema") if isinstance(row, dict) else type(row).__name__
+                    problems.append(f"{file}, line {number}: schema {got!r}, want {RECORDS_SCHEMA}")
+                    continue
+                rows.append(row)
+    except (OSError, EOFError, zlib.error) as error:
+        problems.append(f"{file}, after {len(rows)} rows: cannot be read on ({error})")
     return rows, problems
 
 

@@ -11,7 +11,7 @@ edge of the statistical precipice" (interquartile mean, probability of improveme
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, assert_never
+from typing import Any, Literal, assert_never
 
 import numpy as np
 
@@ -54,8 +54,8 @@ class Estimate:
 # ------------------------------------------------------------------------------------------------ statistics
 
 
-def normalize(score: float, upper_bound: float) -> float:
-    """A score in percent of the best possible one."""
+def normalize(score: Any, upper_bound: Any) -> Any:
+    """Scores in percent of the best possible one: numbers, arrays, or columns of a frame."""
     return 100 * score / upper_bound
 
 
