@@ -166,13 +166,13 @@ SCENARIO = Scenario(
             name="flying_enemies",
             groups=("entity_type",),
             aliases=("flying",),
-            content=Content(parameters={"classes": ("LostSoul",), "spawn_delay": 10}),
+            # the damage factor of fast_enemies makes up for the speed of what walks; lost souls charge at their own
+            content=Content(parameters={"classes": ("LostSoul",), "spawn_delay": 10}, agent={"DamageFactor": 1.0}),
             levdoom=Content(parameters={"respawn_delay": 90}),
         ),
     ),
     complete=("gore", "mossy_bricks", "fuzzy_enemies", "resized_enemies", "fast_enemies", "flying_enemies"),
     levdoom_tasks={
-        "fast_enemies+flying_enemies": Content(agent={"DamageFactor": 1.0}),
         "gore+mossy_bricks": Content(agent={"DamageFactor": 0.7}),
         "fuzzy_enemies+resized_enemies": Content(agent={"DamageFactor": 0.7}),
         "flying_enemies+stone_wall": Content(agent={"DamageFactor": 0.7}),
