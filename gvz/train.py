@@ -238,7 +238,8 @@ class Trainer:
         if self._checkpointer.busy and not force:
             return
         self._report_save()
-        due = counts.updates >= counts.saved_updates + self._config.checkpoint.period_updates
+        period = self._config.checkpoint.period_updates
+        due = counts.updates // period > counts.saved_updates // period  # at its multiples, also after an interruption
         if not (due or (force and counts.updates > counts.saved_updates)):
             return
         counts.saved_updates = counts.updates

@@ -1,0 +1,194 @@
+"""What was asked for: experiments, scale, scenarios; the grid of runs that follows, and plan.json, which keeps it.
+
+Imports gvz.experiments.{base,scale}.
+"""
+
+import dataclasses
+import json
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from gvz.errors import ConfigError
+from gvz.experiments.base import Experiment, PlayerName, TrainingRun, experiment_named
+from gvz.experiments.scale import scaled
+from gvz.tasks import scenario_named
+
+PLAN_SCHEMA = 1
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Evaluation:
+    """Which episodes are played: 0 .. episodes - 1 of each task."""
+
+    tasks: tuple[str, ...] = ()
+    episodes: int = 0
+
+    def joined(self, tasks: Sequence[str], episodes: int) -> "Evaluation":
+        """All tasks of both, each with the larger number of episodes."""
+        return Evaluation(tasks=tuple(dict.fromkeys((*self.tasks, *tasks))), episodes=max(self.episodes, episodes))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Plan:
+    """What was asked for of one results directory."""
+
+    names: tuple[str, ...]
+    """of the experiments"""
+    scale: float = 1.0
+    scenarios: tuple[str, ...] | None = None
+    """only these of each experiment's; None: all (at the smallest scales: the first)"""
+
+    def __post_init__(self) -> None:
+        for scenario in self.scenarios or ():
+            scenario_named(scenario)
+        self.experiments()
+        self.runs()
+
+    def experiments(self) -> tuple[Experiment, ...]:
+        """The experiments, at the plan's scale and with its scenarios alone.
+
+        Raises:
+            ConfigError: an unknown experiment, none, a bad scale, or an experiment without any of the scenarios.
+        """
+        if not self.names:
+            raise ConfigError("experiments: got none, want at least one name; `gvz experiment list` shows them")
+        found = []
+        for name in dict.fromkeys(self.names):
+            full = experiment_named(name)
+            experiment = scaled(full, self.scale)
+            if self.scenarios is not None:
+                chosen = tuple(s for s in full.scenarios if s in self.scenarios)
+                if not chosen:
+                    raise ConfigError(
+                        f"--scenario: got {', '.join(self.scenarios)}, but {name} has {', '.join(full.scenarios)}"
+                    )
+                experiment = dataclasses.replace(experiment, scenarios=chosen)
+            found.append(experiment)
+        return tuple(found)
+
+    def runs(self) -> tuple[TrainingRun, ...]:
+        """Every run of every experiment, each once.
+
+        Raises:
+            ConfigError: two experiments want different runs of one id.
+        """
+        runs: dict[str, TrainingRun] = {}
+        for experiment in self.experiments():
+            for run in experiment.runs():
+                if runs.setdefault(run.id, run) != run:
+                    raise ConfigError(
+                        f"experiment {experiment.name}: run {run.id} is to have {run.total_updates} gradient steps and "
+                        f"{run.num_checkpoints} checkpoints, another experiment gives it "
+                        f"{runs[run.id].total_updates} and {runs[run.id].num_checkpoints}; "
+                        "run them in results directories of their own"
+                    )
+        return tuple(runs.values())
+
+    def evaluations(self) -> dict[str, Evaluation]:
+        """Run id -> what any of the experiments evaluates it on."""
+        found: dict[str, Evaluation] = {}
+        for experiment in self.experiments():
+            for run in experiment.runs():
+                before = found.get(run.id, Evaluation())
+                found[run.id] = before.joined(experiment.evaluation_tasks(run), experiment.episodes)
+        return found
+
+    def players(self) -> dict[PlayerName, Evaluation]:
+        """Player -> the episodes that stand beside its experiments' runs."""
+        found: dict[PlayerName, Evaluation] = {}
+        for experiment in self.experiments():
+            for run in experiment.runs():
+                for player in experiment.players:
+                    before = found.get(player, Evaluation())
+                    found[player] = before.joined(experiment.evaluation_tasks(run), experiment.episodes)
+        return found
+
+    def joined(self, other: "Plan") -> "Plan":
+        """What both ask for.
+
+        Raises:
+            ConfigError: they differ in scale.
+        """
+        if self.scale != other.scale:
+            raise ConfigError(
+                f"--scale: got {other.scale:g}, but the results there have {self.scale:g}, and scales cannot be mixed; "
+                "give the same, or another --results"
+            )
+        both = None
+        if self.scenarios is not None and other.scenarios is not None:
+            both = tuple(dict.fromkeys((*self.scenarios, *other.scenarios)))
+        return Plan(names=tuple(dict.fromkeys((*self.names, *other.names))), scale=self.scale, scenarios=both)
+
+
+def read_plan(results: Path) -> Plan | None:
+    """What was asked for of a results directory; None if nothing was.
+
+    Raises:
+        ConfigError: plan.json is damaged or of another schema.
+    """
+    file = results / "plan.json"
+    if not file.exists():
+        return None
+    try:
+        saved = json.loads(file.read_text())
+        if saved["schema"] != PLAN_SCHEMA:
+            raise ConfigError(f"{file}: schema {saved['schema']}, want {PLAN_SCHEMA}")
+        scenarios = saved["scenarios"]
+        return Plan(
+            names=tuple(saved["experiments"]),
+            scale=saved["scale"],
+            scenarios=None if scenarios is None else tuple(scenarios),
+        )
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"{file} cannot be read: {error!r}; move it aside to plan anew") from error
+
+
+def write_plan(results: Path, plan: Plan) -> Plan:
+    """Adds what `plan` asks for to what was asked of the directory before.
+
+    Returns: both together.
+
+    Raises:
+        ConfigError: the scales differ, or the directory cannot be written.
+    """
+    before = read_plan(results)
+    both = plan if before is None else before.joined(plan)
+    saved = {
+        "schema": PLAN_SCHEMA,
+        "experiments": list(both.names),
+        "scale": both.scale,
+        "scenarios": None if both.scenarios is None else list(both.scenarios),
+    }
+    try:
+        results.mkdir(parents=True, exist_ok=True)
+        temporary = results / f"plan.json.{os.getpid()}"  # the shards of a cluster may come at once
+        temporary.write_text(json.dumps(saved, indent=2) + "\n")
+        temporary.replace(results / "plan.json")
+    except OSError as error:
+        raise ConfigError(f"--results: {results} cannot be written: {error.strerror}") from error
+    return both
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """ "2/3" -> (2, 3).
+
+    Raises:
+        ConfigError: not of that form, or outside 1..n.
+    """
+    match = re.fullmatch(r"(\d+)/(\d+)", text)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise ConfigError(f"--shard: got {text!r}, want i/n with i from 1 to n, for example 2/3")
+    return int(match[1]), int(match[2])
+
+
+def shard(items: Sequence[Item], index: int, count: int) -> tuple[Item, ...]:
+    """Part `index` (1 .. count) of the items: every count-th, so that the parts are alike."""
+    return tuple(items[index - 1 :: count])
