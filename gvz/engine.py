@@ -70,8 +70,9 @@ class EngineConfig:
     """difficulty of the game, 1..5"""
     start_timeout_s: float = 60.0
     """an engine that has not started by then is given up"""
-    step_timeout_s: float = 30.0
-    """an engine that has not answered by then is killed"""
+    step_timeout_s: float = 10.0
+    """an engine that has not answered by then is killed; less than actors' heartbeat_timeout_s, so that a stuck engine
+    costs its episode and not its actor"""
     log: Path | None = None
     """where the engine's output goes; default a file in its private directory"""
 
