@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 from gvz.engine import Engine, EngineConfig
 from gvz.env import TICS_PER_SECOND, DoomEnv
 from gvz.evaluation.play import episode_seed
-from gvz.evaluation.players import PlayerSpec, make_player, player_env
+from gvz.evaluation.players import ScriptedPlayer, player_env
 from gvz.probe import ensure_loads
 from gvz.scenarios.base import Scenario, Task
 from gvz.scenarios.compiler import compile_task, task_content
@@ -144,7 +144,7 @@ def scripted_frames(task: Task, episode: int, first: int, count: int) -> list[np
     Returns: uint8[FRAME_HEIGHT, FRAME_WIDTH, 3] each; fewer if the episode ends before.
     """
     config = replace(player_env("scripted", EnvConfig()), render_width=FRAME_WIDTH, render_height=FRAME_HEIGHT)
-    player, seed, frames = make_player(PlayerSpec(kind="scripted")), episode_seed(task.id, episode), []
+    player, seed, frames = ScriptedPlayer(), episode_seed(task.id, episode), []
     with closing(DoomEnv(task, config, render_mode="rgb_array")) as env:
         observation, info = env.reset(options={"episode_seed": seed})
         player.begin(env, observation, info, seed)

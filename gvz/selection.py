@@ -17,17 +17,22 @@ class TaskSelection:
     """the named tasks of this scenario"""
     split: Split | None = None
     """the named tasks of this training or test set"""
+    level: int | None = None
+    """the named tasks of this level, 0..4"""
 
     def resolve(self) -> tuple[Task, ...]:
         """The tasks.
 
         Raises:
-            TaskError: an unknown name. ConfigError: ids beside a scenario or split.
+            TaskError: an unknown name. ConfigError: ids beside another choice, or a choice that no task fits.
         """
         if not self.tasks:
-            return named_tasks(scenario=self.scenario, split=self.split)
-        if self.scenario is not None or self.split is not None:
-            raise ConfigError("--tasks: got ids and also --scenario or --split, want one or the other")
+            chosen = named_tasks(scenario=self.scenario, level=self.level, split=self.split)
+            if not chosen:
+                raise ConfigError(f"--level, --split: no task of {self.split} has level {self.level}")
+            return chosen
+        if (self.scenario, self.split, self.level) != (None, None, None):
+            raise ConfigError("--tasks: got ids and also --scenario, --split or --level, want one or the other")
         return tuple(dict.fromkeys(parse_task(text) for text in self.tasks))
 
 

@@ -1,26 +1,32 @@
-"""`gvz evaluate`: plays evaluation episodes and prints the scores. Imports gvz.{selection,specs,tasks}; what plays only
-once it runs.
+"""`gvz evaluate`: plays evaluation episodes and prints the scores. Imports gvz.{selection,specs,tasks} and
+gvz.evaluation.players; what plays only once it runs.
 """
 
+import dataclasses
 import os
+import signal
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from gvz.errors import ConfigError
+from gvz.evaluation.players import SimplePlayer
 from gvz.scenarios.base import Task
 from gvz.selection import ALL_TASKS, TaskSelection
 from gvz.specs import EnvConfig, Profile
-from gvz.tasks import named_tasks
 
 if TYPE_CHECKING:
-    from gvz.evaluation.play import Row
+    from gvz.evaluation.play import Entrant, Row
+    from gvz.evaluation.record import RecordFile
 
 EXIT_INTERRUPTED = 130
+LINE_PERIOD_S = 10.0
+"""seconds between lines of progress when the output is not a terminal"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,19 +35,21 @@ class Evaluate:
 
     Episode n of a task has the same seed for every player. The same command goes on where it was stopped.
 
-    Examples: gvz evaluate --player random --scenario seek_and_kill
-              gvz evaluate runs/rainbow_4task/seed_1111 --checkpoint newest --split test
+    Examples: gvz evaluate runs/rainbow_4task/seed_1111 --checkpoints last5 --split test
+              gvz evaluate --player random --scenario seek_and_kill
     """
 
-    player: Literal["random", "idle", "scripted"] | None = None
+    run_dirs: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """run directories: their policies play greedily, noise off; by default the test tasks of their scenario"""
+    player: SimplePlayer | None = None
     """random: uniformly random buttons; idle: presses nothing; scripted: the scenario's simple script"""
-    run_dir: tyro.conf.Positional[Path | None] = None
-    """a run directory: its policy plays greedily, noise off; by default the test tasks of its scenario"""
-    checkpoint: str = "newest"
-    """gradient steps of one of the run's policies, or newest"""
+    checkpoints: tuple[str, ...] = ("newest",)
+    """which of a run's policies: newest, all, last5 (or another number), or numbers of gradient steps"""
     select: Annotated[TaskSelection, tyro.conf.arg(name="")] = ALL_TASKS
     episodes: int = 100
     """episodes of each task"""
+    seeds: tuple[int, ...] = (0,)
+    """base seeds: each draws episodes of its own. 0 is the set that all published scores are of"""
     out: Path | None = None
     """record file, JSON lines; default evaluation.jsonl, in the run directory if there is one"""
     profile: Profile = "thesis"
@@ -50,74 +58,111 @@ class Evaluate:
     """processes; default one per CPU core"""
 
     def run(self) -> int:
-        """Plays what the record file does not hold yet, with a progress bar, and prints the scores."""
-        from gvz.evaluation.players import PlayerSpec, player_env
-        from gvz.evaluation.record import RecordFile, missing_jobs, play_and_record, row_identity
-        from gvz.evaluation.table import score_lines
-
-        if (self.player is None) == (self.run_dir is None):
-            raise ConfigError("evaluate: want a run directory or --player")
-        if self.episodes < 1:
-            raise ConfigError(f"--episodes: got {self.episodes}, want at least 1")
+        """Plays what the record files do not hold yet, with a progress bar, and prints the scores."""
         workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
-        if workers < 1:
-            raise ConfigError(f"--workers: got {workers}, want at least 1")
-        if self.run_dir is None:
-            assert self.player is not None
-            tasks = self.select.resolve()
-            spec, names = PlayerSpec(kind=self.player), {"player": self.player}
-            env = player_env(self.player, EnvConfig(profile=self.profile))
-            out = Path("evaluation.jsonl")
-        else:
-            from gvz.evaluation.trained import check_tasks, read_run_config, read_trained_player
+        self._check(workers)
+        from gvz.evaluation.record import missing_jobs, play_and_record, wanted_episodes
 
-            config = read_run_config(self.run_dir)
-            tasks = _run_tasks(self.select, config.resolved_scenario().id)
-            check_tasks(config, tasks)
-            trained = read_trained_player(self.run_dir, config, _checkpoint(self.checkpoint))
-            spec, names, env = trained.spec, trained.identity, config.env
-            out = self.run_dir / "evaluation.jsonl"
-        file = RecordFile(out if self.out is None else self.out)
-        identity = row_identity(names, env)
-        jobs = missing_jobs(file.rows, identity, tasks, self.episodes)
+        entrants = self._entrants()
+        files: dict[Path, RecordFile] = {}
+        handler = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
         try:
-            _show_progress(play_and_record(file, jobs, identity, spec, env, workers), len(jobs), names["player"])
+            held = {entrant: _open(files, out) for entrant, (_, out) in entrants.items()}
+            jobs = []
+            for entrant, (tasks, _) in entrants.items():
+                wanted = wanted_episodes(tasks, self.episodes, self.seeds)
+                jobs += missing_jobs({entrant: held[entrant]}, wanted)
+            _show_progress(play_and_record(held, jobs, num_workers=workers), len(jobs))
+            for entrant, (tasks, _) in entrants.items():
+                self._print_scores(entrant, tasks, held[entrant].rows)
         except KeyboardInterrupt:
             print("interrupted; the same command goes on from here", file=sys.stderr)
             return EXIT_INTERRUPTED
         finally:
-            file.close()
-        print("\n".join(score_lines(file.rows, identity, tasks, self.episodes)))
+            signal.signal(signal.SIGTERM, handler)
+            for file in files.values():
+                file.close()
         return 0
+
+    def _check(self, workers: int) -> None:
+        if (self.player is None) == (not self.run_dirs):
+            raise ConfigError("evaluate: want run directories or --player")
+        for name, value in (("episodes", self.episodes), ("workers", workers)):
+            if value < 1:
+                raise ConfigError(f"--{name}: got {value}, want at least 1")
+        if any(seed < 0 for seed in self.seeds) or not self.seeds:
+            raise ConfigError(f"--seeds: got {list(self.seeds)}, want numbers of at least 0")
+
+    def _entrants(self) -> "dict[Entrant, tuple[tuple[Task, ...], Path]]":
+        """Who plays -> what, and the record file."""
+        from gvz.evaluation.record import simple_entrant
+        from gvz.evaluation.trained import check_tasks, find_checkpoints, read_run_config, trained_entrant
+
+        if self.player is not None:
+            out = Path("evaluation.jsonl") if self.out is None else self.out
+            return {simple_entrant(self.player, EnvConfig(profile=self.profile)): (self.select.resolve(), out)}
+        found = {}
+        for run_dir in dict.fromkeys(self.run_dirs):
+            config = read_run_config(run_dir)
+            tasks = run_tasks(self.select, config.resolved_scenario().id)
+            check_tasks(config, tasks)
+            out = run_dir / "evaluation.jsonl" if self.out is None else self.out
+            for num_updates in find_checkpoints(run_dir, self.checkpoints):
+                found[trained_entrant(run_dir, config, num_updates)] = (tasks, out)
+        return found
+
+    def _print_scores(self, entrant: "Entrant", tasks: Sequence[Task], rows: "Sequence[Row]") -> None:
+        from gvz.evaluation.table import score_lines
+
+        for base_seed in self.seeds:
+            chosen = [row for row in rows if row.get("base_seed", 0) == base_seed]
+            print(entrant.identity["player"] + (f", base seed {base_seed}" if base_seed else ""))
+            print("\n".join(score_lines(chosen, entrant.identity, tasks, self.episodes)))
 
 
 COMMAND = Evaluate
 
 
-def _run_tasks(select: TaskSelection, scenario: str) -> tuple[Task, ...]:
-    """The tasks a run is evaluated on: as selected, else the test set of its scenario."""
+def run_tasks(select: TaskSelection, scenario: str) -> tuple[Task, ...]:
+    """The tasks a run is evaluated on: as selected, of its own scenario if none is said; else its test set."""
     if select == ALL_TASKS:
-        return named_tasks(scenario, split="test")
-    if select.tasks or select.scenario is not None:
-        return select.resolve()
-    return named_tasks(scenario, split=select.split)
+        select = TaskSelection(split="test")
+    if not select.tasks and select.scenario is None:
+        select = dataclasses.replace(select, scenario=scenario)
+    return select.resolve()
 
 
-def _checkpoint(text: str) -> int | Literal["newest"]:
-    if text == "newest":
-        return "newest"
-    if not text.isdecimal():
-        raise ConfigError(f"--checkpoint: got {text!r}, want newest or a number of gradient steps")
-    return int(text)
+def _open(files: "dict[Path, RecordFile]", path: Path) -> "RecordFile":
+    """The record file at `path`, opened once."""
+    from gvz.evaluation.record import RecordFile
+
+    if path not in files:
+        files[path] = RecordFile(path)
+    return files[path]
 
 
-def _show_progress(rows: "Iterator[Row]", total: int, name: str) -> None:
-    """Draws the rows as they come, on stderr."""
+def _show_progress(rows: "Iterator[Row]", total: int) -> None:
+    """Draws the rows as they come, on stderr: a bar with rate and time left, or now and then a line."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        shown = bar.add_task(name, total=total)
-        for row in rows:
-            bar.update(shown, advance=1, description=f"{name}  {row['task']}")
+    from gvz.progress import format_duration
+
+    console = Console(stderr=True)
+    columns = (
+        *(BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn()),
+        TextColumn("{task.description}"),
+    )
+    first_s = next_line_s = 0.0
+    with Progress(*columns, console=console, disable=not console.is_terminal, speed_estimate_period=300) as bar:
+        shown = bar.add_task("", total=total, rate="")
+        for done, row in enumerate(rows, 1):
+            now_s = time.monotonic()
+            first_s = now_s if done == 1 else first_s
+            per_s = (done - 1) / (now_s - first_s) if done > 1 else 0.0  # the start of the workers left out
+            rate, name = f"{per_s:.2f} episodes/s", f"{row['player']}  {row['task']}"
+            bar.update(shown, advance=1, description=name, rate=rate)
+            if not console.is_terminal and (now_s >= next_line_s or done == total):
+                left = format_duration((total - done) / per_s if per_s else None)
+                print(f"{done}/{total}  {rate}  eta {left}  {name}", file=sys.stderr, flush=True)
+                next_line_s = now_s + LINE_PERIOD_S

@@ -1,41 +1,22 @@
-"""Who plays an evaluation episode: chance, nobody, a script, or a trained policy. Imports numpy, gymnasium,
-gvz.evaluation.scripted; actors.policy where there is a policy to load.
-
-A `PlayerSpec` is data that travels to worker processes; `make_player` makes the player there.
+"""Who plays an evaluation episode: chance, nobody, a script, or any function of frames. Imports numpy,
+actors.preprocess, gvz.evaluation.scripted. The policy of a training run is in gvz.evaluation.trained.
 """
 
 import dataclasses
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Literal, Protocol, assert_never
 
 import numpy as np
 
 from actors.preprocess import push_frame, start_stack
-from gvz.errors import ConfigError
 from gvz.evaluation.scripted import ScriptedPlayer
 from gvz.specs import EnvConfig
-from gvz.transport.messages import ParamsHeader
 
 if TYPE_CHECKING:
     from gvz.env import DoomEnv
     from gvz.observation import Observation
 
-PlayerKind = Literal["random", "idle", "scripted", "policy"]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PlayerSpec:
-    """A player as data. All but `kind` is for kind policy."""
-
-    kind: PlayerKind
-    policy: bytes = b""
-    """exported greedy acting function for one game"""
-    params: np.ndarray | None = None
-    """float32[P]"""
-    obs_shape: tuple[int, int, int] = (84, 84, 12)
-    """(H, W, stack * C) of what the policy sees"""
-    conditioned_on: tuple[str, ...] = ()
-    """ids of the tasks whose index the policy is given; none if it is not given any"""
+SimplePlayer = Literal["random", "idle", "scripted"]
 
 
 class Player(Protocol):
@@ -81,53 +62,38 @@ class IdlePlayer:
         """Nobody is there to look."""
 
 
-class PolicyPlayer:
-    """A trained agent: greedy, noise off."""
+class FramePlayer:
+    """Plays by a function of the last frames, `choose(stack) -> action`.
 
-    def __init__(self, spec: PlayerSpec):
-        from actors.policy import make_policy
+    The stack is uint8[H, W, stack_size * C], oldest frame first along the channels; at an episode's start the first
+    frame is repeated. It changes with the next decision: copy it to keep it.
+    """
 
-        if spec.params is None or not spec.policy:
-            raise ConfigError("player of kind policy: want its exported function and its parameters")
-        self._obs = np.zeros((1, *spec.obs_shape), np.uint8)
-        self._task = np.zeros(1, np.int32)
-        self._conditioned_on = spec.conditioned_on
-        # num_actions is for a random policy; the exported function knows its own
-        self._policy = make_policy(
-            spec.policy, num_actions=1, num_params=spec.params.size, obs_shape=self._obs.shape, seed=0
-        )
-        self._policy.set_params(spec.params, ParamsHeader(version=0, num_updates=0))
+    def __init__(self, choose: Callable[[np.ndarray], int], stack_size: int = 4):
+        self._choose, self._stack_size = choose, stack_size
 
     def begin(self, env: "DoomEnv", observation: "Observation", info: dict[str, Any], seed: int) -> None:
-        if self._conditioned_on:
-            self._task[0] = self._conditioned_on.index(env.task.id)
         assert isinstance(observation, np.ndarray)
-        start_stack(self._obs[0], observation)
+        height, width, channels = observation.shape
+        self._stack = np.zeros((height, width, self._stack_size * channels), np.uint8)
+        start_stack(self._stack, observation)
 
     def act(self) -> int:
-        return int(self._policy.act(self._obs, self._task)[0])
+        return int(self._choose(self._stack))
 
     def observe(self, observation: "Observation", info: dict[str, Any]) -> None:
         assert isinstance(observation, np.ndarray)
-        push_frame(self._obs[0], observation)
+        push_frame(self._stack, observation)
 
 
-def make_player(spec: PlayerSpec) -> Player:
-    """The player, for any number of episodes of any tasks."""
-    match spec.kind:
-        case "random":
-            return RandomPlayer()
-        case "idle":
-            return IdlePlayer()
-        case "scripted":
-            return ScriptedPlayer()
-        case "policy":
-            return PolicyPlayer(spec)
-        case _:
-            assert_never(spec.kind)
+SIMPLE_PLAYERS: Mapping[SimplePlayer, Callable[[], Player]] = {
+    "random": RandomPlayer,
+    "idle": IdlePlayer,
+    "scripted": ScriptedPlayer,
+}
 
 
-def player_env(kind: PlayerKind, env: EnvConfig) -> EnvConfig:
+def player_env(kind: SimplePlayer, env: EnvConfig) -> EnvConfig:
     """`env` as a player of this kind needs it.
 
     Chance and nobody look at nothing: they get the smallest screen, which changes no score. The idle one needs the
@@ -141,7 +107,5 @@ def player_env(kind: PlayerKind, env: EnvConfig) -> EnvConfig:
             return dataclasses.replace(blind, action_set="combinations")
         case "scripted":
             return dataclasses.replace(env, action_set="buttons", buffers=("labels",))
-        case "policy":
-            return env
         case _:
             assert_never(kind)

@@ -2,19 +2,18 @@
 again. Imports gvz.evaluation.{play,players}, gvz.rundir, gvz.specs.
 """
 
-import dataclasses
 import fcntl
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from gvz.errors import ConfigError
-from gvz.evaluation.play import Job, Row, play
-from gvz.evaluation.players import PlayerSpec
+from gvz.evaluation.play import Entrant, Episode, Row, play
+from gvz.evaluation.players import SIMPLE_PLAYERS, Player, SimplePlayer, player_env
 from gvz.rundir import RECORDS_SCHEMA, read_records
 from gvz.specs import EnvConfig
-from gvz.tasks import Task
+from gvz.tasks import Task, parse_task
 
 
 def row_identity(player: Mapping[str, Any], env: EnvConfig) -> dict[str, Any]:
@@ -28,10 +27,26 @@ def row_identity(player: Mapping[str, Any], env: EnvConfig) -> dict[str, Any]:
     return {**player, **rules}
 
 
-def missing_jobs(rows: Sequence[Row], identity: Mapping[str, Any], tasks: Sequence[Task], episodes: int) -> list[Job]:
-    """Episodes 0 .. episodes - 1 of each task that `rows` do not hold under this identity."""
-    held = {(row["task"], row["episode"]) for row in rows if identity.items() <= row.items()}
-    return [(task.id, n) for task in tasks for n in range(episodes) if (task.id, n) not in held]
+def simple_entrant(kind: SimplePlayer, env: EnvConfig) -> Entrant:
+    """A random, idle or scripted player under the rules of `env`."""
+    env = player_env(kind, env)
+    return Entrant(
+        make_player=SIMPLE_PLAYERS[kind],
+        env=env,
+        identity=row_identity({"player": kind}, env),
+        recycle_episodes=0,
+    )
+
+
+def wanted_episodes(tasks: Sequence[Task], episodes: int, base_seeds: Sequence[int] = (0,)) -> list[Episode]:
+    """Episodes 0 .. episodes - 1 of each task and base seed."""
+    return [Episode(task.id, n, base) for task in tasks for base in base_seeds for n in range(episodes)]
+
+
+def rows_of(entrant: Entrant, rows: Iterable[Row]) -> dict[Episode, Row]:
+    """The rows of a record file that are this entrant's. Rows older than base seeds are of base seed 0."""
+    mine = entrant.identity.items()
+    return {Episode(r["task"], r["episode"], r.get("base_seed", 0)): r for r in rows if mine <= r.items()}
 
 
 def read_rows(file: Path) -> list[Row]:
@@ -79,24 +94,75 @@ class RecordFile:
         """Writes a row and flushes it."""
         self._stream.write(json.dumps({"schema": RECORDS_SCHEMA, **row}) + "\n")
         self._stream.flush()
-        self.rows.append(row)
+        self.rows.append({"schema": RECORDS_SCHEMA, **row})
 
     def close(self) -> None:
         """Closes the file and gives it free."""
         self._stream.close()
 
 
+def missing_jobs(entrants: Mapping[Entrant, RecordFile], episodes: Sequence[Episode]) -> list[tuple[Entrant, Episode]]:
+    """What of `episodes` each entrant's file does not hold yet."""
+    return [
+        (entrant, episode)
+        for entrant, file in entrants.items()
+        for episode in dict.fromkeys(episodes).keys() - rows_of(entrant, file.rows).keys()
+    ]
+
+
 def play_and_record(
-    file: RecordFile, jobs: Sequence[Job], identity: dict[str, Any], spec: PlayerSpec, env: EnvConfig, num_workers: int
+    entrants: Mapping[Entrant, RecordFile], jobs: Iterable[tuple[Entrant, Episode]], *, num_workers: int
 ) -> Iterator[Row]:
     """Plays episodes; each row is on disk before it is yielded.
 
     Raises:
         GvzError: an episode could not be played.
     """
-    options = dataclasses.asdict(env)
-    if spec.kind != "policy":
-        options["recycle_episodes"] = 0  # a fresh engine makes fuzz look the same again: only a policy looks at it
-    for row in play(jobs, spec, options, num_workers=num_workers):
-        file.append({**identity, **row})
-        yield file.rows[-1]
+    for entrant, row in play(jobs, num_workers=num_workers):
+        entrants[entrant].append({**entrant.identity, **row})
+        yield entrants[entrant].rows[-1]
+
+
+def evaluate_player(
+    make_player: Callable[[], Player],
+    tasks: Sequence[Task | str],
+    out: Path | str,
+    *,
+    name: str,
+    episodes: int = 100,
+    base_seed: int = 0,
+    env: EnvConfig | None = None,
+    num_workers: int = 0,
+) -> list[Row]:
+    """Evaluates any player by the benchmark's protocol; called again, it goes on where it was stopped.
+
+    Args:
+        make_player: makes it, in each process that plays; picklable unless `num_workers` is 0.
+        tasks: tasks or their ids.
+        out: record file, JSON lines; may hold other players' rows too.
+        name: of the player; say in it what tells it from others in the same file (agent, seed, checkpoint).
+        episodes: of each task.
+        base_seed: draws another set of episodes; 0 is the one that everybody is compared on.
+        env: what it plays in; default the thesis's.
+        num_workers: processes that play; 0 plays in this one.
+
+    Returns:
+        All rows asked for, by task and episode, those that the file held before too.
+
+    Raises:
+        ConfigError, TaskError: an unknown task, or a file that cannot be written.
+        GvzError: an episode could not be played.
+    """
+    env = EnvConfig() if env is None else env
+    entrant = Entrant(make_player=make_player, env=env, identity=row_identity({"player": name}, env))
+    parsed = [parse_task(task) if isinstance(task, str) else task for task in tasks]
+    wanted = wanted_episodes(parsed, episodes, [base_seed])
+    file = RecordFile(Path(out))
+    try:
+        entrants = {entrant: file}
+        for _ in play_and_record(entrants, missing_jobs(entrants, wanted), num_workers=num_workers):
+            pass
+    finally:
+        file.close()
+    held = rows_of(entrant, file.rows)
+    return [held[episode] for episode in wanted]

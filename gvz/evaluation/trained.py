@@ -1,31 +1,44 @@
-"""The policy of a training run as a player: its configuration and parameters, read from its run directory.
+"""The policies of a training run as players, read from its run directory.
 
-Imports jax, gvz.assemble, gvz.config, learner; nothing in a run directory is executed or unpickled.
+Imports gvz.config, gvz.evaluation.play; jax, gvz.assemble, learner where a policy is read. Nothing in a run directory
+is executed or unpickled.
 """
 
 import hashlib
 import json
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from actors.preprocess import push_frame, start_stack
 from gvz.config import RunConfig, config_from_dict
-from gvz.errors import ConfigError
-from gvz.evaluation.players import PlayerSpec
+from gvz.errors import CheckpointError, ConfigError
+from gvz.evaluation.play import Entrant
+from gvz.evaluation.record import row_identity
 from gvz.tasks import Task
+
+if TYPE_CHECKING:
+    from gvz.env import DoomEnv
+    from gvz.observation import Observation
+    from learner.agents.base import Agent, Evaluation
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class TrainedPlayer:
-    """A player and what it says of itself in every row it plays."""
+class Values:
+    """What a policy thinks its actions are worth: discounted reward to come."""
 
-    spec: PlayerSpec
-    identity: dict[str, Any]
-    """player (name, seed and checkpoint), run, run_seed, num_updates, params (a hash of the parameters)"""
+    q_values: np.ndarray
+    """f32[A]"""
+    probabilities: np.ndarray | None
+    """f32[A, N], the distribution of each action's return, if the agent has one"""
+    atoms: np.ndarray | None
+    """f32[N], the returns that `probabilities` are of"""
 
 
 def read_run_config(run_dir: Path) -> RunConfig:
@@ -59,51 +72,144 @@ def check_tasks(config: RunConfig, tasks: Sequence[Task]) -> None:
             )
 
 
-def read_trained_player(run_dir: Path, config: RunConfig, checkpoint: int | Literal["newest"]) -> TrainedPlayer:
-    """The policy of a run at a checkpoint, greedy and with its noise off.
+def find_checkpoints(run_dir: Path, wanted: Sequence[str]) -> list[int]:
+    """The policies of a run that are asked for, as gradient steps, oldest first.
+
+    Args:
+        run_dir: of the run.
+        wanted: any of "newest", "all", "last5" (or another number), and numbers of gradient steps.
+
+    Raises:
+        ConfigError: none of those, or there is no such policy; lists those there are.
+    """
+    directory = run_dir / "policies"
+    known = sorted(int(p.name) for p in directory.glob("*") if p.is_dir() and p.name.isdecimal())
+    if not known:
+        raise ConfigError(f"{directory} holds no policy yet; the first comes with the first checkpoint")
+    chosen: set[int] = set()
+    for text in wanted:
+        if last := re.fullmatch(r"last(\d+)", text):
+            count = int(last[1])
+            if not 1 <= count <= len(known):
+                raise ConfigError(f"--checkpoints: got {text}, but {directory} holds {len(known)} policies")
+            chosen.update(known[-count:])
+        elif text in ("newest", "all"):
+            chosen.update(known if text == "all" else known[-1:])
+        elif text.isdecimal() and int(text) in known:
+            chosen.add(int(text))
+        else:
+            raise ConfigError(
+                f"--checkpoints: got {text!r}, want newest, all, last5 (or another number), or some of those in "
+                f"{directory}: {', '.join(map(str, known))}"
+            )
+    return sorted(chosen)
+
+
+def trained_entrant(run_dir: Path, config: RunConfig, num_updates: int) -> Entrant:
+    """A policy of a run; its parameters are read, so that damage shows now.
 
     Args:
         run_dir: of the run.
         config: as `read_run_config` gives it.
-        checkpoint: gradient steps of one in `policies/`, or the newest there.
+        num_updates: gradient steps of one in `policies/`.
 
     Raises:
-        ConfigError: there is no such policy; lists those there are.
         CheckpointError: it is damaged, or belongs to another configuration.
     """
+    _, params = _read_params(run_dir, config, num_updates)
+    import jax  # not before: reading says on which platform
+
+    digest = hashlib.blake2b(digest_size=8)
+    for leaf in jax.tree.leaves(params):
+        digest.update(np.asarray(leaf, np.float32).tobytes())
+    name = f"{config.name}/seed_{config.seed}"
+    player = {
+        "player": f"{name}@{num_updates}",
+        "run": config.name,
+        "run_seed": config.seed,
+        "num_updates": num_updates,
+        "params": digest.hexdigest(),
+    }
+    return Entrant(
+        make_player=partial(TrainedPlayer, run_dir, num_updates),
+        env=config.env,
+        identity=row_identity(player, config.env),
+    )
+
+
+class TrainedPlayer:
+    """A policy of a run, greedy and with its noise off.
+
+    Args:
+        run_dir: of the run.
+        num_updates: gradient steps of one in `policies/`.
+
+    Raises:
+        ConfigError, CheckpointError: it cannot be read.
+    """
+
+    def __init__(self, run_dir: Path, num_updates: int):
+        config = read_run_config(run_dir)
+        agent, params = _read_params(run_dir, config, num_updates)
+        import jax
+
+        self._params = jax.device_put(params)
+        self._evaluate = _jitted(agent)
+        self._evaluation: Evaluation | None = None
+        self._obs = np.zeros((1, *agent.spec.obs_shape), np.uint8)
+        self._task = np.zeros(1, np.int32)
+        conditioned = config.agent.task_conditioned
+        self._task_ids = [task.id for task in config.resolved_tasks()] if conditioned else None
+
+    @property
+    def values(self) -> Values | None:
+        """What it thought when it chose the last action."""
+        if self._evaluation is None:
+            return None
+        _, q_values, probabilities, atoms = self._evaluation
+        return Values(
+            q_values=np.asarray(q_values)[0],
+            probabilities=None if probabilities is None else np.asarray(probabilities)[0],
+            atoms=None if atoms is None else np.asarray(atoms),
+        )
+
+    def begin(self, env: "DoomEnv", observation: "Observation", info: dict[str, Any], seed: int) -> None:
+        if self._task_ids is not None:
+            self._task[0] = self._task_ids.index(env.task.id)
+        assert isinstance(observation, np.ndarray)
+        start_stack(self._obs[0], observation)
+        self._evaluation = None
+
+    def act(self) -> int:
+        evaluation: Evaluation = self._evaluate(self._params, self._obs, self._task)
+        self._evaluation = evaluation
+        return int(evaluation.action[0])
+
+    def observe(self, observation: "Observation", info: dict[str, Any]) -> None:
+        assert isinstance(observation, np.ndarray)
+        push_frame(self._obs[0], observation)
+
+
+@cache
+def _jitted(agent: "Agent") -> Any:
+    """Compiled once for all checkpoints of a run."""
+    import jax
+
+    return jax.jit(agent.evaluate)
+
+
+def _read_params(run_dir: Path, config: RunConfig, num_updates: int) -> "tuple[Agent, Any]":
     # acting is done on the CPU, by the form of the convolutions that is quick there
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     import jax
 
     from gvz.assemble import run_agent
-    from learner import checkpoint as checkpoints
-    from learner.policy import export_policy, flatten_params
+    from learner import checkpoint
 
-    policies = run_dir / "policies"
-    known = checkpoints.checkpoint_steps(policies)
-    if not known:
-        raise ConfigError(f"{policies} holds no policy yet; the first comes with the first checkpoint")
-    num_updates = known[-1] if checkpoint == "newest" else checkpoint
-    if num_updates not in known:
-        raise ConfigError(f"--checkpoint: got {num_updates}, want newest or one of {', '.join(map(str, known))}")
     agent = run_agent(config)
-    template = jax.eval_shape(agent.init, jax.random.key(0))
-    params, _ = checkpoints.read(policies / str(num_updates), template)
-    flat = np.asarray(flatten_params(params))
-    name = f"{config.name}/seed_{config.seed}"
-    return TrainedPlayer(
-        spec=PlayerSpec(
-            kind="policy",
-            policy=export_policy(agent, template, 1, explore=False),
-            params=flat,
-            obs_shape=agent.spec.obs_shape,
-            conditioned_on=tuple(t.id for t in config.resolved_tasks()) if config.agent.task_conditioned else (),
-        ),
-        identity={
-            "player": f"{name}@{num_updates}",
-            "run": config.name,
-            "run_seed": config.seed,
-            "num_updates": num_updates,
-            "params": hashlib.blake2b(flat.tobytes(), digest_size=8).hexdigest(),
-        },
-    )
+    directory = run_dir / "policies" / str(num_updates)
+    try:
+        params, _ = checkpoint.read(directory, jax.eval_shape(agent.init, jax.random.key(0)))
+    except CheckpointError as error:
+        raise CheckpointError(f"{error}; evaluate another with --checkpoints") from error
+    return agent, params

@@ -1,23 +1,26 @@
 """Evaluation episodes: their seeds, the same rows however they are shared out, engines that die."""
 
-import dataclasses
+import os
 
 import pytest
 
 from gvz.env import DoomEnv
 from gvz.errors import EngineError, GvzError
-from gvz.evaluation.play import episode_seed, play, play_episode
-from gvz.evaluation.players import PlayerSpec, make_player, player_env
+from gvz.evaluation.play import Entrant, Episode, episode_seed, play, play_episode
+from gvz.evaluation.players import RandomPlayer, player_env
+from gvz.evaluation.record import simple_entrant
 from gvz.specs import EnvConfig
 from gvz.tasks import named_tasks
 
 TASK = "defend_the_center/fast_enemies"
-SMALL = dataclasses.asdict(player_env("random", EnvConfig(frame_height=8, frame_width=8)))
+SMALL = player_env("random", EnvConfig(frame_height=8, frame_width=8))
 
 
 def test_the_seed_of_an_episode_never_changes():
     assert episode_seed("defend_the_center/default", 0) == 289007959
     assert episode_seed("defend_the_center/default", 1) == 1919382300
+    assert episode_seed("defend_the_center/default", 1, base_seed=0) == 1919382300
+    assert episode_seed("defend_the_center/default", 1, base_seed=1) == 1979913219
 
 
 def test_no_two_evaluation_episodes_share_a_seed():
@@ -28,13 +31,15 @@ def test_no_two_evaluation_episodes_share_a_seed():
 
 @pytest.mark.engine
 def test_rows_do_not_depend_on_how_episodes_are_shared_out():
-    jobs = [(TASK, 2), (TASK, 0), ("defend_the_center/default", 0), (TASK, 1)]
-    alone = list(play(jobs, PlayerSpec(kind="random"), SMALL, num_workers=1, chunk=4))
-    shared = list(play(jobs, PlayerSpec(kind="random"), SMALL, num_workers=2, chunk=1))
-    assert sorted(alone, key=str) == sorted(shared, key=str)
-    assert {(row["task"], row["episode"]) for row in alone} == set(jobs)
-    for row in alone:
-        assert row["seed"] == episode_seed(row["task"], row["episode"])
+    random, scripted = simple_entrant("random", SMALL), simple_entrant("scripted", EnvConfig())
+    episodes = [Episode(TASK, 1), Episode(TASK, 0), Episode("defend_the_center/default", 0), Episode(TASK, 0, 7)]
+    jobs = [(random, episode) for episode in episodes] + [(scripted, episodes[0])]
+    here = list(play(jobs, num_workers=0))
+    shared = list(play(jobs, num_workers=2))
+    assert sorted(map(str, here)) == sorted(map(str, shared))
+    assert {(e, Episode(row["task"], row["episode"], row["base_seed"])) for e, row in here} == set(jobs)
+    for _, row in here:
+        assert row["seed"] == episode_seed(row["task"], row["episode"], row["base_seed"])
         assert row["terminated"] != row["truncated"]
         assert row["reward"] == pytest.approx(sum(row["reward_components"].values()))
         assert 4 * row["length_steps"] >= row["length_frames"] > 4 * (row["length_steps"] - 1)
@@ -45,7 +50,7 @@ class Assassin:
 
     def __init__(self, num_kills: int):
         self.num_kills = num_kills
-        self._player = make_player(PlayerSpec(kind="random"))
+        self._player = RandomPlayer()
 
     def begin(self, env, observation, info, seed):
         self._env, self._decisions = env, 0
@@ -64,7 +69,7 @@ class Assassin:
 
 @pytest.mark.engine
 def test_an_episode_whose_engine_died_is_played_again_whole():
-    env = DoomEnv(TASK, **SMALL)
+    env = DoomEnv(TASK, SMALL)
     undisturbed = play_episode(env, Assassin(0), 0)
     assert play_episode(env, Assassin(2), 0) == undisturbed
     with pytest.raises(EngineError, match=rf"{TASK}, evaluation episode 0 \(seed \d+\): the engine died 3 times"):
@@ -72,6 +77,14 @@ def test_an_episode_whose_engine_died_is_played_again_whole():
     env.close()
 
 
+class Suicide:
+    """Ends the process it is made in."""
+
+    def __init__(self):
+        os._exit(1)
+
+
 def test_a_worker_that_dies_is_an_error():
-    with pytest.raises(GvzError, match="a worker process died"):
-        list(play([(TASK, 0)], PlayerSpec(kind="policy"), SMALL, num_workers=1))
+    entrant = Entrant(make_player=Suicide, env=SMALL, identity={"player": "suicide"})
+    with pytest.raises(GvzError, match="a worker process died; what it had not finished can be played again"):
+        list(play([(entrant, Episode(TASK, 0))], num_workers=1))

@@ -1,27 +1,20 @@
-"""Players: chance, nobody, scripts, policies, in the real game."""
+"""Players: chance, nobody, scripts, functions of frames, in the real game."""
 
-import dataclasses
-
-import jax
 import numpy as np
 import pytest
 
 from gvz.env import DoomEnv
-from gvz.errors import ConfigError
 from gvz.evaluation.play import play_episode
-from gvz.evaluation.players import PlayerSpec, make_player, player_env
+from gvz.evaluation.players import SIMPLE_PLAYERS, FramePlayer, IdlePlayer, player_env
 from gvz.evaluation.scripted import SCRIPTS
 from gvz.specs import EnvConfig
 from gvz.tasks import scenarios
-from learner.agents.base import AgentSpec, make_agent
-from learner.config import AgentConfig
-from learner.policy import export_policy, flatten_params
 
 
 def play(kind: str, task: str, **fields) -> dict:
     env = DoomEnv(task, player_env(kind, EnvConfig()), **fields)
     try:
-        return play_episode(env, make_player(PlayerSpec(kind=kind)), 0)
+        return play_episode(env, SIMPLE_PLAYERS[kind](), 0)
     finally:
         env.close()
 
@@ -55,7 +48,7 @@ def test_the_idle_player_presses_nothing():
     row = play("idle", "defend_the_center/default")
     assert row["reward_components"]["ammo_spent"] == 0
     env = DoomEnv("seek_and_kill/default", player_env("idle", EnvConfig()))
-    player = make_player(PlayerSpec(kind="idle"))
+    player = IdlePlayer()
     observation, info = env.reset(seed=1)
     player.begin(env, observation, info, 1)
     assert env.action_meanings[player.act()] == ()
@@ -63,36 +56,23 @@ def test_the_idle_player_presses_nothing():
 
 
 @pytest.mark.engine
-@pytest.mark.parametrize("conditioned", [False, True])
-def test_a_policy_acts_greedily_on_the_stack_it_was_trained_on(conditioned):
-    config = AgentConfig(
-        conv_channels=(4,), conv_kernels=(8,), conv_strides=(4,), hidden_units=8, task_conditioned=conditioned
-    )
-    tasks = ("defend_the_center/gore", "defend_the_center/default")
-    agent = make_agent(config, AgentSpec(obs_shape=(24, 32, 4), num_actions=3, num_tasks=2, v_min=-1, v_max=1))
-    params = agent.init(jax.random.key(3))
-    spec = PlayerSpec(
-        kind="policy",
-        policy=export_policy(agent, params, 1, explore=False),
-        params=np.asarray(flatten_params(params)),
-        obs_shape=agent.spec.obs_shape,
-        conditioned_on=tasks if conditioned else (),
-    )
-    player = make_player(spec)
-    env = DoomEnv(tasks[1], frame_height=24, frame_width=32, grayscale=True)
-    frame, info = env.reset(seed=1)
-    player.begin(env, frame, info, 1)
-    stack, task = [frame] * 4, np.array([int(conditioned)], np.int32)
-    for _ in range(12):
-        wanted = agent.evaluate(params, np.concatenate(stack, axis=-1)[None], task).action
-        action = player.act()
-        assert action == int(wanted[0])
-        frame, _, _, _, info = env.step(action)
-        player.observe(frame, info)
-        stack = [*stack[1:], frame]
+def test_a_function_of_frames_is_given_the_newest_frames_oldest_first():
+    seen, frames = [], []
+
+    def choose(stack: np.ndarray) -> int:
+        seen.append(stack.copy())
+        return len(seen) % 3
+
+    player = FramePlayer(choose, stack_size=3)
+    env = DoomEnv("defend_the_center/default", frame_height=24, frame_width=32)
+    for seed in (1, 2):
+        seen.clear()
+        frame, info = env.reset(seed=seed)
+        player.begin(env, frame, info, seed)
+        frames = [frame] * 3
+        for _ in range(5):
+            frame, _, _, _, info = env.step(player.act())
+            player.observe(frame, info)
+            np.testing.assert_array_equal(seen[-1], np.concatenate(frames[-3:], axis=-1))
+            frames.append(frame)
     env.close()
-
-
-def test_a_policy_without_parameters_is_an_error():
-    with pytest.raises(ConfigError, match="want its exported function and its parameters"):
-        make_player(dataclasses.replace(PlayerSpec(kind="policy"), policy=b"x"))

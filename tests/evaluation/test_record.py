@@ -4,23 +4,55 @@ import json
 
 import pytest
 
-from gvz.errors import ConfigError
-from gvz.evaluation.players import PlayerSpec, player_env
-from gvz.evaluation.record import RecordFile, missing_jobs, play_and_record, read_rows, row_identity
+from gvz.errors import ConfigError, TaskError
+from gvz.evaluation.play import Episode
+from gvz.evaluation.players import IdlePlayer, RandomPlayer, player_env
+from gvz.evaluation.record import (
+    RecordFile,
+    evaluate_player,
+    missing_jobs,
+    play_and_record,
+    read_rows,
+    simple_entrant,
+    wanted_episodes,
+)
 from gvz.specs import EnvConfig
 from gvz.tasks import parse_task
 
 TASK = parse_task("defend_the_center/fast_enemies")
-IDENTITY = row_identity({"player": "idle"}, EnvConfig())
+IDLE = simple_entrant("idle", EnvConfig())
 
 
 def row(player: str, episode: int, **fields) -> dict:
-    return {**IDENTITY, "player": player, "task": TASK.id, "episode": episode, **fields}
+    return {**IDLE.identity, "player": player, "task": TASK.id, "episode": episode, **fields}
 
 
-def test_only_rows_of_the_same_player_and_rules_count():
-    rows = [row("idle", 0), row("random", 1), row("idle", 2, profile="levdoom"), row("idle", 3, num_updates=5)]
-    assert missing_jobs(rows, IDENTITY, [TASK], 4) == [(TASK.id, 1), (TASK.id, 2)]
+@pytest.fixture
+def file(tmp_path):
+    file = RecordFile(tmp_path / "evaluation.jsonl")
+    yield file
+    file.close()
+
+
+def test_each_base_seed_has_episodes_of_its_own():
+    wanted = wanted_episodes([TASK], 2, [0, 5])
+    assert wanted == [(TASK.id, 0, 0), (TASK.id, 1, 0), (TASK.id, 0, 5), (TASK.id, 1, 5)]
+
+
+def test_only_rows_of_the_same_player_rules_and_base_seed_count(file):
+    for line in (
+        row("idle", 0),  # as written before there were base seeds
+        row("random", 1),
+        row("idle", 2, profile="levdoom"),
+        row("idle", 3, num_updates=5),
+        row("idle", 1, base_seed=5),
+    ):
+        file.append(line)
+    jobs = missing_jobs({IDLE: file}, wanted_episodes([TASK], 4, [0, 5]))
+    assert {job[0] for job in jobs} == {IDLE}
+    assert sorted(job[1] for job in jobs) == [
+        *((TASK.id, 0, 5), (TASK.id, 1, 0), (TASK.id, 2, 0), (TASK.id, 2, 5), (TASK.id, 3, 5))
+    ]
 
 
 def test_a_half_written_line_is_cut_off(tmp_path):
@@ -69,18 +101,39 @@ def test_a_place_that_cannot_be_written_is_an_error(tmp_path):
 
 @pytest.mark.engine
 def test_an_evaluation_goes_on_where_it_was_left(tmp_path):
-    env = player_env("idle", EnvConfig())
-    identity = row_identity({"player": "idle"}, env)
-    file = RecordFile(tmp_path / "evaluation.jsonl")
-    spec = PlayerSpec(kind="idle")
-    rows = play_and_record(file, missing_jobs(file.rows, identity, [TASK], 2), identity, spec, env, num_workers=1)
+    path = tmp_path / "evaluation.jsonl"
+    wanted = wanted_episodes([TASK], 2)
+    file = RecordFile(path)
+    rows = play_and_record({IDLE: file}, missing_jobs({IDLE: file}, wanted), num_workers=1)
     first = next(rows)
+    assert read_rows(path) == [first], "a row is on disk before it is told of"
     rows.close()
     file.close()
-    file = RecordFile(tmp_path / "evaluation.jsonl")
-    jobs = missing_jobs(file.rows, identity, [TASK], 2)
-    assert jobs == [(TASK.id, 1 - first["episode"])]
-    list(play_and_record(file, jobs, identity, spec, env, num_workers=1))
-    assert missing_jobs(file.rows, identity, [TASK], 2) == []
-    assert {r["episode"] for r in read_rows(tmp_path / "evaluation.jsonl")} == {0, 1}
+    file = RecordFile(path)
+    jobs = missing_jobs({IDLE: file}, wanted)
+    assert jobs == [(IDLE, Episode(TASK.id, 1 - first["episode"]))]
+    list(play_and_record({IDLE: file}, jobs, num_workers=0))
+    assert missing_jobs({IDLE: file}, wanted) == []
+    assert {r["episode"] for r in read_rows(path)} == {0, 1}
     file.close()
+
+
+@pytest.mark.engine
+def test_anybody_s_player_is_evaluated_by_the_same_protocol(tmp_path):
+    path, env = tmp_path / "rows.jsonl", player_env("random", EnvConfig())
+    mine = evaluate_player(RandomPlayer, [TASK.id], path, name="mine", episodes=2, env=env)
+    assert [(r["player"], r["task"], r["episode"]) for r in mine] == [("mine", TASK.id, 0), ("mine", TASK.id, 1)]
+    file = RecordFile(path)
+    random = simple_entrant("random", EnvConfig())
+    jobs = missing_jobs({random: file}, wanted_episodes([TASK], 2))
+    theirs = sorted(play_and_record({random: file}, jobs, num_workers=0), key=lambda r: r["episode"])
+    file.close()
+    assert [{**r, "player": "mine"} for r in theirs] == mine
+    # nothing is left to play: IdlePlayer would fail, since this action set has no idle action
+    assert evaluate_player(IdlePlayer, [TASK], path, name="mine", episodes=2, env=env) == mine
+    assert len(read_rows(path)) == 4
+
+
+def test_a_player_is_not_evaluated_on_an_unknown_task(tmp_path):
+    with pytest.raises(TaskError, match="unknown scenario 'nowhere'"):
+        evaluate_player(RandomPlayer, ["nowhere/default"], tmp_path / "rows.jsonl", name="mine")

@@ -1,16 +1,19 @@
 """The policy of a run, read from its directory."""
 
 import dataclasses
+import hashlib
+import json
+import pickle
 
 import jax
 import numpy as np
 import pytest
 
 from gvz.assemble import run_agent
-from gvz.config import RunConfig
+from gvz.config import RunConfig, config_to_dict
+from gvz.env import DoomEnv
 from gvz.errors import CheckpointError, ConfigError
-from gvz.evaluation.players import make_player
-from gvz.evaluation.trained import check_tasks, read_run_config, read_trained_player
+from gvz.evaluation.trained import TrainedPlayer, check_tasks, find_checkpoints, read_run_config, trained_entrant
 from gvz.rundir import RunDir
 from gvz.specs import EnvConfig
 from gvz.tasks import named_tasks, parse_task
@@ -28,38 +31,85 @@ CONFIG = RunConfig(
 
 @pytest.fixture
 def run(tmp_path):
-    """A run directory with the policies of updates 10 and 20."""
+    """A run directory with the policies of updates 10, 20 and 100."""
     with RunDir(tmp_path / "run") as directory:
         directory.write_config(CONFIG)
-    for step in (10, 20):
-        params = run_agent(CONFIG).init(jax.random.key(step))
-        checkpoint.write(tmp_path / "run" / "policies" / str(step), checkpoint.snapshot(params), {"num_updates": step})
+    for step in (10, 20, 100):
+        write_policy(tmp_path / "run", CONFIG, step)
     return tmp_path / "run"
 
 
-def test_the_newest_policy_is_read_with_its_name(run):
-    trained = read_trained_player(run, read_run_config(run), "newest")
-    wanted = flatten_params(run_agent(CONFIG).init(jax.random.key(20)))
-    np.testing.assert_array_equal(trained.spec.params, wanted)
-    assert trained.identity["player"] == "small/seed_7@20"
-    assert (trained.identity["run"], trained.identity["run_seed"], trained.identity["num_updates"]) == ("small", 7, 20)
-    assert trained.spec.obs_shape == (24, 32, 4)
-    make_player(trained.spec)  # compiles, and fits
+def write_policy(run, config, step):
+    """Writes random parameters as the policy of a step, and returns them."""
+    rng = np.random.default_rng(step)
+    template = jax.eval_shape(run_agent(config).init, jax.random.key(0))
+    params = jax.tree.map(lambda leaf: 0.1 * rng.standard_normal(leaf.shape, np.float32), template)
+    checkpoint.write(run / "policies" / str(step), params, {"num_updates": step})
+    return params
 
 
-def test_other_parameters_are_another_player(run):
-    config = read_run_config(run)
-    old, new = (read_trained_player(run, config, step).identity for step in (10, 20))
+@pytest.mark.parametrize(
+    ("wanted", "found"),
+    [
+        (["newest"], [100]),
+        (["all"], [10, 20, 100]),
+        (["last2"], [20, 100]),
+        (["20"], [20]),
+        (["newest", "10", "100"], [10, 100]),
+    ],
+)
+def test_checkpoints_are_found_by_name_oldest_first(run, wanted, found):
+    assert find_checkpoints(run, wanted) == found
+
+
+def test_a_checkpoint_that_is_not_there_is_an_error(tmp_path, run):
+    with pytest.raises(ConfigError, match=r"--checkpoints: got '15', want newest, all, last5 .*: 10, 20, 100"):
+        find_checkpoints(run, ["15"])
+    with pytest.raises(ConfigError, match="--checkpoints: got 'latest', want newest"):
+        find_checkpoints(run, ["latest"])
+    with pytest.raises(ConfigError, match=r"--checkpoints: got last4, but .*policies holds 3 policies"):
+        find_checkpoints(run, ["last4"])
+    with pytest.raises(ConfigError, match="holds no policy yet"):
+        find_checkpoints(tmp_path, ["newest"])
+
+
+def test_rows_say_which_parameters_played(run):
+    old, new = (trained_entrant(run, CONFIG, step).identity for step in (10, 20))
+    assert (new["player"], new["run"], new["run_seed"], new["num_updates"]) == ("small/seed_7@20", "small", 7, 20)
     assert old["params"] != new["params"]
-    assert old["player"] == "small/seed_7@10"
+    flat = np.asarray(flatten_params(write_policy(run, CONFIG, 20)))
+    assert new["params"] == hashlib.blake2b(flat.tobytes(), digest_size=8).hexdigest()
 
 
-def test_a_conditioned_policy_is_told_its_task(run):
+@pytest.mark.engine
+@pytest.mark.parametrize("conditioned", [False, True])
+def test_a_policy_acts_greedily_on_the_stack_it_was_trained_on(run, conditioned):
+    config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, task_conditioned=conditioned))
+    (run / "config.json").write_text(json.dumps(config_to_dict(config)))
+    params, agent = write_policy(run, config, 30), run_agent(config)
+    player = pickle.loads(pickle.dumps(trained_entrant(run, config, 30))).make_player()
+    task = config.resolved_tasks()[1]
+    env = DoomEnv(task, config.env)
+    frame, info = env.reset(seed=1)
+    player.begin(env, frame, info, 1)
+    assert player.values is None
+    stack, index = [frame] * 4, np.array([int(conditioned)], np.int32)
+    for _ in range(12):
+        wanted = agent.evaluate(params, np.concatenate(stack, axis=-1)[None], index)
+        action = player.act()
+        assert action == int(wanted.action[0]) == int(player.values.q_values.argmax())
+        np.testing.assert_allclose(player.values.q_values, wanted.q_values[0], atol=1e-5)
+        np.testing.assert_allclose(player.values.probabilities, wanted.probabilities[0], atol=1e-5)
+        means = player.values.probabilities @ player.values.atoms
+        np.testing.assert_allclose(means, player.values.q_values, atol=1e-4)
+        frame, _, _, _, info = env.step(action)
+        player.observe(frame, info)
+        stack = [*stack[1:], frame]
+    env.close()
+
+
+def test_a_conditioned_policy_plays_its_training_tasks_only():
     config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, task_conditioned=True))
-    params = run_agent(config).init(jax.random.key(1))
-    checkpoint.write(run / "policies" / "30", checkpoint.snapshot(params), {"num_updates": 30})
-    trained = read_trained_player(run, config, "newest")
-    assert trained.spec.conditioned_on == tuple(task.id for task in config.resolved_tasks())
     check_tasks(config, config.resolved_tasks())
     with pytest.raises(ConfigError, match="defend_the_center/complete: the policy is told which of its 4"):
         check_tasks(config, [parse_task("defend_the_center/complete")])
@@ -80,14 +130,26 @@ def test_what_is_no_run_is_an_error(tmp_path, run):
         read_run_config(run)
 
 
-def test_a_policy_that_is_not_there_is_an_error(tmp_path, run):
-    with pytest.raises(ConfigError, match="--checkpoint: got 15, want newest or one of 10, 20"):
-        read_trained_player(run, CONFIG, 15)
-    with pytest.raises(ConfigError, match="holds no policy yet"):
-        read_trained_player(tmp_path, CONFIG, "newest")
+def test_a_damaged_policy_is_an_error_that_names_the_file(run):
+    file = next(f for f in (run / "policies" / "20" / "arrays").rglob("*") if f.is_file() and f.stat().st_size > 100)
+    file.write_bytes(file.read_bytes()[:-9])
+    with pytest.raises(CheckpointError, match=r"policies/20/.*: cut short; evaluate another with --checkpoints"):
+        trained_entrant(run, CONFIG, 20)
+    assert trained_entrant(run, CONFIG, 10).identity["num_updates"] == 10
 
 
 def test_a_policy_of_another_configuration_is_an_error(run):
     wider = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, hidden_units=9))
     with pytest.raises(CheckpointError, match="it belongs to another configuration"):
-        read_trained_player(run, wider, "newest")
+        trained_entrant(run, wider, 20)
+
+
+def test_an_agent_without_distributions_has_values_alone(run):
+    plain = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, distributional=False))
+    (run / "config.json").write_text(json.dumps(config_to_dict(plain)))
+    write_policy(run, plain, 20)
+    player = TrainedPlayer(run, 20)
+    action = player.act()
+    assert player.values.q_values.shape == (3,)
+    assert player.values.q_values.argmax() == action
+    assert (player.values.probabilities, player.values.atoms) == (None, None)

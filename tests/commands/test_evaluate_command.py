@@ -1,0 +1,133 @@
+"""gvz evaluate, as it is called: bad input, several checkpoints, interruption and going on."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+
+from gvz import cli
+from gvz.assemble import run_agent
+from gvz.commands.evaluate import run_tasks
+from gvz.config import RunConfig, config_to_dict
+from gvz.evaluation.record import read_rows
+from gvz.selection import TaskSelection
+from gvz.specs import EnvConfig
+from gvz.tasks import named_tasks
+from learner import checkpoint
+from learner.config import AgentConfig
+
+CONFIG = RunConfig(
+    name="small",
+    seed=7,
+    env=EnvConfig(frame_height=24, frame_width=32, grayscale=True),
+    agent=AgentConfig(conv_channels=(4,), conv_kernels=(8,), conv_strides=(4,), hidden_units=8),
+)
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run directory with the policies of updates 10 and 20."""
+    path = tmp_path / "run"
+    template = jax.eval_shape(run_agent(CONFIG).init, jax.random.key(0))
+    for step in (10, 20):
+        rng = np.random.default_rng(step)
+        params = jax.tree.map(lambda leaf, rng=rng: rng.standard_normal(leaf.shape, np.float32), template)
+        checkpoint.write(path / "policies" / str(step), params, {"num_updates": step})
+    (path / "config.json").write_text(json.dumps(config_to_dict(CONFIG)))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("", "evaluate: want run directories or --player"),
+        ("{run} --player idle", "evaluate: want run directories or --player"),
+        ("--player idle --episodes 0", "--episodes: got 0, want at least 1"),
+        ("--player idle --workers 0", "--workers: got 0, want at least 1"),
+        ("--player idle --seeds -1", "--seeds: got [-1], want numbers of at least 0"),
+        ("--player idle --out {file}/below/rows.jsonl", "cannot be written: Not a directory"),
+        ("--player idle --out {file}", "line 1: not JSON (half-written?); move the file aside"),
+        ("--player idle --level 5", "level 5, want 0..4"),
+        ("--player idle --level 0 --split test", "--level, --split: no task of test has level 0"),
+        ("{file}", "is not a run directory"),
+        ("{run} --checkpoints last", "--checkpoints: got 'last', want newest, all, last5"),
+        ("{run} --checkpoints 30", "10, 20"),
+        ("{run} --scenario seek_and_kill", "the run was trained on defend_the_center, whose buttons are others"),
+        ("{run} --tasks defend_the_center/gor", "unknown attribute 'gor' (did you mean 'gore'?)"),
+    ],
+)
+def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, tmp_path, run):
+    (tmp_path / "file").write_text("nonsense\n")
+    assert cli.main(["evaluate", *arguments.format(file=tmp_path / "file", run=run).split()]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: ")
+    assert message in err
+    assert not (run / "evaluation.jsonl").exists()
+
+
+def test_a_damaged_policy_is_told_of_before_anything_is_played(capsys, run):
+    (run / "policies" / "10" / "host.msgpack").unlink()
+    assert cli.main(["evaluate", str(run), "--checkpoints", "all"]) == 1
+    err = capsys.readouterr().err
+    assert "policies/10: files missing or unknown: ['host.msgpack']; evaluate another with --checkpoints" in err
+    assert not (run / "evaluation.jsonl").exists()
+
+
+def test_a_run_is_evaluated_on_the_test_tasks_of_its_scenario_unless_told_otherwise():
+    scenario = "dodge_projectiles"
+    assert run_tasks(TaskSelection(), scenario) == named_tasks(scenario, split="test")
+    assert run_tasks(TaskSelection(level=2), scenario) == named_tasks(scenario, level=2)
+    assert run_tasks(TaskSelection(split="train4"), scenario) == named_tasks(scenario, split="train4")
+    assert run_tasks(TaskSelection(scenario="seek_and_kill"), scenario) == named_tasks("seek_and_kill")
+
+
+@pytest.mark.engine
+def test_all_checkpoints_meet_the_same_episodes_and_none_twice(run, capsys):
+    command = f"evaluate {run} --checkpoints all --tasks defend_the_center/default --seeds 0 4 --workers 2".split()
+    assert cli.main([*command, "--episodes", "1"]) == 0
+    out, err = capsys.readouterr()
+    assert [line for line in out.splitlines() if line.startswith("small")] == [
+        *("small/seed_7@10", "small/seed_7@10, base seed 4", "small/seed_7@20", "small/seed_7@20, base seed 4")
+    ]
+    assert err.splitlines()[-1].startswith("4/4  ")
+    rows = read_rows(run / "evaluation.jsonl")
+    first = {(row["num_updates"], row["base_seed"]): row for row in rows}
+    assert len(rows) == len(first) == 4
+    assert first[10, 0]["seed"] == first[20, 0]["seed"] != first[10, 4]["seed"]
+    assert cli.main([*command, "--episodes", "1"]) == 0
+    assert read_rows(run / "evaluation.jsonl") == rows
+    assert capsys.readouterr().out == out
+
+
+@pytest.mark.engine
+def test_an_interrupted_evaluation_goes_on_and_ends_with_a_table(tmp_path):
+    out = tmp_path / "rows.jsonl"
+    command = [
+        *(sys.executable, "-m", "gvz.cli", "evaluate", "--player", "idle", "--episodes", "12", "--workers", "1"),
+        *("--tasks", "defend_the_center/default", "--out", str(out)),
+    ]
+    num_rows = 0
+    for signal_number in (signal.SIGINT, signal.SIGTERM):
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+        deadline = time.monotonic() + 120
+        while not out.exists() or out.read_text().count("\n") == num_rows:
+            assert time.monotonic() < deadline, "waited 120 s for a row"
+            time.sleep(0.02)
+        process.send_signal(signal_number)
+        _, err = process.communicate(timeout=120)
+        assert process.returncode == 130, err
+        assert "interrupted; the same command goes on from here" in err
+        assert "Traceback" not in err
+        assert num_rows < len(read_rows(out)) < 12
+        num_rows = len(read_rows(out))
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=tmp_path, check=False)
+    assert done.returncode == 0, done.stderr
+    assert sorted(row["episode"] for row in read_rows(out)) == list(range(12))
+    assert "defend_the_center/default" in done.stdout
+    assert list(tmp_path.iterdir()) == [out]
