@@ -37,9 +37,8 @@ class List:
             print(f"{experiment.name}: {experiment.question}")
             print(f"    {experiment.source}")
             grid = (experiment.configs, experiment.scenarios, experiment.trainings, map(str, experiment.seeds))
-            print(
-                f"    {len(runs)} runs of {experiment.total_updates:,} gradient steps: {' x '.join(map(', '.join, grid))}"
-            )
+            cells = " x ".join(", ".join(values) for values in grid)
+            print(f"    {len(runs)} runs of {experiment.total_updates:,} gradient steps: {cells}")
         return 0
 
 

@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Protocol
 
 from gvz.config import load_config
 from gvz.experiments import progress
@@ -44,6 +44,28 @@ class Outlook:
     """something of it stands on the disk"""
     text: str
     """how far it is, for a person"""
+
+
+class Job(Protocol):
+    """What is to be done, in commands that follow from what stands on the disk."""
+
+    @property
+    def id(self) -> str:
+        """Unique in the results directory; names the log."""
+        ...
+
+    @property
+    def results(self) -> Path:
+        """The results directory."""
+        ...
+
+    def outlook(self) -> Outlook:
+        """What is left, read from the disk."""
+        ...
+
+    def done_count(self, step: str) -> int:
+        """Of `Command.total`, how much is done; of a job at work."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -120,9 +142,6 @@ class PlayerJob:
     @property
     def _file(self) -> Path:
         return progress.player_file(self.results, self.player)
-
-
-Job = RunJob | PlayerJob
 
 
 def training_flags(run: TrainingRun, scale: float) -> tuple[str, ...]:

@@ -174,7 +174,8 @@ def _held_episodes(file: Path) -> dict[int, set[tuple[str, int]]]:
     for line in _lines(file):
         try:
             row = json.loads(line)
-            held.setdefault(row.get("num_updates", 0), set()).add((row["task"], row["episode"]))
+            if row.get("base_seed", 0) == 0:  # the episodes that everybody meets
+                held.setdefault(row.get("num_updates", 0), set()).add((row["task"], row["episode"]))
         except (ValueError, KeyError, AttributeError):  # half-written, or no row of ours
             continue
     return held

@@ -1,0 +1,128 @@
+"""The grid that was asked for, its shards, and plan.json."""
+
+import dataclasses
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gvz.errors import ConfigError
+from gvz.experiments.base import experiments
+from gvz.experiments.plan import Evaluation, Plan, parse_shard, read_plan, shard, write_plan
+
+THESIS = ("training_difficulty", "training_set_size", "algorithm_comparison", "rainbow_evaluation")
+
+
+def test_a_run_that_experiments_share_is_there_once_and_evaluated_for_all():
+    plan = Plan(names=THESIS)
+    ids = [run.id for run in plan.runs()]
+    assert len(ids) == len(set(ids)) == 228 + 36 + 12  # the comparison adds DQN alone, the evaluation nothing
+    evaluations = plan.evaluations()
+    assert evaluations.keys() == set(ids)
+    shared = evaluations["rainbow_4task/defend_the_center/train4/seed_1111"]
+    assert (len(shared.tasks), shared.episodes) == (18, 100)
+    alone = evaluations["rainbow_4task/defend_the_center/train8/seed_1111"]
+    assert len(alone.tasks) == 7
+
+
+def test_players_meet_every_task_that_any_run_is_evaluated_on():
+    assert len(Plan(names=THESIS).players()["random"].tasks) == 76
+    assert set(Plan(names=("quick_comparison",)).players()) == {"random", "idle", "scripted"}
+
+
+def test_scenarios_narrow_every_experiment_and_bring_back_those_a_small_scale_leaves_out():
+    plan = Plan(names=("training_set_size",), scale=0.001, scenarios=("seek_and_kill",))
+    assert {run.scenario for run in plan.runs()} == {"seek_and_kill"}
+
+
+@given(count=st.integers(1, 7), num_items=st.integers(0, 40))
+def test_shards_are_disjoint_alike_and_together_everything(count, num_items):
+    items = list(range(num_items))
+    parts = [shard(items, index, count) for index in range(1, count + 1)]
+    assert sorted(item for part in parts for item in part) == items
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
+def test_an_evaluation_joined_with_another_has_the_tasks_of_both_and_the_more_episodes():
+    both = Evaluation(tasks=("a", "b"), episodes=2).joined(("b", "c"), 5)
+    assert both == Evaluation(tasks=("a", "b", "c"), episodes=5)
+
+
+def test_plan_json_gathers_what_was_asked_for(tmp_path):
+    assert read_plan(tmp_path) is None
+    one = Plan(names=("training_set_size",), scale=0.5, scenarios=("seek_and_kill",))
+    two = Plan(names=("rainbow_evaluation",), scale=0.5, scenarios=("health_gathering",))
+    write_plan(tmp_path, one)
+    both = write_plan(tmp_path, two)
+    assert both.names == ("training_set_size", "rainbow_evaluation")
+    assert both.scenarios == ("seek_and_kill", "health_gathering")
+    assert read_plan(tmp_path) == both
+    assert write_plan(tmp_path, dataclasses.replace(two, scenarios=None)).scenarios is None
+    assert [p.name for p in tmp_path.iterdir()] == ["plan.json"]
+
+
+def test_scales_are_not_mixed(tmp_path):
+    write_plan(tmp_path, Plan(names=("rainbow_evaluation",)))
+    with pytest.raises(
+        ConfigError, match=r"--scale: got 0.5, but the results there have 1, and scales cannot be mixed"
+    ):
+        write_plan(tmp_path, Plan(names=("rainbow_evaluation",), scale=0.5))
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"schema": 1}', "[]"])
+def test_a_damaged_plan_is_named(tmp_path, text):
+    (tmp_path / "plan.json").write_text(text)
+    with pytest.raises(ConfigError, match=r"plan\.json cannot be read: .*; move it aside to plan anew"):
+        read_plan(tmp_path)
+
+
+def test_a_plan_of_another_schema_is_refused(tmp_path):
+    (tmp_path / "plan.json").write_text(json.dumps({"schema": 9}))
+    with pytest.raises(ConfigError, match=r"plan\.json: schema 9, want 1"):
+        read_plan(tmp_path)
+
+
+def test_a_results_directory_that_cannot_be_made_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"--results: .*file/results cannot be written: Not a directory"):
+        write_plan(tmp_path / "file" / "results", Plan(names=("rainbow_evaluation",)))
+
+
+@pytest.mark.parametrize("text", ["", "3", "0/2", "3/2", "1/0", "a/b", "-1/2"])
+def test_a_bad_shard_is_refused(text):
+    with pytest.raises(ConfigError, match=rf"--shard: got '{text}', want i/n with i from 1 to n"):
+        parse_shard(text)
+
+
+def test_a_shard_is_two_numbers():
+    assert parse_shard("2/3") == (2, 3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"names": ()}, "experiments: got none, want at least one name"),
+        ({"names": ("nope",)}, "unknown experiment 'nope'"),
+        ({"names": ("quick_comparison",), "scenarios": ("nope",)}, "unknown scenario 'nope'"),
+        (
+            {"names": ("quick_comparison",), "scenarios": ("seek_and_kill",)},
+            "--scenario: got seek_and_kill, but quick_comparison has defend_the_center",
+        ),
+    ],
+)
+def test_a_plan_that_cannot_be_run_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Plan(**arguments)
+
+
+def test_two_experiments_that_want_one_run_differently_are_refused():
+    full = experiments()["rainbow_evaluation"]
+    experiments()["rainbow_evaluation_twice"] = dataclasses.replace(full, total_updates=400_000)
+    try:
+        with pytest.raises(
+            ConfigError, match=r"run rainbow_4task/.* is to have 400000 gradient steps .* gives it 200000"
+        ):
+            Plan(names=("rainbow_evaluation", "rainbow_evaluation_twice"))
+    finally:
+        del experiments()["rainbow_evaluation_twice"]

@@ -1,0 +1,175 @@
+"""The scheduler with real processes: small Python programs in place of training."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from gvz.errors import ConfigError
+from gvz.experiments import progress
+from gvz.experiments.jobs import Command, Outlook, RunningJob, Slot
+from gvz.experiments.schedule import gpus, make_slots, run_jobs
+
+CORES = tuple(sorted(os.sched_getaffinity(0)))
+SLOT = Slot(cores=CORES, environment={})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Program:
+    """A job that writes its file: `first`, then `second` when that one's text is there."""
+
+    id: str
+    results: Path
+    first: str = "pass"
+    second: str | None = None
+
+    def outlook(self) -> Outlook:
+        done = self.file.read_text() if self.file.exists() else ""
+        for step, code in (("first", self.first), ("second", self.second)):
+            if code is not None and f"{step} done" not in done:
+                ending = f"\nopen({str(self.file)!r}, 'a').write('{step} done ')"
+                return Outlook(next=Command(step=step, arguments=("-c", code + ending), total=1), begun=True, text="")
+        return Outlook(next=None, begun=True, text="")
+
+    def done_count(self, step: str) -> int:
+        return 0
+
+    @property
+    def file(self) -> Path:
+        return self.results / f"{self.id}.txt"
+
+
+def log(job: Program) -> str:
+    return progress.log_file(job.results, job.id).read_text()
+
+
+def wait_for(file: Path) -> None:
+    deadline = time.monotonic() + 60
+    while not file.exists():
+        assert time.monotonic() < deadline, f"waited 60 s for {file}"
+        time.sleep(0.05)
+
+
+def test_jobs_are_done_command_by_command_and_done_ones_are_left_alone(tmp_path, capsys):
+    two = Program(id="two", results=tmp_path, first="print('one')", second="print('two')")
+    done = Program(id="done", results=tmp_path, first="raise SystemExit(9)")
+    done.file.write_text("first done")
+    assert run_jobs([two, done], [SLOT]) == 0
+    assert two.file.read_text() == "first done second done "
+    assert log(two).count("# ended with exit code 0") == 2
+    assert not progress.log_file(tmp_path, "done").exists()
+    assert "done: two" in capsys.readouterr().err
+
+
+def test_a_failure_sinks_no_other_job_and_is_named_with_its_log(tmp_path, capsys):
+    bad = Program(id="bad/one", results=tmp_path, first="print('no luck today'); raise SystemExit(3)")
+    liar = Program(id="liar", results=tmp_path, first="import os; os._exit(0)")
+    killed = Program(id="killed", results=tmp_path, first="import os; os.kill(os.getpid(), 9)")
+    good = Program(id="good", results=tmp_path)
+    assert run_jobs([bad, liar, killed, good], make_slots(2, CORES, ())) == 1
+    assert good.file.exists()
+    err = capsys.readouterr().err
+    assert f"FAILED (first: exit code 3; log {tmp_path}/logs/bad/one.log): bad/one" in err
+    assert "no luck today" in err
+    assert "it ended as if all were done, but" in err
+    assert "exit code 137" in err
+    assert "3 jobs failed; the same command tries them again:" in err
+    assert progress.job_state(tmp_path, "bad/one", done=False, begun=True) == "failed"
+
+
+def test_a_job_stays_on_its_cores_and_has_its_slot_s_environment(tmp_path):
+    shown = "import os; print(sorted(os.sched_getaffinity(0)), os.environ['CUDA_VISIBLE_DEVICES'])"
+    job = Program(id="shown", results=tmp_path, first=shown)
+    assert run_jobs([job], [Slot(cores=CORES[:1], environment={"CUDA_VISIBLE_DEVICES": "7"})]) == 0
+    assert f"[{CORES[0]}] 7" in log(job)
+
+
+def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("gvz.experiments.schedule.LOCKED_TIMEOUT_S", 1.0)
+    job = Program(id="held", results=tmp_path, first="import time; time.sleep(60)")
+    command = job.outlook().next
+    assert command is not None
+    holder = RunningJob.start(job, command, SLOT)
+    assert holder is not None
+    try:
+        assert RunningJob.start(job, command, SLOT) is None
+        assert run_jobs([job, Program(id="free", results=tmp_path)], [SLOT]) == 1
+    finally:
+        holder.kill()
+    assert "left alone: held, which another process is at" in capsys.readouterr().err
+    assert holder.poll() == 137
+
+
+RUNNER = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {directory!r})
+from test_schedule import SLOT, Program
+from gvz.experiments.schedule import run_jobs
+code = '''
+import os, pathlib, signal, sys, time
+def saved(*_):
+    pathlib.Path({saved!r}).write_text("saved")
+    sys.exit(130)
+signal.signal(signal.SIGINT, saved); signal.signal(signal.SIGTERM, saved)
+pathlib.Path({pid!r} + ".new").write_text(str(os.getpid())); os.rename({pid!r} + ".new", {pid!r})
+time.sleep(100)
+'''
+sys.exit(run_jobs([Program(id="slow", results=Path({results!r}), first=code)], [SLOT]))
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
+def test_a_signal_reaches_the_jobs_which_save_and_none_is_left(tmp_path, number, code):
+    pid, saved = tmp_path / "pid", tmp_path / "saved"
+    text = RUNNER.format(directory=str(Path(__file__).parent), saved=str(saved), pid=str(pid), results=str(tmp_path))
+    runner = subprocess.Popen([sys.executable, "-c", text])
+    try:
+        wait_for(pid)
+        runner.send_signal(number)
+        assert runner.wait(60) == code
+    finally:
+        runner.kill()
+    wait_for(saved)
+    deadline = time.monotonic() + 30
+    while progress.is_locked(progress.log_file(tmp_path, "slow")):
+        assert time.monotonic() < deadline, "the job holds its log still"
+        time.sleep(0.05)
+    assert progress.job_state(tmp_path, "slow", done=False, begun=True) == "stopped"
+
+
+@pytest.mark.parametrize(
+    ("jobs", "cores", "devices", "shares"),
+    [
+        (None, range(4), (), [(0, 2), (1, 3)]),
+        (None, range(1), (), [(0,)]),
+        (3, range(2), (), [(0,), (1,), (0,)]),
+        (None, range(4), ("0",), [(0, 1, 2, 3)]),
+    ],
+)
+def test_cores_are_shared_out(jobs, cores, devices, shares):
+    assert [slot.cores for slot in make_slots(jobs, list(cores), devices)] == shares
+
+
+def test_jobs_of_one_gpu_share_its_memory():
+    slots = make_slots(4, range(8), ("0", "3"))
+    assert [slot.environment["CUDA_VISIBLE_DEVICES"] for slot in slots] == ["0", "3", "0", "3"]
+    assert {slot.environment["XLA_PYTHON_CLIENT_MEM_FRACTION"] for slot in slots} == {"0.450"}
+    assert make_slots(2, range(8), ("0", "3"))[0].environment.keys() == {"CUDA_VISIBLE_DEVICES"}
+
+
+def test_hidden_gpus_are_not_used(monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert gpus() == ()
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,5")
+    assert gpus() == ("2", "5")
+
+
+def test_no_jobs_at_once_is_refused():
+    with pytest.raises(ConfigError, match="--jobs: got 0, want at least 1"):
+        make_slots(0, CORES, ())
