@@ -90,7 +90,11 @@ class PlanCommand:
 
         plan, slots = self.ask.plan(), self.ask.slots()
         index, count = parse_shard(self.ask.shard)
-        rates = _rates(plan, slots[0], again=self.measure)
+        try:
+            rates = _rates(plan, slots[0], again=self.measure)
+        except KeyboardInterrupt:
+            print("interrupted; nothing was remembered of the rate that was being measured", file=sys.stderr)
+            return 130
         evaluations = plan.evaluations()
         costs = {run.id: run_cost(run, evaluations[run.id], plan.scale, rates[run.config]) for run in plan.runs()}
         mine = shard(plan.runs(), index, count)

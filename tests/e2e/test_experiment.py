@@ -1,0 +1,93 @@
+"""The real command on real Doom: two experiments that share a run; one job is killed in the middle, run again."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import psutil
+import pytest
+
+from gvz.experiments import progress
+from gvz.experiments.plan import read_plan
+
+pytestmark = [pytest.mark.e2e, pytest.mark.engine, pytest.mark.timeout(600)]
+
+RAINBOW = "rainbow_4task/defend_the_center/train4/seed_1111"
+DQN = "dqn_4task/defend_the_center/train4/seed_1111"
+
+
+def command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "gvz.cli", "experiment", *arguments]
+
+
+def begin(results: Path) -> subprocess.Popen[str]:
+    names = ("algorithm_comparison", "rainbow_evaluation")
+    flags = ("--results", str(results), "--scale", "0.001", "--jobs", "2")
+    return subprocess.Popen(command("run", *names, *flags), stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+
+def training_process(runner: subprocess.Popen[str], run: str) -> psutil.Process:
+    (found,) = [p for p in psutil.Process(runner.pid).children() if any(a.endswith(run) for a in p.cmdline())]
+    return found
+
+
+def wait_for(path: Path, runner: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + 300
+    while not path.exists():
+        assert runner.poll() is None, runner.communicate()[1]
+        assert time.monotonic() < deadline, f"waited 300 s for {path}"
+        time.sleep(0.02)
+
+
+def test_a_killed_job_sinks_no_other_goes_on_when_run_again_and_every_episode_is_there_once(tmp_path):
+    results = tmp_path / "results"
+    runner = begin(results)
+    wait_for(results / "runs" / RAINBOW / "checkpoints" / "100", runner)
+    training_process(runner, RAINBOW).kill()
+    _, err = runner.communicate(timeout=400)
+    assert runner.returncode == 1, err
+    assert f"exit code 137; log {results}/logs/{RAINBOW}.log): {RAINBOW}" in err
+    assert f"done: {DQN}" in err
+    assert "done: players/random" in err
+    status = subprocess.run(command("status", "--results", str(results)), capture_output=True, text=True, check=False)
+    assert status.returncode == 1
+    assert f"failed   {RAINBOW}" in status.stdout
+
+    again = begin(results)
+    _, err = again.communicate(timeout=400)
+    assert again.returncode == 0, err
+    assert "goes on from update 100" in progress.log_file(results, RAINBOW).read_text()
+    status = subprocess.run(command("status", "--results", str(results)), capture_output=True, text=True, check=False)
+    assert status.returncode == 0, status.stdout
+    assert status.stdout.count("done  ") == 3
+
+    plan = read_plan(results)
+    assert plan is not None
+    for run in plan.runs():
+        wanted = plan.evaluations()[run.id]
+        file = progress.run_directory(results, run) / "evaluation.jsonl"
+        played = Counter(
+            (row["num_updates"], row["task"], row["episode"]) for row in map(json.loads, file.read_text().splitlines())
+        )
+        assert set(played.values()) == {1}
+        assert played.keys() == {(c, t, n) for c in run.checkpoints for t in wanted.tasks for n in range(2)}
+
+
+def test_ctrl_c_saves_what_is_being_trained_and_leaves_nothing_running(tmp_path):
+    runner = begin(tmp_path)
+    try:
+        wait_for(tmp_path / "runs" / DQN / "metrics.jsonl", runner)
+        children = psutil.Process(runner.pid).children(recursive=True)
+        os.killpg(runner.pid, signal.SIGINT)
+        _, err = runner.communicate(timeout=120)
+    finally:
+        runner.kill()
+    assert runner.returncode == 130, err
+    assert "2 jobs save themselves" in err
+    assert not [p for p in children if p.is_running() and p.status() != psutil.STATUS_ZOMBIE]
+    assert list((tmp_path / "runs" / DQN / "checkpoints").iterdir())
