@@ -1,6 +1,7 @@
 """Experiments as data: every one there is, the published numbers by their own averages, and what is refused."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -133,3 +134,10 @@ def test_an_experiment_that_cannot_be_is_refused(changes, message):
 def test_an_unknown_name_is_answered_with_the_nearest():
     with pytest.raises(ConfigError, match=r"unknown experiment 'training_size'.*training_set_size"):
         experiment_named("training_size")
+
+
+def test_the_page_lists_every_experiment_with_its_size():
+    page = (Path(__file__).parents[2] / "docs" / "EXPERIMENTS.md").read_text()
+    for experiment in experiments().values():
+        (line,) = [line for line in page.splitlines() if line.startswith(f"| `{experiment.name}` |")]
+        assert line.endswith(f"| {len(experiment.runs())} | {experiment.total_updates:,} |")
