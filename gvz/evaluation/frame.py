@@ -37,6 +37,7 @@ OPTIONAL: dict[str, pl.DataType] = {
     "run_seed": pl.Int64(),
     "num_updates": pl.Int64(),
     "params": pl.String(),
+    "base_seed": pl.Int64(),
     "profile": pl.String(),
     "action_set": pl.String(),
     "frame_skip": pl.Int64(),
@@ -156,12 +157,13 @@ def _read_file(file: Path) -> tuple[pl.DataFrame, list[str]]:
         run_dir=pl.when(pl.col("run").is_not_null()).then(pl.lit(str(file.parent))),
         trained_on=pl.when(pl.col("run").is_not_null()).then(pl.lit(trained_on, pl.List(pl.String()))),
         truncated=pl.coalesce("truncated", ~pl.col("terminated")),
+        base_seed=pl.col("base_seed").fill_null(0),
     )
     tasks, unknown = _task_columns(frame)
     problems += [f"{file}: {message}" for message in (*trouble, *unknown)]
-    return frame.join(tasks, on=["task", "profile"], how="left", nulls_equal=True).with_columns(
-        normalized_score=pl.coalesce("normalized_score", normalize(pl.col("score"), pl.col("bound")))
-    ).drop("bound"), problems  # fmt: skip
+    frame = frame.join(tasks, on=["task", "profile"], how="left", nulls_equal=True)
+    percent = normalize(pl.col("score"), pl.col("bound"))
+    return frame.with_columns(normalized_score=pl.coalesce("normalized_score", percent)).drop("bound"), problems
 
 
 _FIELDS = REQUIRED | OPTIONAL

@@ -1,0 +1,132 @@
+"""What stands at the head of a report: what was run, with which budget, what beats what, and how far to believe it.
+
+Imports polars, gvz.evaluation.metrics, gvz.reports.
+"""
+
+import itertools
+from collections.abc import Sequence
+
+import polars as pl
+
+from gvz.evaluation.metrics import bootstrap_runs, difference, mean, probability_of_improvement
+from gvz.reports.results import Results
+from gvz.reports.scenario_section import agents_of, played_tasks
+from gvz.reports.scores import Scores, agent_scores, redraw
+from gvz.tasks import named_tasks, scenario_named, scenarios
+
+ENOUGH_SEEDS = 3
+"""training seeds of the thesis's protocol; fewer are said in the report's head"""
+
+
+def what_was_run(results: Results) -> list[str]:
+    """Sentences on runs, budgets and episodes."""
+    sentences = []
+    for asked in results.asked:
+        e = asked.experiment
+        sentences.append(
+            f"Experiment “{e.title}”: {len(e.runs())} runs of {e.total_updates:,} gradient steps asked for"
+            + (f", at scale {asked.scale:g} of the full experiment." if asked.scale < 1 else ".")
+        )
+    if results.runs:
+        steps = sorted({run.total_updates for run in results.runs})
+        budget = f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}"
+        seeds = {run.seed for run in results.runs}
+        agents = sorted(set(results.agents.values()))
+        sentences.append(
+            f"{_count(len(results.runs), 'training run')} of {_count(len(agents), 'agent')} ({', '.join(agents)}), "
+            f"{_count(len(seeds), 'training seed')}, {budget} gradient steps each."
+        )
+    tasks = results.episodes["task"].n_unique()
+    players = results.episodes.filter(pl.col("run").is_null())["player"].unique().sort().to_list()
+    beside = f", among them players that do not learn: {', '.join(players)}" if players else ""
+    sentences.append(f"{len(results.episodes):,} evaluation episodes on {_count(tasks, 'task')}{beside}.")
+    return sentences
+
+
+def what_beats_what(results: Results) -> list[str]:
+    """For each scenario the agents in order, each compared with the next on the tasks that all have."""
+    sentences = []
+    for name in scenarios():
+        episodes = results.episodes.filter(scenario=name).drop_nulls("normalized_score")
+        scores = {agent: agent_scores(episodes, agent) for agent in agents_of(episodes)}
+        tasks = _common_tasks(name, episodes, scores)
+        if len(scores) < 2 or not tasks:
+            continue
+        means = {
+            agent: bootstrap_runs([one.cells(tasks)], mean, num_resamples=1).value for agent, one in scores.items()
+        }
+        order = sorted(means, key=lambda agent: -means[agent])
+        compared = [_comparison(scores, better, worse, tasks) for better, worse in itertools.pairwise(order)]
+        over = f"{scenario_named(name).title}, {_described(name, tasks)}"
+        sentences.append(f"{over}: {'; '.join(compared)}.")
+    return sentences
+
+
+def _common_tasks(scenario: str, episodes: pl.DataFrame, scores: dict[str, Scores]) -> list[str]:
+    """The test tasks if all agents have them, else all the tasks that all agents have."""
+    test = [task.id for task in named_tasks(scenario, split="test")]
+    if all(one.complete_seeds(test) for one in scores.values()):
+        return test
+    return [task.id for task in played_tasks(episodes) if all(one.complete_seeds([task.id]) for one in scores.values())]
+
+
+def _described(scenario: str, tasks: Sequence[str]) -> str:
+    if set(tasks) == {task.id for task in named_tasks(scenario, split="test")}:
+        return "mean of the 7 test tasks"
+    if len(tasks) == 1:
+        return tasks[0].partition("/")[2]
+    return f"mean of the {len(tasks)} tasks that all played"
+
+
+def _comparison(scores: dict[str, Scores], better: str, worse: str, tasks: Sequence[str]) -> str:
+    pair = [scores[better], scores[worse]]
+    cells = [one.cells(tasks) for one in pair]
+    how = redraw(pair) if all(len(runs) > 1 for runs in cells) else "episodes"
+    gain = bootstrap_runs(cells, difference, redraw=how, num_resamples=1000)
+    if gain.low <= 0:
+        return f"{better} and {worse} are not told apart ({gain} points)"
+    said = f"{better} beats {worse} by {gain} points"
+    if how == "episodes":
+        return said
+    return f"{said}, probability of improvement {probability_of_improvement(*_means(cells)):.2f}"
+
+
+def _means(cells: Sequence) -> list:
+    import numpy as np
+
+    return [np.array([[np.mean(cell) for cell in run] for run in runs]) for runs in cells]
+
+
+def caveats(results: Results) -> list[str]:
+    """What keeps the numbers from reaching far."""
+    found = []
+    if small := sorted({asked.scale for asked in results.asked if asked.scale < 1}):
+        found.append(
+            f"Scale {small[0]:g}: budgets, episodes and grid are shrunk. This shows that the pipeline works, and "
+            "nothing of what the agents can do at full size."
+            if small[0] < 0.1
+            else f"Scale {small[0]:g}: budgets and episodes are shrunk; not comparable with published numbers."
+        )
+    seeds = {agent: set() for agent in results.agents.values()}
+    for run in results.runs:
+        seeds[results.agents[str(run.path)]].add(run.seed)
+    if few := sorted(agent for agent, one in seeds.items() if len(one) < ENOUGH_SEEDS):
+        found.append(
+            f"Fewer than {ENOUGH_SEEDS} training seeds of {', '.join(few)}: differences between agents may be "
+            "differences between seeds."
+        )
+    unfinished = [r.id for r in results.runs if r.metrics.is_empty() or r.metrics["num_updates"][-1] < r.total_updates]
+    if unfinished:
+        found.append(f"Not trained to the end (or without metrics): {', '.join(unfinished)}.")
+    there = {str(run.path) for run in results.runs}
+    for asked in results.asked:
+        absent = [run.id for run in asked.experiment.runs() if str(asked.results / "runs" / run.id) not in there]
+        if absent:
+            found.append(
+                f"{asked.experiment.title}: {len(absent)} of {len(asked.experiment.runs())} runs are not there yet."
+            )
+    return found
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"

@@ -1,0 +1,117 @@
+"""Curves over gradient steps, as numbers: scores of training episodes and of evaluated checkpoints.
+
+Imports numpy, polars, gvz.evaluation.metrics, gvz.reports.scores.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from gvz.evaluation.metrics import bootstrap_runs
+from gvz.reports.results import Run
+from gvz.reports.scores import Scores, pick, redraw
+
+WINDOW_EPISODES = 30
+"""training episodes in a running mean, as in the trainer's own KPI"""
+
+GRID_POINTS = 100
+"""gradient steps at which learning curves of several runs are averaged"""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Curve:
+    """A line with its band and, if it is of one run, the episodes behind it. All float64 of one length each."""
+
+    label: str
+    updates: np.ndarray
+    values: np.ndarray
+    """percent of the upper bound"""
+    low: np.ndarray
+    high: np.ndarray
+    points: tuple[np.ndarray, np.ndarray] | None = None
+    """gradient steps and scores of single episodes"""
+
+
+def running_mean(values: np.ndarray, window: int) -> np.ndarray:
+    """Mean of each value and up to `window - 1` before it, float64[N]."""
+    sums = np.cumsum(np.concatenate([[0.0], values]))
+    ends = np.arange(1, len(values) + 1)
+    starts = np.maximum(0, ends - window)
+    return (sums[ends] - sums[starts]) / (ends - starts)
+
+
+def learning_curve(label: str, runs: Sequence[Run], tasks: Sequence[str]) -> Curve | None:
+    """Running mean of the scores of training episodes, mean over the tasks and then over the training seeds.
+
+    Args:
+        label: of the line.
+        runs: of one agent; several of one seed if every task has a run of its own.
+        tasks: only episodes of these; a seed that has none of one of them is left out.
+
+    Returns: the curve with the band of redrawn seeds, or None without any episodes.
+    """
+    found: dict[int, dict[str, tuple[np.ndarray, np.ndarray]]] = {}
+    for run in runs:
+        for task in tasks:
+            rows = run.training_episodes.filter(task=task).drop_nulls("normalized_score").sort("num_updates")
+            if len(rows):
+                found.setdefault(run.seed, {})[task] = (
+                    rows["num_updates"].to_numpy().astype(np.float64),
+                    rows["normalized_score"].to_numpy(),
+                )
+    complete = [by_task for by_task in found.values() if len(by_task) == len(tasks)]
+    if not complete:
+        return None
+    series = [one for by_task in complete for one in by_task.values()]
+    begin, end = max(updates[0] for updates, _ in series), min(updates[-1] for updates, _ in series)
+    if begin > end:
+        return None
+    grid = np.linspace(begin, end, GRID_POINTS)
+    lines = np.array([np.mean([_held(one, grid) for one in by_task.values()], axis=0) for by_task in complete])
+    drawn = np.random.default_rng(0).integers(len(lines), size=(500, len(lines)))
+    low, high = np.quantile(lines[drawn].mean(axis=1), [0.025, 0.975], axis=0)
+    points = None
+    if len(complete) == 1:
+        points = (np.concatenate([updates for updates, _ in series]), np.concatenate([scores for _, scores in series]))
+    return Curve(label=label, updates=grid, values=lines.mean(axis=0), low=low, high=high, points=points)
+
+
+def _held(series: tuple[np.ndarray, np.ndarray], grid: np.ndarray) -> np.ndarray:
+    """The running mean as it stood at each point of the grid."""
+    updates, scores = series
+    return running_mean(scores, WINDOW_EPISODES)[np.searchsorted(updates, grid, side="right") - 1]
+
+
+def evaluation_curve(label: str, episodes: pl.DataFrame, tasks: Sequence[str], agents_of_tasks: bool) -> Curve | None:
+    """Mean evaluation score of each checkpoint over tasks and training seeds, with its interval.
+
+    Args:
+        label: of the line.
+        episodes: rows of one agent; the n-th checkpoints of its runs are taken together.
+        tasks: only these; a seed that lacks one of them at a checkpoint is left out there.
+        agents_of_tasks: every task has agents of its own.
+
+    Returns: the curve, or None if no checkpoint has all tasks.
+    """
+    rows = episodes.filter(pl.col("task").is_in(tasks)).with_columns(
+        nth=pl.col("num_updates").rank("dense").over("run_dir")
+    )
+    updates, estimates = [], []
+    for (_,), checkpoint in sorted(rows.drop_nulls("num_updates").group_by("nth")):
+        runs = pick(checkpoint)
+        scores = Scores(runs=runs, wanted_seeds=tuple(runs), agents_of_tasks=agents_of_tasks)
+        if cells := scores.cells(tasks):
+            how = redraw([scores]) if len(cells) > 1 else "episodes"
+            estimates.append(bootstrap_runs([cells], redraw=how, num_resamples=300))
+            updates.append(float(checkpoint["num_updates"].median()))  # pyright: ignore[reportArgumentType]  # not empty
+    if not estimates:
+        return None
+    return Curve(
+        label=label,
+        updates=np.array(updates),
+        values=np.array([e.value for e in estimates]),
+        low=np.array([e.low for e in estimates]),
+        high=np.array([e.high for e in estimates]),
+    )

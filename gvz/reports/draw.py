@@ -1,0 +1,214 @@
+"""Figures of a report. Imports matplotlib, numpy, gvz.reports.{curves,document}.
+
+A figure is one panel about as wide as a telephone, so that a page can set as many side by side as it has room for.
+Each is written as SVG, PDF and PNG; the page holds the SVG.
+"""
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Picture
+from matplotlib.ticker import FuncFormatter
+
+from gvz.reports.curves import Curve
+from gvz.reports.document import Figure
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
+"""Okabe and Ito's, which can be told apart without seeing all colours; brown in place of yellow"""
+GREY = "#777777"
+PANEL_INCHES = (4.2, 3.0)
+STYLE: dict[Any, Any] = {
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 10,
+    "axes.grid": True,
+    "grid.color": "#e4e4e4",
+    "axes.axisbelow": True,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "svg.hashsalt": "gvz",  # the same numbers give the same bytes
+    "figure.constrained_layout.use": True,
+}
+
+
+def colour(number: int) -> str:
+    """Of the n-th line of a panel."""
+    return COLOURS[number % len(COLOURS)]
+
+
+def draw_curves(
+    out: Path,
+    id: str,
+    title: str,
+    curves: Sequence[Curve | None],
+    caption: str,
+    levels: Mapping[str, float] | None = None,
+) -> Figure:
+    """Lines over gradient steps with their bands; dots where a line is of one run.
+
+    Args:
+        out: directory of the report.
+        id: of the figure.
+        title: above the panel.
+        curves: in the order of their colours; None keeps a colour free, so that panels side by side agree.
+        caption: below it.
+        levels: name and score of players that do not learn, drawn as level lines.
+    """
+    with mpl.rc_context(STYLE):
+        picture, axes = _panel(title, "gradient steps", "score, % of the bound")
+        for number, curve in enumerate(curves):
+            if curve is None:
+                continue
+            line = colour(number)
+            if curve.points is not None:
+                axes.plot(*curve.points, ".", markersize=1.5, alpha=0.2, color=line, rasterized=True)
+            mark = "o" if len(curve.updates) <= 20 else ""
+            axes.plot(curve.updates, curve.values, marker=mark, markersize=3, color=line, label=curve.label)
+            axes.fill_between(curve.updates, curve.low, curve.high, color=line, alpha=0.15, linewidth=0)
+        for number, (name, value) in enumerate((levels or {}).items()):
+            axes.axhline(value, color=GREY, linestyle=("--", ":", "-.")[number % 3], linewidth=1, label=name)
+        axes.set_ylim(0, None)
+        axes.xaxis.set_major_formatter(FuncFormatter(_short_number))
+        _legend(picture, axes)
+        return _written(picture, out, id, caption)
+
+
+def draw_histogram(
+    out: Path, id: str, title: str, scores: Mapping[str, np.ndarray], caption: str, top: float = 100.0
+) -> Figure:
+    """How an agent's episodes spread over the scores, an outline each.
+
+    Args:
+        out, id, title, caption: as of `draw_curves`.
+        scores: agent -> percent of the upper bound of single episodes; an agent without any keeps its colour.
+        top: the highest score shown.
+    """
+    with mpl.rc_context(STYLE):
+        picture, axes = _panel(title, "score, % of the bound", "share of episodes, %")
+        edges = np.linspace(0, max(top, *(values.max() for values in scores.values() if len(values))), 26)
+        for number, (agent, values) in enumerate(scores.items()):
+            if len(values):
+                share = 100 * np.histogram(values, edges)[0] / len(values)
+                axes.stairs(share, edges, color=colour(number), label=agent, linewidth=1.4)
+        axes.set_ylim(0, None)
+        _legend(picture, axes)
+        return _written(picture, out, id, caption)
+
+
+def draw_heat_map(
+    out: Path,
+    id: str,
+    title: str,
+    tasks: Sequence[tuple[str, int, Sequence[str]]],
+    attributes: Sequence[str],
+    scores: Mapping[str, Sequence[float | None]],
+    caption: str,
+) -> Figure:
+    """Tasks as rows: dots for the attributes each has, then its score with every agent.
+
+    Args:
+        out, id, title, caption: as of `draw_curves`.
+        tasks: name, level, attributes.
+        attributes: all there are, in the order of their columns.
+        scores: agent -> mean score in percent of the bound by task, None where there is none.
+    """
+    num_marks, num_agents = len(attributes), len(scores)
+    width = 1.9 + 0.22 * num_marks + 0.62 * num_agents
+    with mpl.rc_context({**STYLE, "axes.grid": False}):
+        picture = Picture(figsize=(max(PANEL_INCHES[0], width), 1.7 + 0.24 * len(tasks)))
+        marks, heat = picture.subplots(1, 2, sharey=True, width_ratios=(0.22 * num_marks, 0.62 * num_agents))
+        picture.suptitle(title, fontsize=10)
+        table = np.array([[np.nan if v is None else v for v in values] for values in scores.values()]).T
+        heat.imshow(table, aspect="auto", cmap="viridis", vmin=0, vmax=100)
+        for (row, column), value in np.ndenumerate(table):
+            text = "-" if np.isnan(value) else f"{value:.0f}"
+            shade = "white" if value < 60 else "black"
+            heat.text(column, row, text, ha="center", va="center", fontsize=8, color=GREY if np.isnan(value) else shade)
+        heat.set_xticks(range(num_agents), list(scores), rotation=60, ha="left", rotation_mode="anchor")
+        for row, (_, _, having) in enumerate(tasks):
+            marks.plot(range(num_marks), [row] * num_marks, ".", color="#dddddd", markersize=5)
+            columns = [attributes.index(name) for name in having]
+            marks.plot(columns, [row] * len(columns), "-", color="black", linewidth=1)
+            marks.plot(columns, [row] * len(columns), "o", color="black", markersize=4.5)
+        marks.set_xticks(range(num_marks), list(attributes), rotation=60, ha="left", rotation_mode="anchor")
+        marks.set_xlim(-0.7, num_marks - 0.3)
+        marks.set_yticks(range(len(tasks)), [f"{level}  {name}" for name, level, _ in tasks])
+        for axes in (marks, heat):
+            axes.xaxis.tick_top()
+            axes.tick_params(length=0, labelsize=8)
+            axes.spines[:].set_visible(False)
+            for row in (n for n in range(1, len(tasks)) if tasks[n][1] != tasks[n - 1][1]):
+                axes.axhline(row - 0.5, color="#999999", linewidth=0.8)
+        return _written(picture, out, id, caption, wide=True)
+
+
+def draw_bars(
+    out: Path, id: str, title: str, values: Mapping[str, Mapping[str, float]], xlabel: str, caption: str
+) -> Figure:
+    """Grouped horizontal bars.
+
+    Args:
+        out, id, title, caption: as of `draw_curves`.
+        values: agent -> bar -> length; a bar that an agent lacks is left out, and so is an agent without any.
+        xlabel: what the length is.
+    """
+    bars = list(dict.fromkeys(bar for lengths in values.values() for bar in lengths))
+    with mpl.rc_context(STYLE):
+        picture, axes = _panel(title, xlabel, "", inches=(PANEL_INCHES[0], 0.9 + 0.16 * len(bars) * (len(values) + 1)))
+        thick = 0.84 / len(values)
+        for number, (agent, lengths) in enumerate(values.items()):
+            if not lengths:
+                continue
+            at = np.array([bars.index(bar) for bar in lengths]) + (number - (len(values) - 1) / 2) * thick
+            axes.barh(at, list(lengths.values()), height=thick, color=colour(number), label=agent)
+        axes.set_yticks(range(len(bars)), bars)
+        axes.invert_yaxis()
+        axes.axvline(0, color="black", linewidth=0.8)
+        axes.grid(visible=False, axis="y")
+        _legend(picture, axes)
+        return _written(picture, out, id, caption)
+
+
+def _panel(title: str, xlabel: str, ylabel: str, inches: tuple[float, float] = PANEL_INCHES) -> tuple[Picture, Axes]:
+    picture = Picture(figsize=inches)
+    axes = picture.subplots()
+    axes.set(title=title, xlabel=xlabel, ylabel=ylabel)
+    return picture, axes
+
+
+def _legend(picture: Picture, axes: Axes) -> None:
+    """Below the panel, where it hides nothing."""
+    handles, _ = axes.get_legend_handles_labels()
+    if handles:
+        columns = 1 if max(len(str(h.get_label())) for h in handles) > 26 else 2
+        picture.set_figheight(picture.get_figheight() + 0.17 * -(-len(handles) // columns))
+        picture.legend(loc="outside lower center", ncols=columns)
+
+
+def _short_number(value: float, _: int) -> str:
+    """20000 -> 20K."""
+    for size, letter in ((1e6, "M"), (1e3, "K")):
+        if abs(value) >= size:
+            return f"{value / size:g}{letter}"
+    return f"{value:g}"
+
+
+def _written(picture: Picture, out: Path, id: str, caption: str, *, wide: bool = False) -> Figure:
+    directory = out / "figures"
+    directory.mkdir(parents=True, exist_ok=True)
+    layout = picture.get_layout_engine()
+    assert layout is not None
+    layout.execute(picture)
+    picture.set_layout_engine("none")  # once for all three files: it takes longer than drawing
+    svg = io.BytesIO()
+    picture.savefig(svg, format="svg", metadata={"Date": None})
+    picture.savefig(directory / f"{id}.pdf", metadata={"CreationDate": None})
+    picture.savefig(directory / f"{id}.png", dpi=150)
+    (directory / f"{id}.svg").write_bytes(svg.getvalue())
+    return Figure(id=id, caption=caption, svg=svg.getvalue(), wide=wide)

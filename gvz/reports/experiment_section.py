@@ -1,0 +1,295 @@
+"""The section of an experiment: its table as in the thesis, aggregates, comparisons, curves.
+
+Imports polars, gvz.evaluation.metrics, gvz.experiments, gvz.reports.
+"""
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from gvz.evaluation.metrics import (
+    Statistic,
+    difference,
+    interquartile_mean,
+    mean,
+    mean_over_scenarios,
+    median,
+    probability_of_improvement,
+)
+from gvz.experiments.base import Experiment, TrainingRun
+from gvz.experiments.progress import run_directory
+from gvz.reports.curves import evaluation_curve, learning_curve
+from gvz.reports.document import Block, Cell, Figure, Section, Table, missing, theirs, words
+from gvz.reports.draw import draw_curves
+from gvz.reports.results import Asked, Results
+from gvz.reports.scores import Scores, estimate, estimate_groups, pick
+from gvz.tasks import parse_task, scenario_named
+
+_COLUMN_TITLES = {"train1": "1 task", "train4": "4 tasks", "train8": "8 tasks"}
+
+
+def experiment_section(results: Results, asked: Asked, out: Path) -> Section:
+    """Everything the report says of an experiment."""
+    experiment = asked.experiment
+    budget = (
+        f"{len(experiment.seeds)} training seeds, {experiment.total_updates:,} gradient steps, "
+        f"{experiment.num_checkpoints} checkpoints, {experiment.episodes} evaluation episodes a task and checkpoint; "
+        f"tables are over the last {experiment.table_checkpoints}."
+    )
+    tables = [_table(results, asked), _aggregates(results, asked)]
+    if experiment.columns != "level":
+        tables.append(_comparisons(results, asked))
+    text = (f"**{experiment.question}** Source: {experiment.source}.", budget, *experiment.notes)
+    return Section(
+        id=experiment.name.replace("_", "-"),
+        title=experiment.title,
+        blocks=(
+            Block(text=text, tables=tuple(tables)),
+            Block(heading="Curves", figures=tuple(_figures(results, asked, out))),
+        ),
+    )
+
+
+def column_title(experiment: Experiment, column: str) -> str:
+    """What stands above a column of the experiment's table."""
+    return f"level {column}" if experiment.columns == "level" else _COLUMN_TITLES.get(column, column)
+
+
+def column_scores(
+    results: Results, asked: Asked, scenario: str, column: str, *, last_checkpoints: int | None = None
+) -> tuple[Scores, tuple[str, ...]]:
+    """Scores of the runs of one column in one scenario, and the ids of the tasks they are over.
+
+    Args:
+        results: what was read.
+        asked: the experiment.
+        scenario: id.
+        column: one of the experiment's `column_names`.
+        last_checkpoints: so many of each run; default the experiment's `table_checkpoints`.
+    """
+    experiment = asked.experiment
+    last = experiment.table_checkpoints if last_checkpoints is None else last_checkpoints
+    runs: dict[int | None, dict[str, np.ndarray]] = {}
+    tasks: dict[str, None] = {}
+    for run in column_runs(experiment, scenario, column):
+        wanted = _column_tasks(experiment, run, column)
+        tasks |= dict.fromkeys(wanted)
+        rows = run_episodes(results, asked, run).filter(
+            pl.col("num_updates").rank("dense", descending=True) <= last, pl.col("task").is_in(wanted)
+        )
+        for by_task in pick(rows).values():
+            runs.setdefault(run.seed, {}).update(by_task)
+    own = experiment.evaluate_on == "own"
+    return Scores(runs=runs, wanted_seeds=experiment.seeds, agents_of_tasks=own), tuple(tasks)
+
+
+def column_runs(experiment: Experiment, scenario: str, column: str) -> list[TrainingRun]:
+    """The runs behind a column: all of the scenario's for a level, else those of the training or the config."""
+    runs = [run for run in experiment.runs() if run.scenario == scenario]
+    match experiment.columns:
+        case "level":
+            return runs
+        case "training":
+            return [run for run in runs if run.training == column]
+        case "config":
+            return [run for run in runs if run.config == column]
+
+
+def run_episodes(results: Results, asked: Asked, run: TrainingRun) -> pl.DataFrame:
+    """The evaluation episodes of one run of the experiment."""
+    return results.episodes.filter(run_dir=str(run_directory(asked.results, run)))
+
+
+def _column_tasks(experiment: Experiment, run: TrainingRun, column: str) -> tuple[str, ...]:
+    tasks = experiment.table_tasks(run)
+    return tuple(t for t in tasks if parse_task(t).level == int(column)) if experiment.columns == "level" else tasks
+
+
+def _table(results: Results, asked: Asked) -> Table:
+    """Rows: for every scenario ours and, below, what others published; then the mean over scenarios."""
+    experiment, columns = asked.experiment, asked.experiment.column_names
+    rows = []
+    for scenario in experiment.scenarios:
+        title = scenario_named(scenario).title
+        cells = [estimate(*column_scores(results, asked, scenario, column)) for column in columns]
+        rows.append((words(title), words("ours"), *cells))
+        for who, published in experiment.published.items():
+            if scenario in published:
+                numbers = [theirs(value, 2) for value in published[scenario]]
+                rows.append((words(title), Cell(kind="theirs", text=who), *numbers))
+    if len(experiment.scenarios) > 1:
+        groups = [[column_scores(results, asked, s, column) for s in experiment.scenarios] for column in columns]
+        averages = [estimate_groups(group, mean_over_scenarios) for group in groups]
+        rows.append((words("P_norm: mean over scenarios"), words("ours"), *averages))
+        for who, published in experiment.published.items():
+            if published.keys() >= set(experiment.scenarios):
+                numbers = np.mean([published[s] for s in experiment.scenarios], axis=0)
+                rows.append(
+                    (
+                        words("P_norm: mean over scenarios"),
+                        Cell(kind="theirs", text=who),
+                        *[theirs(v, 2) for v in numbers],
+                    )
+                )
+    return Table(
+        id=experiment.name,
+        caption=f"{experiment.title}: percent of the upper bound ({experiment.source}). Rows in italics are others' "
+        "published numbers, to stand beside ours; nothing of ours is made of them.",
+        columns=("scenario", "numbers", *(column_title(experiment, column) for column in columns)),
+        rows=tuple(rows),
+        notes=(interval_note(experiment),),
+    )
+
+
+def interval_note(experiment: Experiment) -> str:
+    """What the intervals of an experiment's tables are."""
+    if len(experiment.seeds) < 2:
+        return (
+            "Mean [95% bootstrap interval over evaluation episodes]: one training seed, so nothing is said of others."
+        )
+    what = "runs drawn anew within each task" if experiment.evaluate_on == "own" else "training seeds drawn anew, whole"
+    return (
+        f"Mean [95% bootstrap interval, {what}]. With {len(experiment.seeds)} seeds it is about the range of their "
+        "means. Where seeds are missing the cell says so."
+    )
+
+
+def _joined(statistic: Statistic) -> Statistic:
+    """A statistic of all scenarios' runs and tasks as one matrix."""
+    return lambda *groups: statistic(np.concatenate(groups, axis=-1))
+
+
+def _aggregates(results: Results, asked: Asked) -> Table:
+    """Mean, interquartile mean and median over all scenarios' tasks."""
+    experiment = asked.experiment
+    rows = []
+    for column in experiment.column_names:
+        groups = [column_scores(results, asked, scenario, column) for scenario in experiment.scenarios]
+        alike = len({len(scores.cells(tasks)) for scores, tasks in groups}) == 1
+        cells = [
+            estimate_groups(groups, _joined(statistic)) if alike else missing("scenarios differ in seeds")
+            for statistic in (mean, interquartile_mean, median)
+        ]
+        rows.append((words(column_title(experiment, column)), *cells))
+    return Table(
+        id=f"{experiment.name}_aggregates",
+        caption="All tasks of all scenarios together, percent of the upper bound: mean, interquartile mean and median "
+        "of the scores by task and seed.",
+        columns=(experiment.columns, "mean", "IQM", "median"),
+        rows=tuple(rows),
+    )
+
+
+def _comparisons(results: Results, asked: Asked) -> Table:
+    """Each two columns: difference of the means, and how probable it is that the first is better."""
+    experiment = asked.experiment
+    rows = []
+    for worse, better in itertools.combinations(experiment.column_names, 2):
+        for scenario in experiment.scenarios:
+            groups = [column_scores(results, asked, scenario, column) for column in (better, worse)]
+            names = [column_title(experiment, column) for column in (better, worse)]
+            rows.append(
+                (
+                    words(scenario_named(scenario).title),
+                    words(f"{names[0]} against {names[1]}"),
+                    estimate_groups(groups, difference),
+                    estimate_groups(groups, probability_of_improvement, digits=2),
+                )
+            )
+    return Table(
+        id=f"{experiment.name}_comparisons",
+        caption="Difference of the means in points, and probability of improvement: that a run of the first beats one "
+        "of the second on a task, mean over tasks.",
+        columns=("scenario", "compared", "difference", "probability"),
+        rows=tuple(rows),
+    )
+
+
+# ----------------------------------------------------------------------------------------------------- curves
+
+
+def _figures(results: Results, asked: Asked, out: Path) -> list[Figure]:
+    experiment = asked.experiment
+    figures: list[Figure] = []
+    for scenario in experiment.scenarios:
+        if experiment.evaluate_on == "own":
+            figures += _learning_curves(results, asked, scenario, out)
+        elif experiment.columns == "level":
+            figures += _curves_by_level(results, asked, scenario, out)
+        else:
+            figures += _curves_by_task(results, asked, scenario, out)
+    return figures
+
+
+def _learning_curves(results: Results, asked: Asked, scenario: str, out: Path) -> list[Figure]:
+    """Training scores by level, and those of each task of level 1 (thesis Figures 5.2 and 5.3)."""
+    experiment, title = asked.experiment, scenario_named(scenario).title
+    runs = column_runs(experiment, scenario, "0")
+    paths = {str(run_directory(asked.results, run)) for run in runs}
+    trained = [run for run in results.runs if str(run.path) in paths]
+    tasks = list(dict.fromkeys(task for run in runs for task in run.tasks))
+    by_level = {f"level {level}": [task for task in tasks if parse_task(task).level == level] for level in range(5)}
+    of_level_1 = {task.partition("/")[2]: [task] for task in by_level["level 1"]}
+    figures = []
+    for id, lines, what in (("levels", by_level, "by level"), ("level_1", of_level_1, "each task of level 1")):
+        curves = [learning_curve(label, trained, chosen) for label, chosen in lines.items() if chosen]
+        if any(curves):
+            caption = f"{title}: training scores {what}, running mean of 30 episodes; band: training seeds redrawn."
+            figures.append(draw_curves(out, f"{experiment.name}_{scenario}_{id}", title, curves, caption))
+    return figures
+
+
+def what_id(text: str) -> str:
+    """A name as part of a file name."""
+    return "".join(c if c.isalnum() else "_" for c in text)
+
+
+def _curves_by_level(results: Results, asked: Asked, scenario: str, out: Path) -> list[Figure]:
+    """Evaluation scores of checkpoints by level (thesis Figure 5.6)."""
+    experiment, title = asked.experiment, scenario_named(scenario).title
+    runs = column_runs(experiment, scenario, "0")
+    rows = _episodes_of(results, asked, runs)
+    tasks = experiment.table_tasks(runs[0])
+    by_level = [[task for task in tasks if parse_task(task).level == level] for level in range(5)]
+    curves = [evaluation_curve(f"level {n}", rows, chosen, agents_of_tasks=False) for n, chosen in enumerate(by_level)]
+    if not any(curves):
+        return []
+    caption = f"{title}: evaluation of every checkpoint by level, mean over tasks and seeds with 95% interval."
+    return [draw_curves(out, f"{experiment.name}_{scenario}_levels", title, curves, caption)]
+
+
+def _curves_by_task(results: Results, asked: Asked, scenario: str, out: Path) -> list[Figure]:
+    """Evaluation scores of checkpoints on each test task, a line for each column (thesis Figures 5.4 and 5.5)."""
+    experiment, title = asked.experiment, scenario_named(scenario).title
+    figures = []
+    by_column = {c: column_runs(experiment, scenario, c) for c in experiment.column_names}
+    tasks = experiment.table_tasks(next(iter(by_column.values()))[0])
+    rows = {c: _episodes_of(results, asked, runs) for c, runs in by_column.items()}
+    for task in tasks:
+        curves = [
+            curve
+            for column in experiment.column_names
+            if (
+                curve := evaluation_curve(column_title(experiment, column), rows[column], [task], agents_of_tasks=False)
+            )
+        ]
+        if curves:
+            name = task.partition("/")[2]
+            caption = f"{title}, {name} (level {parse_task(task).level}): evaluation of every checkpoint."
+            id = f"{experiment.name}_{scenario}_{what_id(name)}"
+            figures.append(draw_curves(out, id, name, curves, caption, _players(results, task)))
+    return figures
+
+
+def _players(results: Results, task: str) -> dict[str, float]:
+    """Mean scores of the players that do not learn."""
+    rows = results.episodes.filter(pl.col("run_dir").is_null() & pl.col("run").is_null(), task=task)
+    means = rows.group_by("agent", maintain_order=True).agg(pl.col("normalized_score").mean()).drop_nulls()
+    return dict(means.iter_rows())
+
+
+def _episodes_of(results: Results, asked: Asked, runs: Sequence[TrainingRun]) -> pl.DataFrame:
+    return results.episodes.filter(pl.col("run_dir").is_in([str(run_directory(asked.results, run)) for run in runs]))

@@ -1,0 +1,225 @@
+"""What a report is made of: evaluation episodes, training runs and plans, read from results directories.
+
+Imports polars, gvz.evaluation.frame, gvz.experiments, gvz.rundir, gvz.tasks. Reads records, never checkpoints.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, get_args
+
+import polars as pl
+
+from gvz.errors import ConfigError
+from gvz.evaluation.frame import collect_evaluations
+from gvz.experiments.base import Experiment
+from gvz.experiments.plan import read_plan
+from gvz.rundir import read_records
+from gvz.scenarios.base import Split
+from gvz.tasks import named_tasks, scenarios
+
+EACH = "each task alone"
+"""training of the agents of which every one was trained on a task of its own"""
+
+_TRAININGS = {"train1": "1 task", "train4": "4 tasks", "train8": "8 tasks"}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Run:
+    """A run directory of the trainer."""
+
+    path: Path
+    id: str
+    """its path under runs/, else its directory's"""
+    config: dict[str, Any]
+    """the configuration, as saved"""
+    tasks: tuple[str, ...]
+    """ids of the tasks trained on"""
+    metrics: pl.DataFrame
+    """rates by gradient steps"""
+    training_episodes: pl.DataFrame
+    """task, score and gradient steps of every finished training episode"""
+
+    @property
+    def name(self) -> str:
+        return str(self.config["name"])
+
+    @property
+    def seed(self) -> int:
+        return int(self.config["seed"])
+
+    @property
+    def total_updates(self) -> int:
+        return int(self.config["learner"]["total_updates"])
+
+    @property
+    def scenario(self) -> str:
+        return self.tasks[0].partition("/")[0]
+
+    @property
+    def training(self) -> str:
+        """ "4 tasks", "gore alone": what it was trained on, in words."""
+        for split, words in _TRAININGS.items():
+            if set(self.tasks) == _split(self.scenario, split):
+                return words
+        one = self.tasks[0].partition("/")[2]
+        return f"{one} alone" if len(self.tasks) == 1 else f"{len(self.tasks)} chosen tasks"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Asked:
+    """An experiment that a results directory was planned for."""
+
+    results: Path
+    experiment: Experiment
+    scale: float
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Results:
+    """Everything readable in some results directories."""
+
+    paths: tuple[Path, ...]
+    episodes: pl.DataFrame
+    """`gvz.evaluation.frame`'s columns, with `agent` (who played, without seed and checkpoint) and `final` (of one of
+    the last quarter of the run's evaluated checkpoints, by which agents are compared)"""
+    runs: tuple[Run, ...]
+    agents: dict[str, str]
+    """run directory -> the agent its rows belong to"""
+    asked: tuple[Asked, ...]
+    problems: tuple[str, ...]
+
+
+def read_results(paths: Sequence[Path]) -> Results:
+    """Reads results directories, run directories and record files, in any mixture.
+
+    Raises:
+        ConfigError: a path does not exist.
+    """
+    episodes, problems = collect_evaluations(paths)
+    runs: dict[Path, Run] = {}
+    asked = []
+    for path in paths:
+        for config in sorted(path.rglob("config.json")) if path.is_dir() else []:
+            if config.parent.resolve() not in runs and "discarded" not in config.parts:
+                run, found = _read_run(config, path)
+                problems += found
+                if run is not None:
+                    runs[config.parent.resolve()] = run
+        for file in sorted(path.rglob("plan.json")) if path.is_dir() else []:
+            try:
+                plan = read_plan(file.parent)
+            except ConfigError as error:
+                problems.append(f"{error}; its experiments are not in this report")
+                continue
+            assert plan is not None, "the file is there"
+            asked += [Asked(results=file.parent, experiment=e, scale=plan.scale) for e in plan.experiments()]
+    evaluated = set(episodes["run_dir"])
+    for run in runs.values():
+        if str(run.path) not in evaluated:
+            problems.append(f"{run.path}: no evaluation of this run yet; make one with `gvz evaluate {run.path}`")
+    agents = _agents(list(runs.values()))
+    return Results(
+        paths=tuple(paths),
+        episodes=_with_agents(episodes, agents),
+        runs=tuple(runs.values()),
+        agents=agents,
+        asked=tuple(asked),
+        problems=tuple(problems),
+    )
+
+
+def _read_run(file: Path, results: Path) -> tuple[Run | None, list[str]]:
+    """The run, if it can be told, and what is wrong with it."""
+    metrics, problems = _read_columns(file.parent, "metrics", _METRICS)
+    episodes, more = _read_columns(file.parent, "episodes", _TRAINING_EPISODES)
+    try:
+        saved = json.loads(file.read_text())
+        run = Run(
+            path=file.parent,
+            id=_run_id(file.parent, results),
+            config=saved["config"],
+            tasks=tuple(map(str, saved["resolved"]["tasks"])),
+            metrics=metrics,
+            training_episodes=episodes.filter(~pl.col("cut")),
+        )
+        _ = run.name, run.seed, run.total_updates, run.scenario
+    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        return None, [f"{file}: not a configuration of ours ({type(error).__name__}: {error}); the run is left out"]
+    return run, [*problems, *more]
+
+
+def _run_id(directory: Path, results: Path) -> str:
+    inside = directory.relative_to(results).parts
+    return "/".join(inside[1:] if inside[:1] == ("runs",) else inside) or directory.resolve().name
+
+
+@cache
+def _split(scenario: str, split: str) -> set[str]:
+    name: Split = next(one for one in get_args(Split) if one == split)
+    return {task.id for task in named_tasks(scenario, split=name)} if scenario in scenarios() else set()
+
+
+def _agents(runs: Sequence[Run]) -> dict[str, str]:
+    """Run directory -> agent: the configuration's name, and what it was trained on where that tells agents apart."""
+    alone: dict[tuple[str, str], set[str]] = {}
+    for run in runs:
+        if len(run.tasks) == 1:
+            alone.setdefault((run.name, run.scenario), set()).add(run.training)
+
+    def training(run: Run) -> str:
+        several = len(run.tasks) == 1 and len(alone[run.name, run.scenario]) > 2  # more than default and one other
+        return EACH if several and not run.id.count("/train") else run.training
+
+    trainings = {name: {training(run) for run in runs if run.name == name} for name in {run.name for run in runs}}
+    return {
+        str(run.path): run.name if len(trainings[run.name]) == 1 else f"{run.name}, {training(run)}" for run in runs
+    }
+
+
+def _with_agents(episodes: pl.DataFrame, agents: dict[str, str]) -> pl.DataFrame:
+    """Adds the columns `agent` and `final`."""
+    named = pl.col("run_dir").replace_strict(agents, default=pl.col("run"), return_dtype=pl.String)
+    age = pl.col("num_updates").rank("dense", descending=True)  # 1: the newest checkpoint
+    num_checkpoints = pl.col("num_updates").n_unique()
+    return episodes.with_columns(
+        agent=pl.coalesce(named, "player"),
+        final=(age <= (num_checkpoints / 4).ceil()).over("run_dir").fill_null(value=True),
+    )
+
+
+_METRICS = {
+    "num_updates": pl.Int64(),
+    "time_s": pl.Float64(),
+    "learner/updates_per_s": pl.Float64(),
+    "actors/decisions_per_s": pl.Float64(),
+    "actors/frames_per_s": pl.Float64(),
+    "actors/env_steps": pl.Int64(),
+    "actors/restarts": pl.Int64(),
+}
+_TRAINING_EPISODES = {
+    "num_updates": pl.Int64(),
+    "task": pl.String(),
+    "score": pl.Float64(),
+    "normalized_score": pl.Float64(),
+    "cut": pl.Boolean(),
+}
+
+
+def _read_columns(directory: Path, name: str, columns: dict[str, pl.DataType]) -> tuple[pl.DataFrame, list[str]]:
+    """These columns of a run's record file, compressed or not; rows without `num_updates` are left out."""
+    for file in (directory / f"{name}.jsonl", directory / f"{name}.jsonl.gz"):
+        if file.exists():
+            rows, problems = read_records(file)
+            data = {c: pl.Series([row.get(c) for row in rows], dtype=t, strict=False) for c, t in columns.items()}
+            return pl.DataFrame(data).drop_nulls("num_updates"), problems
+    return pl.DataFrame(schema=columns), []
+
+
+def training_time_s(metrics: pl.DataFrame) -> float:
+    """Seconds a run spent training, by the rates in its metrics: pauses between its processes do not count."""
+    rates = metrics.filter(pl.col("learner/updates_per_s") > 0)
+    steps = pl.col("num_updates").diff(null_behavior="ignore").fill_null(pl.col("num_updates"))
+    return rates.select((steps / pl.col("learner/updates_per_s")).sum()).item()

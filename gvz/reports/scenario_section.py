@@ -1,0 +1,260 @@
+"""The section of a scenario: every agent and player on every task, by level and by attribute.
+
+Imports polars, gvz.evaluation.metrics, gvz.reports, gvz.tasks.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from gvz.evaluation.frame import REWARD_PREFIX
+from gvz.evaluation.metrics import bootstrap_runs, generalization_gap, interquartile_mean, mean, median, solved
+from gvz.reports.curves import evaluation_curve, learning_curve
+from gvz.reports.document import Block, Cell, Figure, Section, Table, missing, ours, words
+from gvz.reports.draw import draw_bars, draw_curves, draw_heat_map, draw_histogram
+from gvz.reports.experiment_section import what_id
+from gvz.reports.results import Results
+from gvz.reports.scores import Scores, agent_scores, estimate, pick, redraw
+from gvz.scenarios.base import Scenario, Task
+from gvz.tasks import named_tasks, parse_task, scenario_named, scenarios
+
+
+def scenario_sections(results: Results, out: Path) -> list[Section]:
+    """A section for each scenario that has evaluated episodes or runs."""
+    played = set(results.episodes.drop_nulls("level")["scenario"]) | {run.scenario for run in results.runs}
+    return [_section(results, scenario_named(name), out) for name in scenarios() if name in played]
+
+
+def agents_of(episodes: pl.DataFrame) -> list[str]:
+    """Trained agents by name, then the players that do not learn."""
+    pairs = episodes.select("agent", learns=pl.col("run").is_not_null()).unique().rows()
+    return [agent for agent, _ in sorted(pairs, key=lambda pair: (not pair[1], pair[0]))]
+
+
+def played_tasks(episodes: pl.DataFrame) -> list[Task]:
+    """The known tasks among the rows, named ones first in the thesis's order."""
+    ids = set(episodes.drop_nulls("level")["task"])
+    order = [task.id for task in named_tasks()]
+    return [parse_task(id) for id in sorted(ids, key=lambda id: (order.index(id) if id in order else len(order), id))]
+
+
+def _section(results: Results, scenario: Scenario, out: Path) -> Section:
+    episodes = results.episodes.filter(scenario=scenario.id).drop_nulls("level")
+    agents, tasks = agents_of(episodes), played_tasks(episodes)
+    blocks = []
+    if agents:
+        scores = {agent: agent_scores(episodes, agent) for agent in agents}
+        tables = [_by_level(scenario, scores, tasks), _by_task(scenario, scores, tasks, episodes)]
+        if gaps := _gaps(results, scenario, scores, tasks):
+            tables.append(gaps)
+        final = episodes.filter("final")
+        pictures = [_heat_map(scenario, scores, tasks, out)]
+        pictures += _histograms(scenario, final, agents, out)
+        pictures += _rewards(scenario, final, agents, out)
+        text = (
+            f"Score: {'kills' if scenario.metric == 'kills' else 'frames alive'}; percent of the upper bound "
+            f"({scenario.upper_bound():g} in profile thesis). A trained agent's numbers are of the last quarter of its "
+            "evaluated checkpoints.",
+        )
+        blocks = [
+            Block(text=text, tables=tuple(tables)),
+            Block(heading="Tasks, scores, rewards", figures=tuple(pictures)),
+        ]
+    curves = [*_learning(results, scenario, out), *_evaluation(results, scenario, episodes, agents, out)]
+    if curves:
+        blocks.append(Block(heading="Curves", figures=tuple(curves)))
+    return Section(id=scenario.id.replace("_", "-"), title=scenario.title, blocks=tuple(blocks))
+
+
+def _interval_note(scores: Mapping[str, Scores]) -> str:
+    several = [agent for agent, one in scores.items() if redraw([one]) != "episodes"]
+    if not several:
+        return "Mean [95% bootstrap interval over evaluation episodes]. It says nothing about other training seeds."
+    return (
+        f"Mean [95% bootstrap interval]: training seeds drawn anew for {', '.join(several)}; evaluation episodes for "
+        "the others."
+    )
+
+
+def _by_level(scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task]) -> Table:
+    """Agents as rows, levels as columns, then all test tasks together."""
+    test = [task.id for task in named_tasks(scenario.id, split="test")]
+    played = {task.id for task in tasks}
+    levels = [(f"level {n}", [t.id for t in tasks if t.level == n]) for n in range(5)]
+    levels = [(title, ids) for title, ids in levels if ids]
+    rows = []
+    for agent, one in scores.items():
+        cells = [estimate(one, ids) if one.played(ids) else missing() for _, ids in levels]
+        if set(test) <= played:
+            statistics = (mean, interquartile_mean, median)
+            cells += [estimate(one, test, s) if one.played(test) else missing() for s in statistics]
+        rows.append((words(agent), *cells))
+    columns = ["agent", *(f"{title} ({len(ids)} tasks)" for title, ids in levels)]
+    columns += ["P: mean of the 7 test tasks", "their IQM", "their median"] if set(test) <= played else []
+    return Table(
+        id=f"{scenario.id}_levels",
+        caption=f"{scenario.title} by level, percent of the upper bound.",
+        columns=tuple(columns),
+        rows=tuple(rows),
+        notes=(_interval_note(scores), "- : not evaluated on all of these tasks."),
+    )
+
+
+def _by_task(scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task], episodes: pl.DataFrame) -> Table:
+    """Tasks as rows, agents as columns; says who has solved a task."""
+    who_solved = _solved(scenario, episodes.filter("final"))
+    rows = []
+    for task in tasks:
+        cells = []
+        for agent, one in scores.items():
+            cell = estimate(one, [task.id]) if one.played([task.id]) else missing()
+            note = "; ".join(filter(None, (cell.note, "solved" if (agent, task.id) in who_solved else "")))
+            cells.append(Cell(kind=cell.kind, text=cell.text, estimate=cell.estimate, note=note))
+        rows.append((words(task.name), words(str(task.level)), *cells))
+    notes = (_interval_note(scores),)
+    if scenario.metric == "frames_alive":
+        notes += ("solved: 10 consecutive evaluation episodes of every training seed reached the time-out.",)
+    return Table(
+        id=f"{scenario.id}_tasks",
+        caption=f"{scenario.title} by task, percent of the upper bound.",
+        columns=("task", "level", *scores),
+        rows=tuple(rows),
+        notes=notes,
+    )
+
+
+def _solved(scenario: Scenario, final: pl.DataFrame) -> set[tuple[str, str]]:
+    """(agent, task) where each seed's newest checkpoint survived ten episodes in a row; only survival counts."""
+    if scenario.metric != "frames_alive":
+        return set()
+    newest = final.filter((pl.col("num_updates").max().over("run_dir") == pl.col("num_updates")).fill_null(value=True))
+    by_seed = (
+        newest.sort("episode").group_by("agent", "task", "run_dir").agg(pl.col("truncated").fill_null(value=False))
+    )
+    done = {}
+    for agent, task, _, timed_out in by_seed.iter_rows():
+        done[agent, task] = done.get((agent, task), True) and solved(np.array(timed_out))
+    return {key for key, value in done.items() if value}
+
+
+def _gaps(results: Results, scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task]) -> Table | None:
+    """How much agents lose from the tasks trained on to others, and from levels 0 and 1 to levels 2 to 4."""
+    trained_on = {results.agents[str(r.path)]: r.tasks for r in results.runs if r.scenario == scenario.id}
+    test = [task.id for task in named_tasks(scenario.id, split="test")]
+    low, high = [t.id for t in tasks if t.level <= 1], [t.id for t in tasks if t.level >= 2]
+    rows = []
+    for agent, one in scores.items():
+        if agent in trained_on and not one.agents_of_tasks:
+            of_tasks = _gap(one, trained_on[agent], [id for id in test if id not in trained_on[agent]])
+            rows.append((words(agent), of_tasks, _gap(one, low, high)))
+    if not any(cell.estimate for row in rows for cell in row):
+        return None
+    return Table(
+        id=f"{scenario.id}_gap",
+        caption=f"{scenario.title}, generalization gap in points of the upper bound: what is lost on tasks never "
+        "trained on. The smaller the better, given equal scores.",
+        columns=("agent", "training tasks less test tasks", "levels 0 and 1 less levels 2 to 4"),
+        rows=tuple(rows),
+    )
+
+
+def _gap(scores: Scores, easier: Sequence[str], harder: Sequence[str]) -> Cell:
+    cells = scores.cells([*easier, *harder])
+    if not (easier and harder and cells):
+        return missing(scores.coverage([*easier, *harder]))
+    statistic = partial(generalization_gap, num_train=len(easier))
+    how = redraw([scores]) if len(cells) > 1 else "episodes"
+    return ours(bootstrap_runs([cells], statistic, redraw=how, num_resamples=1000))
+
+
+# ---------------------------------------------------------------------------------------------------- figures
+
+
+def _heat_map(scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task], out: Path) -> Figure:
+    attributes = [attribute.name for attribute in scenario.attributes]
+    means = {agent: [estimate(one, [task.id]).estimate for task in tasks] for agent, one in scores.items()}
+    return draw_heat_map(
+        out,
+        f"{scenario.id}_heat_map",
+        scenario.title,
+        [(task.name, task.level, task.attributes) for task in tasks],
+        [name for name in attributes if any(name in task.attributes for task in tasks)],
+        {agent: [None if e is None else e.value for e in row] for agent, row in means.items()},
+        f"{scenario.title}: level, task, its attributes, and the mean score in percent of the upper bound.",
+    )
+
+
+def _histograms(scenario: Scenario, final: pl.DataFrame, agents: Sequence[str], out: Path) -> list[Figure]:
+    figures = []
+    for level in range(5):
+        rows = final.filter(level=level).drop_nulls("normalized_score")
+        if rows.is_empty():
+            continue
+        scores = {agent: rows.filter(agent=agent)["normalized_score"].to_numpy() for agent in agents}
+        caption = f"{scenario.title}, level {level}: evaluation episodes by score, all tasks of the level together."
+        figures.append(draw_histogram(out, f"{scenario.id}_histogram_{level}", f"level {level}", scores, caption))
+    return figures
+
+
+def _rewards(scenario: Scenario, final: pl.DataFrame, agents: Sequence[str], out: Path) -> list[Figure]:
+    means = final.group_by("agent").agg(pl.col(f"^{REWARD_PREFIX}.*$").mean())
+    values: dict[str, dict[str, float]] = {agent: {} for agent in agents}
+    for row in means.iter_rows(named=True):
+        components = {n.removeprefix(REWARD_PREFIX): v for n, v in row.items() if n != "agent" and v is not None}
+        values[row["agent"]] = components
+    if not any(values.values()):
+        return []
+    caption = f"{scenario.title}: mean sum of each reward component over an evaluation episode, all tasks together."
+    title = "reward components"
+    return [draw_bars(out, f"{scenario.id}_rewards", title, values, "reward per episode", caption)]
+
+
+def _learning(results: Results, scenario: Scenario, out: Path) -> list[Figure]:
+    """Training scores of each agent, a line for each task trained on (by level if those are many)."""
+    if any(asked.experiment.evaluate_on == "own" for asked in results.asked):
+        return []  # drawn with the experiment
+    figures = []
+    agents: dict[str, list] = {}
+    for run in results.runs:
+        if run.scenario == scenario.id:
+            agents.setdefault(results.agents[str(run.path)], []).append(run)
+    for agent, runs in agents.items():
+        tasks = list(dict.fromkeys(task for run in runs for task in run.tasks))
+        lines = [learning_curve(task.partition("/")[2], runs, [task]) for task in tasks]
+        if any(lines):
+            caption = f"{scenario.title}, {agent}: training scores, running mean of 30 episodes"
+            caption += (
+                "; dots: episodes." if len({run.seed for run in runs}) == 1 else "; band: training seeds redrawn."
+            )
+            id = f"learning_{scenario.id}_{what_id(agent)}"
+            figures.append(draw_curves(out, id, agent, lines, caption, _chance(results, tasks)))
+    return figures
+
+
+def _chance(results: Results, tasks: Sequence[str]) -> dict[str, float]:
+    """Mean score of the random player on these tasks, if it played them all."""
+    rows = pick(results.episodes.filter(pl.col("task").is_in(tasks), player="random")).get(None, {})
+    return {"random": float(np.mean([np.mean(rows[task]) for task in tasks]))} if rows.keys() >= set(tasks) else {}
+
+
+def _evaluation(
+    results: Results, scenario: Scenario, episodes: pl.DataFrame, agents: Sequence[str], out: Path
+) -> list[Figure]:
+    """Evaluation of checkpoints by level, for agents with several of them; not what an experiment shows already."""
+    if any(asked.experiment.columns == "level" for asked in results.asked):
+        return []
+    figures = []
+    for agent in agents:
+        rows = episodes.filter(agent=agent)
+        if rows["num_updates"].n_unique() < 2:
+            continue
+        by_level = [rows.filter(level=n)["task"].unique(maintain_order=True).to_list() for n in range(5)]
+        curves = [
+            evaluation_curve(f"level {n}", rows, tasks, agents_of_tasks=False) for n, tasks in enumerate(by_level)
+        ]
+        caption = f"{scenario.title}, {agent}: evaluation of every checkpoint by level, with 95% interval."
+        figures.append(draw_curves(out, f"evaluation_{scenario.id}_{what_id(agent)}", agent, curves, caption))
+    return figures

@@ -1,0 +1,150 @@
+"""Writes a document: one self-contained HTML page, Markdown, and every table as CSV and LaTeX. Imports jinja2,
+gvz.reports.document.
+"""
+
+import base64
+import csv
+import io
+import re
+from pathlib import Path
+
+import jinja2
+from markupsafe import Markup, escape
+
+from gvz.reports.document import Cell, Document, Figure, Table
+
+_TEMPLATES = Path(__file__).parent / "templates"
+
+_LATEX = {
+    "\\": r"\textbackslash{}",
+    **{c: f"\\{c}" for c in "&%$#_{}"},
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+}
+
+
+def write_document(document: Document) -> list[Path]:
+    """Writes all of it into `document.out`: report.html, report.md, tables/. The figures are there already.
+
+    Returns: the files.
+    """
+    tables = [table for section in document.sections for block in section.blocks for table in block.tables]
+    assert len({table.id for table in tables}) == len(tables), "two tables of one id"
+    files = {"report.html": to_html(document), "report.md": to_markdown(document)}
+    for table in tables:
+        files[f"tables/{table.id}.csv"] = to_csv(table)
+        files[f"tables/{table.id}.tex"] = to_latex(table)
+    (document.out / "tables").mkdir(parents=True, exist_ok=True)
+    for name, text in files.items():
+        (document.out / name).write_text(text)
+    return [document.out / name for name in files]
+
+
+def to_html(document: Document) -> str:
+    """The page. Nothing in it is loaded from elsewhere."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["data_uri"] = _data_uri
+    environment.filters["strong"] = _strong
+    return environment.get_template("report.html.j2").render(document=document)
+
+
+def _data_uri(figure: Figure) -> str:
+    return f"data:image/svg+xml;base64,{base64.b64encode(figure.svg).decode()}"
+
+
+def _strong(text: str) -> Markup:
+    """**bold** as in Markdown; everything else is escaped."""
+    escaped = str(escape(text))
+    return Markup(re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", escaped))
+
+
+def to_markdown(document: Document) -> str:
+    """The report as text, with the figures by name."""
+    parts = [f"# {document.title}", *document.abstract]
+    parts += [f"> **Mind:** {text}" for text in document.warnings]
+    for section in document.sections:
+        parts.append(f"## {section.title}")
+        for block in section.blocks:
+            parts += [f"### {block.heading}"] if block.heading else []
+            parts += block.text
+            for table in block.tables:
+                parts += [f"**{table.caption}**", _markdown_table(table), *(f"*{note}*" for note in table.notes)]
+            parts += [f"![{figure.caption}](figures/{figure.id}.png)" for figure in block.figures]
+            parts += ["\n".join(f"- [{link.text}]({link.target})" for link in block.links)] if block.links else []
+    return "\n\n".join([*parts, document.made_with]) + "\n"
+
+
+def _markdown_table(table: Table) -> str:
+    def line(cells: list[str]) -> str:
+        return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+    def text(cell: Cell) -> str:
+        shown = f"*{cell.text}*" if cell.kind == "theirs" else cell.text
+        return f"{shown} ({cell.note})" if cell.note else shown
+
+    rows = [line([text(cell) for cell in row]) for row in table.rows]
+    return "\n".join([line(list(table.columns)), "|" + "---|" * len(table.columns), *rows])
+
+
+def to_csv(table: Table) -> str:
+    """The table for programs: a column with numbers is three, the value and the ends of its interval.
+
+    A missing cell is empty; a published number has no interval.
+    """
+    numeric = [any(row[n].estimate for row in table.rows) for n in range(len(table.columns))]
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    head = []
+    for name, is_number in zip(table.columns, numeric, strict=True):
+        head += [name, f"{name} low", f"{name} high", f"{name} note"] if is_number else [name]
+    writer.writerow(head)
+    for row in table.rows:
+        line: list[str] = []
+        for cell, is_number in zip(row, numeric, strict=True):
+            line += _csv_numbers(cell) if is_number else [cell.text]
+        writer.writerow(line)
+    return out.getvalue()
+
+
+def _csv_numbers(cell: Cell) -> list[str]:
+    if cell.estimate is None:
+        return ["", "", "", cell.note]
+    e = cell.estimate
+    interval = ["", ""] if cell.kind == "theirs" else [f"{e.low:.4f}", f"{e.high:.4f}"]
+    return [f"{e.value:.4f}", *interval, cell.note]
+
+
+def to_latex(table: Table) -> str:
+    """A table environment for the package booktabs; published numbers in italics."""
+
+    def text(cell: Cell) -> str:
+        shown = _latex(cell.text)
+        shown = f"\\textit{{{shown}}}" if cell.kind == "theirs" else shown
+        return f"{shown} ({_latex(cell.note)})" if cell.note else shown
+
+    lines = [
+        "\\begin{table}",
+        "\\centering\\small",
+        f"\\caption{{{_latex(table.caption)}}}",
+        f"\\label{{tab:{table.id}}}",
+        f"\\begin{{tabular}}{{{'l' * len(table.columns)}}}",
+        "\\toprule",
+        " & ".join(map(_latex, table.columns)) + " \\\\",
+        "\\midrule",
+        *(" & ".join(map(text, row)) + " \\\\" for row in table.rows),
+        "\\bottomrule",
+        "\\end{tabular}",
+        *(f"\\par {_latex(note)}" for note in table.notes),
+        "\\end{table}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _latex(text: str) -> str:
+    return "".join(_LATEX.get(c, c) for c in text)
