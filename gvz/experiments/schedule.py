@@ -119,12 +119,15 @@ class Schedule:
         return bool(self._running)
 
     def _begin(self, job: Job) -> None:
+        if progress.is_locked(progress.log_file(job.results, job.id)):
+            self._waiting.append(job)
+            return
         outlook = job.outlook()
         if outlook.next is None:
             self._display.ended(job, "done")
             return
         running = RunningJob.start(job, outlook.next, self._free[0])
-        if running is None:
+        if running is None:  # another process took it just now
             self._waiting.append(job)
             return
         self._free.popleft()
