@@ -1,0 +1,1 @@
+"""Whole-system benchmarks beside their peers: `python -m benchmarks --list`. See docs/PERFORMANCE.md."""

@@ -1,0 +1,66 @@
+"""Decisions per second with the full network acting, against the limit that engine and arithmetic set.
+
+The limit of a core is 1 / (engine time + inference FLOPs / matmul rate): the engine time is that of bare processes,
+the rate that of float32 products in a process with an actor's settings, on all cores at once; both are measured in
+the same rounds. Goal: 0.6 of the limit.
+"""
+
+import contextlib
+import os
+import tempfile
+
+import numpy as np
+
+from benchmarks import workload
+from benchmarks.remote import Remote, count_per_s
+from benchmarks.rounds import Budget, Row, alternate, goal, measured, rates
+
+
+def measure(budget: Budget) -> list[Row]:
+    """Rates of pools with and without the network, of engines and of products, and the goal's ratio."""
+    import jax
+    import jax.numpy as jnp
+
+    from actors.process import _ENVIRONMENT as ACTOR_ENVIRONMENT
+    from gvz.assemble import assemble
+    from learner.policy import flatten_params
+
+    cores, config = len(os.sched_getaffinity(0)), workload.run_config(budget)
+    num_engines = 1 if budget.quick else 2 * cores
+    with contextlib.ExitStack() as stack:
+        directory = stack.enter_context(tempfile.TemporaryDirectory(prefix="gvz-benchmark-"))
+        parts = assemble(config, workload.work_directory(directory))
+        agent = parts.agent
+        params = agent.init(jax.random.key(0))
+        flat = np.asarray(jax.jit(flatten_params)(params))
+        size = (str(config.env.render_width), str(config.env.render_height))
+        engines = [stack.enter_context(Remote("bare_engine", workload.TASK, *size)) for _ in range(num_engines)]
+        products = [stack.enter_context(Remote("cpu_matmul", **ACTOR_ENVIRONMENT)) for _ in range(cores)]
+        acting = stack.enter_context(workload.playing(parts.pool_config, flat))
+        values = alternate(
+            budget.rounds,
+            {
+                "engines": lambda: count_per_s(engines, {"seconds": budget.body_s}),
+                "flops": lambda: count_per_s(products, {"seconds": budget.body_s}),
+                "acting": lambda: workload.decisions_per_s(acting, budget.body_s),
+            },
+        )
+    obs = jax.ShapeDtypeStruct((1, *agent.spec.obs_shape), jnp.uint8)
+    flops = workload.flops(
+        workload.direct(agent).act, params, jax.random.key(0), obs, jax.ShapeDtypeStruct((1,), jnp.int32), 0.0
+    )
+    limits = [1 / (1 / e + flops / f) for e, f in zip(values["engines"], values["flops"], strict=True)]
+    return [
+        rates(f"bare engines x{num_engines}", decisions_per_s=values["engines"]),
+        rates("limit: engine and arithmetic", decisions_per_s=limits),
+        rates("actor pool, full network", decisions_per_s=values["acting"]),
+        measured("float32 products, all cores", "GFLOP/s", [f / 1e9 for f in values["flops"]]),
+        measured("arithmetic of one decision", "MFLOP", [flops / 1e6]),
+        goal(
+            2,
+            "acting pool against the limit",
+            [a / limit for a, limit in zip(values["acting"], limits, strict=True)],
+            at_least=0.6,
+            unit="x",
+        ),
+    ]

@@ -1,0 +1,117 @@
+"""Alternating rounds, and the rows that a benchmark gives back. Imports numpy and the standard library only.
+
+A row is plain data: `kind` says which of the four it is, and every measured quantity in it is a `Spread`. Ratios are
+made within a round, of bodies that ran one after the other, and only then summed up.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+Row = dict[str, Any]
+Spread = dict[str, Any]
+"""median, min and max of a quantity over the rounds, and its `values`, one a round"""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Budget:
+    """How long a benchmark may measure."""
+
+    rounds: int
+    """rounds after the warm-up"""
+    body_s: float
+    """seconds of one body in one round"""
+    quick: bool
+    """smallest sizes: proves that every body runs; its figures mean nothing"""
+    peers: Path
+    """interpreter of the peers' virtual environment; what is not installed there is reported as absent"""
+
+
+FULL = Budget(rounds=5, body_s=3.0, quick=False, peers=Path(".venv-peers/bin/python"))
+QUICK = Budget(rounds=1, body_s=0.3, quick=True, peers=Path(".venv-peers/bin/python"))
+
+
+def alternate(
+    rounds: int, bodies: Mapping[str, Callable[[], float]], *, warm_up: bool = True
+) -> dict[str, list[float]]:
+    """Runs A, B, C, A, B, C, ... and returns what each body measured, a value a round; a warm-up is thrown away."""
+    values: dict[str, list[float]] = {name: [] for name in bodies}
+    for number in range(-int(warm_up), rounds):
+        for name, body in bodies.items():
+            value = body()
+            if number >= 0:
+                values[name].append(value)
+    return values
+
+
+def seconds_per_call(call: Callable[[], object], body_s: float) -> float:
+    """Mean seconds of one call, called again and again for `body_s` seconds, at least once."""
+    start, count = time.perf_counter(), 0
+    while count == 0 or time.perf_counter() - start < body_s:
+        call()
+        count += 1
+    return (time.perf_counter() - start) / count
+
+
+def spread(values: Sequence[float]) -> Spread:
+    """Median, min and max, four significant digits."""
+    rounded = [float(f"{value:.4g}") for value in values]
+    return {"median": float(np.median(rounded)), "min": min(rounded), "max": max(rounded), "values": rounded}
+
+
+def ratios(above: Sequence[float], below: Sequence[float]) -> list[float]:
+    """above / below, round by round."""
+    return [a / b for a, b in zip(above, below, strict=True)]
+
+
+def rates(
+    name: str,
+    *,
+    decisions_per_s: Sequence[float] | None = None,
+    updates_per_s: Sequence[float] | None = None,
+    frame_skip: int = 4,
+    batch_size: int = 32,
+) -> Row:
+    """The four rates of a candidate; those it has none of are None."""
+    row: Row = {"kind": "rates", "name": name}
+    for rate, unit in ((decisions_per_s, ("decisions", 1)), (decisions_per_s, ("frames", frame_skip))):
+        row[f"{unit[0]}_per_s"] = None if rate is None else spread([value * unit[1] for value in rate])
+    for rate, unit in ((updates_per_s, ("updates", 1)), (updates_per_s, ("samples", batch_size))):
+        row[f"{unit[0]}_per_s"] = None if rate is None else spread([value * unit[1] for value in rate])
+    return row
+
+
+def measured(name: str, unit: str, values: Sequence[float], *, x: float | None = None, x_unit: str = "") -> Row:
+    """One quantity; with `x` it is a point of the curve `name` over `x_unit`."""
+    return {"kind": "measured", "name": name, "unit": unit, "x": x, "x_unit": x_unit, **spread(values)}
+
+
+def goal(
+    number: int,
+    name: str,
+    values: Sequence[float],
+    *,
+    at_least: float | None = None,
+    at_most: float | None = None,
+    unit: str = "",
+) -> Row:
+    """What was aimed at, and what came out; `number` is the goal's in docs/PERFORMANCE.md. One bound is given."""
+    assert (at_least is None) != (at_most is None), "a goal has one bound"
+    bounds = {"at_least": at_least, "at_most": at_most}
+    return {"kind": "goal", "number": number, "name": name, "unit": unit, **bounds, **spread(values)}
+
+
+def absent(name: str, why: str) -> Row:
+    """A peer or a device that could not be measured, never a number."""
+    return {"kind": "absent", "name": name, "why": why}
+
+
+def met(row: Row) -> bool:
+    """Whether the median of a goal's row keeps to its bound."""
+    if row["at_least"] is not None:
+        return row["median"] >= row["at_least"]
+    return row["median"] <= row["at_most"]

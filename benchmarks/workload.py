@@ -1,0 +1,135 @@
+"""What several benchmarks put to work: a pool that is drained, a replay that is full, and how much a network computes.
+
+Everything is sized as `rainbow_4task` is, on one task, so that a peer that plays a single task is comparable. Imports
+jax and the machine's own modules inside functions: whoever starts processes first does not pay for them.
+"""
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from benchmarks.rounds import Budget
+
+if TYPE_CHECKING:
+    from actors.pool import ActorPool, PoolConfig
+    from gvz.config import RunConfig
+    from learner.agents.base import Agent
+    from learner.replay import ReplaySpec, ReplayState
+
+TASK = "defend_the_center/default"
+_START_TIMEOUT_S = 300.0
+_DRAIN_RECORDS, _DRAIN_WAIT_S = 256, 0.02
+"""as in gvz/train.py"""
+_SETTLE_S = 0.3
+"""seconds played before the clock starts: what waited in full rings is not counted"""
+
+
+def run_config(budget: Budget) -> "RunConfig":
+    """`rainbow_4task` on its default task; in a quick run with the smallest network and replay."""
+    from gvz.config import load_config
+
+    config = dataclasses.replace(load_config("rainbow_4task.py"), training_set=1)
+    if not budget.quick:
+        return config
+    return dataclasses.replace(
+        config,
+        agent=dataclasses.replace(config.agent, conv_channels=(4, 4, 4), hidden_units=8),
+        replay=dataclasses.replace(config.replay, capacity=2_000),
+        learner=dataclasses.replace(config.learner, warmup_steps=100, batch_size=8),
+        actors=dataclasses.replace(config.actors, num_actors=1, games_per_actor=2),
+    )
+
+
+def random_players(config: "PoolConfig", **changes: Any) -> "PoolConfig":
+    """The same pool without a network: uniformly random actions."""
+    return dataclasses.replace(config, policy=b"", num_params=0, layout_hash=0, **changes)
+
+
+@contextlib.contextmanager
+def playing(config: "PoolConfig", params: np.ndarray | None = None) -> "Iterator[ActorPool]":
+    """A pool whose actors are all ready, and which acts by `params` float32[P] if it has a policy."""
+    from actors.pool import ActorPool
+    from gvz.transport.messages import ParamsHeader
+
+    with ActorPool(config) as pool:
+        if params is not None:
+            pool.publish(params, ParamsHeader(version=1, num_updates=0, layout_hash=config.layout_hash))
+        deadline = time.monotonic() + _START_TIMEOUT_S
+        while pool.statistics().actors_ready < config.num_actors:
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"pool: {pool.statistics().actors_ready} of {config.num_actors} actors are ready")
+            pool.poll()
+            time.sleep(0.02)
+        yield pool
+
+
+def decisions_per_s(pool: "ActorPool", seconds: float) -> float:
+    """Plays for a while, the learner's side of the work included: drain and supervision."""
+
+    def play(seconds: float) -> float:
+        start, before = time.perf_counter(), pool.statistics().env_steps
+        while time.perf_counter() - start < seconds:
+            pool.drain(_DRAIN_RECORDS, wait_s=_DRAIN_WAIT_S)
+            pool.poll()
+        return (pool.statistics().env_steps - before) / (time.perf_counter() - start)
+
+    play(_SETTLE_S)
+    return play(seconds)
+
+
+def work_directory(directory: str) -> Path:
+    """Where actors log, below a temporary directory."""
+    return Path(directory) / "work"
+
+
+def filled_replay(spec: "ReplaySpec") -> "ReplayState":
+    """A replay full of noise in episodes of about a hundred records, every leaf with a priority of its own."""
+    import jax
+    import jax.numpy as jnp
+
+    from learner import replay, sum_tree
+
+    @jax.jit
+    def fill(key: jax.Array) -> "ReplayState":
+        empty, K = replay.init(spec), spec.num_slots
+        keys = jax.random.split(key, 4)
+        last = jax.random.uniform(keys[0], (K,)) < 0.01
+        drawable = ~last & (jnp.arange(K) % spec.lane_capacity < spec.lane_capacity - spec.n_steps)
+        priorities = jnp.where(drawable, jax.random.uniform(keys[1], (K,)) + 0.01, 0.0)
+        return dataclasses.replace(
+            empty,
+            # bytes that differ from frame to frame and cost little to make
+            frames=(
+                jnp.arange(K, dtype=jnp.uint32)[:, None] * 2654435761 + jnp.arange(empty.frames.shape[1])[None]
+            ).astype(jnp.uint8),
+            reward=jax.random.uniform(keys[2], (K,)),
+            action=jax.random.randint(keys[3], (K,), 0, 3),
+            task=jnp.zeros(K, jnp.int32),
+            first=jnp.roll(last, 1),
+            last=last,
+            terminated=last,
+            tree=sum_tree.set(empty.tree, jnp.arange(K), priorities),
+        )
+
+    return jax.block_until_ready(fill(jax.random.key(0)))
+
+
+def flops(function: Any, *arguments: Any) -> float:
+    """Floating-point operations of one call as XLA counts them before it optimizes; arguments may be shapes."""
+    import jax
+
+    analysis = jax.jit(function).lower(*arguments).cost_analysis()
+    return float((analysis[0] if isinstance(analysis, list) else analysis)["flops"])
+
+
+def direct(agent: "Agent") -> "Agent":
+    """The same agent with plain convolutions: the form whose operations count as the work there is to do."""
+    from learner.agents.base import make_agent
+
+    config = agent.config  # pyright: ignore[reportAttributeAccessIssue]  # ours has one, the protocol does not
+    return make_agent(dataclasses.replace(config, conv_form="direct"), agent.spec)
