@@ -1,4 +1,4 @@
-"""The real command on real Doom: two experiments that share a run; one job is killed in the middle, run again."""
+"""The real command on real Doom: two experiments that share a run, one job killed in the middle, run again, a report."""
 
 import json
 import os
@@ -76,6 +76,12 @@ def test_a_killed_job_sinks_no_other_goes_on_when_run_again_and_every_episode_is
         )
         assert set(played.values()) == {1}
         assert played.keys() == {(c, t, n) for c in run.checkpoints for t in wanted.tasks for n in range(2)}
+
+    report = [sys.executable, "-m", "gvz.cli", "report", str(results), "--out", str(tmp_path / "report")]
+    subprocess.run(report, check=True, timeout=300)
+    page = (tmp_path / "report" / "report.html").read_text()
+    for experiment in plan.experiments():
+        assert experiment.title in page
 
 
 def test_ctrl_c_saves_what_is_being_trained_and_leaves_nothing_running(tmp_path):
