@@ -176,7 +176,7 @@ def bootstrap_runs(
     groups: Sequence[Cells],
     statistic: Statistic = mean,
     *,
-    redraw: Redraw = "runs",
+    redraw: Redraw | Sequence[Redraw] = "runs",
     confidence: float = 0.95,
     num_resamples: int = 2000,
     seed: int = 0,
@@ -186,14 +186,14 @@ def bootstrap_runs(
     Args:
         groups: what the statistic takes, each drawn anew by itself: one scenario's runs each, or ours and theirs.
         statistic: f(scores [..., S, T] of each group) -> [...].
-        redraw: what is drawn anew. With fewer than two runs in each group only episodes can be.
+        redraw: what is drawn anew, in all groups or in each of them. Of a single run only episodes can be.
         confidence: of the interval, 0..1.
         num_resamples: bootstrap samples.
         seed: of the resampling.
 
     Raises:
-        ValueError: no groups, a cell without episodes, runs with different numbers of tasks, or a confidence outside
-            0..1.
+        ValueError: no groups, a cell without episodes, runs with different numbers of tasks, not as many `redraw` as
+            groups, or a confidence outside 0..1.
     """
     for cells in groups:
         if not cells or not cells[0] or any(len(run) != len(cells[0]) or not all(map(len, run)) for run in cells):
@@ -202,11 +202,12 @@ def bootstrap_runs(
         raise ValueError("bootstrap_runs: got no groups of runs, want at least one")
     rng = np.random.default_rng(seed)
     means = [np.array([[np.mean(cell) for cell in run] for run in cells]) for cells in groups]  # [S, T] each
+    hows = [redraw] * len(groups) if isinstance(redraw, str) else redraw
     drawn = [
         _redraw_episodes(cells, num_resamples, rng)
-        if redraw == "episodes"
-        else _redraw_runs(m, redraw, num_resamples, rng)
-        for cells, m in zip(groups, means, strict=True)
+        if how == "episodes"
+        else _redraw_runs(scores, how, num_resamples, rng)
+        for cells, scores, how in zip(groups, means, hows, strict=True)
     ]
     return _percentile_interval(statistic(*means), statistic(*drawn), confidence)
 

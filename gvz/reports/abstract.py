@@ -1,17 +1,18 @@
 """What stands at the head of a report: what was run, with which budget, what beats what, and how far to believe it.
 
-Imports polars, gvz.evaluation.metrics, gvz.reports.
+Imports numpy, polars, gvz.evaluation.metrics, gvz.reports.
 """
 
 import itertools
 from collections.abc import Sequence
 
+import numpy as np
 import polars as pl
 
-from gvz.evaluation.metrics import bootstrap_runs, difference, mean, probability_of_improvement
+from gvz.evaluation.metrics import difference
 from gvz.reports.results import Results
 from gvz.reports.scenario_section import agents_of, played_tasks
-from gvz.reports.scores import Scores, agent_scores, redraw
+from gvz.reports.scores import Scores, agent_scores, estimate_groups
 from gvz.tasks import named_tasks, scenario_named, scenarios
 
 ENOUGH_SEEDS = 3
@@ -53,7 +54,7 @@ def what_beats_what(results: Results) -> list[str]:
         if len(scores) < 2 or not tasks:
             continue
         means = {
-            agent: bootstrap_runs([one.cells(tasks)], mean, num_resamples=1).value for agent, one in scores.items()
+            agent: np.mean([[np.mean(c) for c in run] for run in one.cells(tasks)]) for agent, one in scores.items()
         }
         order = sorted(means, key=lambda agent: -means[agent])
         compared = [_comparison(scores, better, worse, tasks) for better, worse in itertools.pairwise(order)]
@@ -79,22 +80,12 @@ def _described(scenario: str, tasks: Sequence[str]) -> str:
 
 
 def _comparison(scores: dict[str, Scores], better: str, worse: str, tasks: Sequence[str]) -> str:
-    pair = [scores[better], scores[worse]]
-    cells = [one.cells(tasks) for one in pair]
-    how = redraw(pair) if all(len(runs) > 1 for runs in cells) else "episodes"
-    gain = bootstrap_runs(cells, difference, redraw=how, num_resamples=1000)
+    groups = [(scores[better], tasks), (scores[worse], tasks)]
+    gain = estimate_groups(groups, difference).estimate
+    assert gain is not None, "all have these tasks"
     if gain.low <= 0:
         return f"{better} and {worse} are not told apart ({gain} points)"
-    said = f"{better} beats {worse} by {gain} points"
-    if how == "episodes":
-        return said
-    return f"{said}, probability of improvement {probability_of_improvement(*_means(cells)):.2f}"
-
-
-def _means(cells: Sequence) -> list:
-    import numpy as np
-
-    return [np.array([[np.mean(cell) for cell in run] for run in runs]) for runs in cells]
+    return f"{better} beats {worse} by {gain} points"
 
 
 def caveats(results: Results) -> list[str]:

@@ -11,13 +11,13 @@ import numpy as np
 import polars as pl
 
 from gvz.evaluation.frame import REWARD_PREFIX
-from gvz.evaluation.metrics import bootstrap_runs, generalization_gap, interquartile_mean, mean, median, solved
+from gvz.evaluation.metrics import generalization_gap, interquartile_mean, mean, median, solved
 from gvz.reports.curves import evaluation_curve, learning_curve
-from gvz.reports.document import Block, Cell, Figure, Section, Table, missing, ours, words
+from gvz.reports.document import Block, Cell, Figure, Section, Table, missing, words
 from gvz.reports.draw import draw_bars, draw_curves, draw_heat_map, draw_histogram
 from gvz.reports.experiment_section import what_id
 from gvz.reports.results import Results
-from gvz.reports.scores import Scores, agent_scores, estimate, pick, redraw
+from gvz.reports.scores import Scores, agent_scores, estimate, pick
 from gvz.scenarios.base import Scenario, Task
 from gvz.tasks import named_tasks, parse_task, scenario_named, scenarios
 
@@ -70,7 +70,7 @@ def _section(results: Results, scenario: Scenario, out: Path) -> Section:
 
 
 def _interval_note(scores: Mapping[str, Scores]) -> str:
-    several = [agent for agent, one in scores.items() if redraw([one]) != "episodes"]
+    several = [agent for agent, one in scores.items() if len(one.runs) > 1]
     if not several:
         return "Mean [95% bootstrap interval over evaluation episodes]. It says nothing about other training seeds."
     return (
@@ -162,12 +162,9 @@ def _gaps(results: Results, scenario: Scenario, scores: Mapping[str, Scores], ta
 
 
 def _gap(scores: Scores, easier: Sequence[str], harder: Sequence[str]) -> Cell:
-    cells = scores.cells([*easier, *harder])
-    if not (easier and harder and cells):
-        return missing(scores.coverage([*easier, *harder]))
-    statistic = partial(generalization_gap, num_train=len(easier))
-    how = redraw([scores]) if len(cells) > 1 else "episodes"
-    return ours(bootstrap_runs([cells], statistic, redraw=how, num_resamples=1000))
+    if not (easier and harder):
+        return missing()
+    return estimate(scores, [*easier, *harder], partial(generalization_gap, num_train=len(easier)))
 
 
 # ---------------------------------------------------------------------------------------------------- figures

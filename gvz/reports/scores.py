@@ -2,7 +2,7 @@
 gvz.reports.document.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,12 +69,11 @@ def agent_scores(episodes: pl.DataFrame, agent: str) -> Scores:
     )
 
 
-def redraw(groups: Iterable[Scores]) -> Redraw:
-    """What a bootstrap of these can draw anew: runs, if each has several of them."""
-    groups = list(groups)
-    if any(len(scores.runs) < 2 for scores in groups):
+def redraw(scores: Scores, tasks: Sequence[str]) -> Redraw:
+    """What a bootstrap can draw anew: runs, if there are several, else episodes."""
+    if len(scores.complete_seeds(tasks)) < 2:
         return "episodes"
-    return "runs_by_task" if any(scores.agents_of_tasks for scores in groups) else "runs"
+    return "runs_by_task" if scores.agents_of_tasks else "runs"
 
 
 def estimate(scores: Scores, tasks: Sequence[str], statistic: Statistic = mean) -> Cell:
@@ -89,6 +88,5 @@ def estimate_groups(groups: Sequence[tuple[Scores, Sequence[str]]], statistic: S
     cells = [scores.cells(tasks) for scores, tasks in groups]
     if not groups or not all(tasks and runs for (_, tasks), runs in zip(groups, cells, strict=True)):
         return missing(note)
-    several = all(len(runs) > 1 for runs in cells)
-    how = redraw(scores for scores, _ in groups) if several else "episodes"
+    how: list[Redraw] = [redraw(scores, tasks) for scores, tasks in groups]
     return ours(bootstrap_runs(cells, statistic, redraw=how, num_resamples=1000), note, digits)

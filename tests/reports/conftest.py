@@ -1,0 +1,107 @@
+"""Results directories without training: real configurations and plans, and scores that a test chooses."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gvz.config import config_to_dict, load_config
+from gvz.experiments.base import TrainingRun
+from gvz.experiments.plan import Plan, write_plan
+from gvz.experiments.progress import run_directory
+from gvz.tasks import parse_task
+
+Score = Callable[[TrainingRun, str, int, int], float]
+"""f(run, task, checkpoint, episode) -> percent of the upper bound"""
+
+
+def write_rows(file: Path, rows: list[dict[str, Any]]) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text("".join(json.dumps({"schema": 1, **row}) + "\n" for row in rows))
+
+
+def evaluation_row(player: str, task: str, episode: int, percent: float, **more: Any) -> dict[str, Any]:
+    bound = parse_task(task).scenario.upper_bound()
+    return {
+        "player": player,
+        "profile": "thesis",
+        "action_set": "buttons",
+        "frame_skip": 4,
+        "task": task,
+        "episode": episode,
+        "seed": episode,
+        "score": percent * bound / 100,
+        "normalized_score": percent,
+        "reward_components": {"kill": percent / 10, "death": -1.0},
+        "terminated": percent < 100,
+        "truncated": percent >= 100,
+        **more,
+    }
+
+
+def write_training(results: Path, run: TrainingRun, *, until: int | None = None) -> Path:
+    """Config and records of training, up to a gradient step."""
+    directory = run_directory(results, run)
+    config = load_config(run.config)
+    learner = dataclasses.replace(config.learner, total_updates=run.total_updates)
+    config = dataclasses.replace(config, learner=learner, seed=run.seed, tasks=run.tasks)
+    end = run.total_updates if until is None else until
+    steps = [end * n // 20 for n in range(1, 21)]
+    rates = {"learner/updates_per_s": 50.0, "actors/decisions_per_s": 200.0, "actors/frames_per_s": 800.0}
+    write_rows(
+        directory / "metrics.jsonl",
+        [{"num_updates": s, "time_s": s / 50, "actors/env_steps": 4 * s, **rates} for s in steps],
+    )
+    write_rows(
+        directory / "episodes.jsonl",
+        [
+            {"num_updates": s, "task": task, "score": 1.0, "normalized_score": 100.0 * s / end, "cut": False}
+            for s in steps
+            for task in run.tasks
+        ],
+    )
+    (directory / "config.json").write_text(json.dumps(config_to_dict(config)))
+    return directory
+
+
+def write_evaluation(results: Path, run: TrainingRun, tasks: tuple[str, ...], episodes: int, score: Score) -> None:
+    name = f"{run.config}/seed_{run.seed}"
+    rows = [
+        evaluation_row(
+            f"{name}@{updates}",
+            task,
+            n,
+            score(run, task, updates, n),
+            run=run.config,
+            run_seed=run.seed,
+            num_updates=updates,
+            params="0",
+        )
+        for updates in run.checkpoints
+        for task in tasks
+        for n in range(episodes)
+    ]
+    write_rows(run_directory(results, run) / "evaluation.jsonl", rows)
+
+
+def write_experiments(results: Path, plan: Plan, score: Score, *, without: tuple[str, ...] = ()) -> None:
+    """All runs of a plan, but those whose ids are in `without`, and its players."""
+    write_plan(results, plan)
+    evaluations = plan.evaluations()
+    for run in plan.runs():
+        if run.id not in without:
+            write_training(results, run)
+            write_evaluation(results, run, evaluations[run.id].tasks, evaluations[run.id].episodes, score)
+    for player, evaluation in plan.players().items():
+        rows = [
+            evaluation_row(player, task, n, 20.0 + n) for task in evaluation.tasks for n in range(evaluation.episodes)
+        ]
+        write_rows(results / "players" / f"{player}.jsonl", rows)
+
+
+@pytest.fixture(scope="session")
+def experiments_writer() -> Callable[..., None]:
+    return write_experiments
