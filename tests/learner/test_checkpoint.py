@@ -1,5 +1,6 @@
 """Checkpoints: whole or not at all, and damage is named, never used."""
 
+import dataclasses
 import json
 import os
 import shutil
@@ -12,6 +13,8 @@ import pytest
 
 from gvz.errors import CheckpointError
 from learner import checkpoint
+from learner.agents.base import AgentSpec, make_agent
+from learner.config import AgentConfig
 
 
 def example(fill: int = 0):
@@ -46,6 +49,22 @@ def test_what_is_written_is_read_back_exactly(tmp_path):
     assert (restored.num_updates, restored.damage) == (7, [])
     assert restored.host == {"num_updates": 7, "note": "é"}
     assert equal(restored.arrays, example(7))
+
+
+def test_parameters_written_under_one_form_of_the_convolution_are_read_under_the_other(tmp_path):
+    spec = AgentSpec(obs_shape=(12, 12, 4), num_actions=3, num_tasks=1, v_min=-1.0, v_max=1.0)
+    config = AgentConfig(conv_channels=(4, 4), conv_kernels=(4, 3), conv_strides=(2, 1), hidden_units=8, num_atoms=5)
+    shifted, direct = (make_agent(dataclasses.replace(config, conv_form=form), spec) for form in ("shifted", "direct"))
+    params = jax.jit(shifted.init)(jax.random.key(0))
+    checkpoint.write(tmp_path / "1", checkpoint.snapshot(params), {})
+    found, _ = checkpoint.read(tmp_path / "1", jax.eval_shape(direct.init, jax.random.key(0)))
+    assert equal(found, params)
+    obs = np.random.default_rng(0).integers(0, 256, (5, 12, 12, 4), dtype=np.uint8)
+    before, after = (
+        jax.jit(agent.evaluate)(tree, obs, np.zeros(5, np.int32))
+        for agent, tree in ((shifted, params), (direct, found))
+    )
+    np.testing.assert_allclose(before.q_values, after.q_values, rtol=1e-5, atol=1e-6)
 
 
 def test_an_empty_directory_has_nothing_to_restore(tmp_path):

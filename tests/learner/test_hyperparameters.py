@@ -1,0 +1,92 @@
+"""The defaults are the thesis's tables, and every ready configuration is Rainbow less what its name says."""
+
+from dataclasses import asdict, replace
+
+import pytest
+
+from gvz.config import RunConfig, load_config
+from gvz.errors import ConfigError
+from learner.config import AgentConfig, LearnerConfig, ReplayConfig
+
+
+def settings(config: RunConfig) -> dict[str, object]:
+    parts = {"agent": config.agent, "replay": config.replay, "learner": config.learner}
+    return {f"{part}.{name}": value for part, values in parts.items() for name, value in asdict(values).items()}
+
+
+def test_defaults_are_tables_5_1_and_5_2():
+    values = settings(RunConfig(name="defaults"))
+    table_5_1 = {
+        "learner.target_period_updates": 3000,
+        "learner.warmup_steps": 10_000,  # "gathering experience"
+        "agent.epsilon_decay_steps": 50_000,
+        "agent.epsilon_start": 1.0,
+        "agent.epsilon_end": 0.001,
+        "agent.discount": 0.99,
+        "learner.learning_rate": 1e-4,
+        "learner.adam_eps": 1e-7,
+        "learner.batch_size": 32,
+    }
+    table_5_2 = {
+        "replay.capacity": 100_000,  # section 5.1.2
+        "agent.n_steps": 3,
+        "agent.noisy_sigma": 0.017,
+        "replay.priority_exponent": 0.6,
+        "replay.importance_sampling_exponent": 0.4,
+        "replay.importance_sampling_exponent_end": 1.0,
+        "replay.min_priority": 0.01,
+        "agent.num_atoms": 51,
+    }
+    for name, wanted in {**table_5_1, **table_5_2}.items():
+        assert values[name] == wanted, name
+    assert RunConfig(name="defaults").env.frame_skip == 4
+    assert load_config("dqn_4task").replay.capacity == 50_000
+
+
+DQN = {
+    "agent.name": "dqn",
+    "agent.double": False,
+    "agent.dueling": False,
+    "agent.noisy": "off",
+    "agent.distributional": False,
+    "agent.n_steps": 1,
+    "replay.prioritized": False,
+    "replay.capacity": 50_000,
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("rainbow_no_double", {"agent.double": False}),
+        ("rainbow_no_dueling", {"agent.dueling": False}),
+        ("rainbow_no_noisy", {"agent.noisy": "off"}),
+        ("rainbow_no_distributional", {"agent.distributional": False}),
+        ("rainbow_no_n_step", {"agent.n_steps": 1}),
+        ("rainbow_no_prioritized", {"replay.prioritized": False}),
+        ("rainbow_hidden_4096", {"agent.hidden_units": 4096}),
+        ("dqn_4task", DQN),
+    ],
+)
+def test_a_ready_configuration_differs_from_rainbow_by_what_its_name_says(name: str, changes: dict[str, object]):
+    rainbow, config = load_config("rainbow_4task"), load_config(name)
+    before, after = settings(rainbow), settings(config)
+    assert {field: after[field] for field in after if after[field] != before[field]} == changes
+    same = {part: getattr(rainbow, part) for part in ("name", "agent", "replay", "learner")}
+    assert replace(config, **same) == rainbow
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: AgentConfig(n_steps=0), r"agent\.n_steps: got 0, want 1\.\.64"),
+        (lambda: AgentConfig(conv_channels=(32,)), r"got lengths 1, 3, 3, want one equal length"),
+        (lambda: AgentConfig(conv_strides=(4, 0, 1)), r"conv_strides: want integers of at least 1"),
+        (lambda: AgentConfig(v_min=2.0, v_max=1.0), r"got 2\.0, 1\.0, want v_min < v_max"),
+        (lambda: ReplayConfig(min_priority=0.0), r"replay\.min_priority: got 0\.0, want 1e-08\.\.100"),
+        (lambda: LearnerConfig(max_grad_norm=0.0), r"learner\.max_grad_norm: got 0\.0, want 1e-12\.\.1e\+12"),
+    ],
+)
+def test_values_out_of_range_are_refused_by_name(make, message: str):
+    with pytest.raises(ConfigError, match=message):
+        make()
