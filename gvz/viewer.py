@@ -1,4 +1,4 @@
-"""A window that shows what an agent sees, for people. Imports pygame (when a window opens), numpy, gvz.errors."""
+"""A window that shows a game to people. Imports pygame (when a window opens), numpy, gvz.errors."""
 
 import os
 
@@ -7,10 +7,16 @@ import numpy as np
 from gvz.errors import ResourceError
 
 _MIN_HEIGHT = 480
+_UNSEEN_DRIVERS = ("dummy", "offscreen")
+"""what SDL falls back on without a display; only who asks for one of them by $SDL_VIDEODRIVER is given it"""
 
 
 class Window:
-    """One window; shows frames enlarged by a whole factor, so that every pixel stays one."""
+    """One window; shows frames enlarged by a whole factor, so that every pixel stays one.
+
+    Attributes:
+        closed: somebody has closed it or pressed Escape; nothing happens by itself then.
+    """
 
     def __init__(self, title: str, width: int, height: int):
         """Opens the window.
@@ -27,10 +33,15 @@ class Window:
         import pygame
 
         self._pygame = pygame
+        self.closed = False
         scale = max(1, -(-_MIN_HEIGHT // height))
         try:
             pygame.display.init()
             self._surface = pygame.display.set_mode((width * scale, height * scale))
+            driver = pygame.display.get_driver()
+            if driver in _UNSEEN_DRIVERS and "SDL_VIDEODRIVER" not in os.environ:
+                pygame.display.quit()
+                raise pygame.error(f"no display; SDL would draw {driver}")
         except pygame.error as error:
             raise ResourceError(f"render_mode human: no window can be opened ({error}); use rgb_array") from error
         pygame.display.set_caption(title)
@@ -40,7 +51,9 @@ class Window:
         picture = self._pygame.surfarray.make_surface(frame.swapaxes(0, 1))
         self._pygame.transform.scale(picture, self._surface.get_size(), self._surface)
         self._pygame.display.flip()
-        self._pygame.event.pump()  # else the desktop calls the window unresponsive
+        for event in self._pygame.event.get():  # unread, the desktop would call the window unresponsive
+            escape = event.type == self._pygame.KEYDOWN and event.key == self._pygame.K_ESCAPE
+            self.closed = self.closed or escape or event.type == self._pygame.QUIT
 
     def close(self) -> None:
         """Closes the window."""

@@ -1,0 +1,94 @@
+"""`gvz watch`: an episode in a window. Imports gvz.evaluation.cast; what plays and draws once it runs."""
+
+import contextlib
+import sys
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import tyro
+
+from gvz.errors import ConfigError, ResourceError
+from gvz.evaluation.cast import UNCAST, Cast, make_panel
+from gvz.scenarios.base import Task
+
+if TYPE_CHECKING:
+    from gvz.evaluation.play import Entrant
+    from gvz.viewer import Window
+
+EXIT_INTERRUPTED = 130
+END_S = 1.5
+"""for how long the last picture stays, seconds"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Watch:
+    """Watch evaluation episodes in a window, at the speed of the game; Escape or closing the window ends it.
+
+    Beside the game stand action, values, rewards and score. Without a display, `gvz record` writes the same pictures.
+
+    Examples: gvz watch runs/rainbow_4task/seed_1111 --task defend_the_center/complete
+              gvz watch --player random --task seek_and_kill/blue --episodes 3
+    """
+
+    cast: Annotated[Cast, tyro.conf.arg(name="")] = UNCAST
+    episodes: int | None = None
+    """how many, one after the other; default until the window is closed"""
+    speed: float = 1.0
+    """how many times the game's own speed (35 tics a second)"""
+
+    def run(self) -> int:
+        """Plays and shows; a line for each episode that ends."""
+        if self.episodes is not None and self.episodes < 1:
+            raise ConfigError(f"--episodes: got {self.episodes}, want at least 1")
+        if self.speed <= 0:
+            raise ConfigError(f"--speed: got {self.speed:g}, want more than 0")
+        entrant, task = self.cast.resolve()
+        from gvz.evaluation.panel import HEIGHT, WIDTH
+        from gvz.viewer import Window
+
+        try:
+            window = Window(f"{task.id}: {entrant.identity['player']}", WIDTH, HEIGHT)
+        except ResourceError as error:
+            raise ResourceError(
+                "watch: no window can be opened, there seems to be no display ($DISPLAY); "
+                "`gvz record` writes the same pictures to a file"
+            ) from error
+        episode = self.cast.episode
+        with contextlib.closing(window):
+            try:
+                while not window.closed and (self.episodes is None or episode < self.cast.episode + self.episodes):
+                    self._show(window, entrant, task, episode)
+                    episode += 1
+            except KeyboardInterrupt:
+                print("interrupted", file=sys.stderr)
+                return EXIT_INTERRUPTED
+        return 0
+
+    def _show(self, window: "Window", entrant: "Entrant", task: Task, episode: int) -> None:
+        """Plays an episode in the window, unless somebody closes it before."""
+        from gvz.env import TICS_PER_SECOND
+        from gvz.evaluation.performance import perform
+        from gvz.evaluation.play import Episode
+
+        panel, begun_s = make_panel(entrant, task), time.monotonic()
+        with contextlib.closing(perform(entrant, Episode(task.id, episode, self.cast.seed))) as moments:
+            for moment in moments:
+                if moment.frames == 0:
+                    begun_s = time.monotonic()  # the engines have started
+                late_s = time.monotonic() - begun_s - moment.frames / TICS_PER_SECOND / self.speed
+                ended = moment.terminated or moment.truncated
+                if late_s > 0 and not moment.decided and not ended:
+                    continue  # a slow machine shows every decision, but not every tic
+                time.sleep(max(-late_s, 0))
+                window.show(np.asarray(panel.draw(moment)))
+                if window.closed:
+                    return
+                if ended:
+                    how = "died" if moment.terminated else "reached the time-out"
+                    print(f"{task.id}, episode {episode}: {how} at tic {moment.frames}, score {moment.score:g}")
+                    time.sleep(END_S / self.speed)
+
+
+COMMAND = Watch

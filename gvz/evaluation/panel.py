@@ -1,0 +1,237 @@
+"""A picture of a moment of an episode: the screen, and beside it what the player does and thinks.
+
+Imports numpy, pillow, gvz.evaluation.{performance,trained}, gvz.scenarios.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from gvz.evaluation.performance import SCREEN_HEIGHT, SCREEN_WIDTH, Moment
+from gvz.evaluation.trained import Values
+from gvz.scenarios.base import Task
+from gvz.specs import Profile
+
+HEAD_HEIGHT, FOOT_HEIGHT, SIDE_WIDTH = 46, 120, 440
+WIDTH, HEIGHT = SCREEN_WIDTH + SIDE_WIDTH, HEAD_HEIGHT + SCREEN_HEIGHT + FOOT_HEIGHT
+"""of the picture, pixels; both even, as H.264 wants them"""
+
+Colour = tuple[int, int, int]
+Box = tuple[float, float, float, float]
+
+BACKGROUND: Colour = (18, 20, 24)
+LINE: Colour = (58, 62, 70)
+TEXT: Colour = (232, 234, 238)
+FAINT: Colour = (150, 156, 166)
+ACCENT: Colour = (255, 184, 77)
+BAR: Colour = (92, 124, 168)
+GOOD: Colour = (110, 200, 120)
+BAD: Colour = (236, 102, 92)
+LEVELS: Sequence[Colour] = ((235, 235, 235), (140, 220, 140), (230, 220, 110), (240, 165, 80), (240, 100, 90))
+"""of the task's level, 0..4; as in the gallery"""
+
+MARGIN = 16
+_METRICS = {"frames_alive": "frames alive", "kills": "kills"}
+
+
+class Panel:
+    """Draws the moments of one episode, in their order.
+
+    Args:
+        player: its name.
+        task: that is played.
+        profile: whose time-out and upper bound.
+        action_meanings: buttons of each action.
+    """
+
+    def __init__(self, player: str, task: Task, profile: Profile, action_meanings: Sequence[Sequence[str]]):
+        self._task = task
+        self._actions = ["+".join(_button(b) for b in held) or "nothing" for held in action_meanings]
+        self._bound = task.scenario.upper_bound(profile)
+        self._timeout = task.scenario.timeout_frames(profile)
+        self._value_range = (np.inf, -np.inf)
+        self._timeline: list[tuple[int, float | None, float]] = []
+        self._reward = 0.0
+        self._picture = Image.new("RGB", (WIDTH, HEIGHT), BACKGROUND)
+        self._draw = ImageDraw.Draw(self._picture)
+        self._draw_head(player)
+
+    def draw(self, moment: Moment) -> Image.Image:
+        """The picture of a moment; it is drawn over with the next one."""
+        self._picture.paste(Image.fromarray(moment.screen), (0, HEAD_HEIGHT))
+        if moment.terminated or moment.truncated:
+            self._draw_end("died" if moment.terminated else "time is up")
+        rewarded = moment.reward - self._reward
+        if moment.decided or rewarded:
+            value = None if moment.values is None else float(moment.values.q_values.max())
+            self._timeline.append((moment.frames, value, rewarded))
+            self._reward = moment.reward
+            self._draw_side(moment)
+        self._draw_foot(moment)
+        return self._picture
+
+    def _draw_head(self, player: str) -> None:
+        task, middle = self._task, HEAD_HEIGHT / 2
+        self._text((MARGIN, middle), task.scenario.title, 20, TEXT, "lm")
+        x = MARGIN + _font(20).getlength(task.scenario.title) + 14
+        self._text((x, middle), f"level {task.level}", 16, LEVELS[task.level], "lm")
+        x += _font(16).getlength(f"level {task.level}") + 14
+        size = _fitting(task.name, 16, SCREEN_WIDTH - x)
+        self._text((x, middle), task.name, size, FAINT, "lm")
+        size = _fitting(player, 16, SIDE_WIDTH - 2 * MARGIN)
+        self._text((SCREEN_WIDTH + MARGIN, middle), player, size, TEXT, "lm")
+
+    def _draw_end(self, how: str) -> None:
+        x, y = SCREEN_WIDTH / 2, HEAD_HEIGHT + SCREEN_HEIGHT / 3
+        self._draw.rounded_rectangle((x - 110, y - 26, x + 110, y + 26), 8, BACKGROUND)
+        self._text((x, y), how, 26, ACCENT, "mm")
+
+    def _draw_side(self, moment: Moment) -> None:
+        self._clear((SCREEN_WIDTH, HEAD_HEIGHT, WIDTH, HEIGHT))
+        left, right = SCREEN_WIDTH + MARGIN, WIDTH - MARGIN
+        y = self._draw_actions(moment, (left, HEAD_HEIGHT, right, 0))
+        if moment.values is not None and moment.values.probabilities is not None and moment.action is not None:
+            y = self._draw_returns(moment.values, moment.action, (left, y + 12, right, 0))
+        self._draw_rewards(moment, (left, y + 12, right, 0))
+
+    def _draw_actions(self, moment: Moment, box: Box) -> float:
+        """A line an action, the held one marked, with its value if there are any. Returns where it ends."""
+        left, y, right, _ = box
+        values = None if moment.values is None else moment.values.q_values
+        self._caption((left, y), "action" if values is None else "action, value (discounted reward to come)")
+        y += 22
+        row = min(24, 200 // len(self._actions))
+        size = min(15, row - 3)
+        low, high = self._scale(values)
+        name_width = min(220, max(_font(size).getlength(name) for name in self._actions))
+        bar_left, bar_right = left + 14 + name_width + 10, right - 62
+        for action, name in enumerate(self._actions):
+            middle = y + row / 2
+            held = action == moment.action
+            colour = ACCENT if held else FAINT
+            if held:
+                self._draw.ellipse((left, middle - 4, left + 8, middle + 4), ACCENT)
+            self._text((left + 14, middle), name, _fitting(name, size, 220), TEXT if held else FAINT, "lm")
+            if values is not None:
+                at = bar_left + (values[action] - low) / (high - low) * (bar_right - bar_left)
+                self._draw.rectangle((bar_left, y + 3, bar_right, y + row - 4), LINE)
+                self._draw.rectangle((bar_left, y + 3, max(at, bar_left), y + row - 4), ACCENT if held else BAR)
+                self._text((right, middle), f"{values[action]:.3f}", size, colour, "rm")
+            y += row
+        return y
+
+    def _scale(self, values: np.ndarray | None) -> tuple[float, float]:
+        """Of the bars: what has been seen so far, widened a little, so that bars can be told apart and compared."""
+        if values is not None:
+            low, high = self._value_range
+            self._value_range = (min(low, float(values.min())), max(high, float(values.max())))
+        low, high = self._value_range
+        room = max(0.1 * (high - low), 1e-3)
+        return low - room, high + room
+
+    def _draw_returns(self, values: Values, action: int, box: Box) -> float:
+        """The distribution of the held action's return as bars. Returns where it ends."""
+        assert values.probabilities is not None
+        assert values.atoms is not None
+        left, y, right, _ = box
+        self._caption((left, y), f"return of {self._actions[action]}, probability")
+        masses, atoms = values.probabilities[action], values.atoms
+        top, bottom = y + 24, y + 24 + (110 if len(self._actions) <= 6 else 70)
+        width = (right - left) / len(atoms)
+        scale = (bottom - top) / max(float(masses.max()), 0.1)
+        self._text((right, top - 13), f"highest {masses.max():.2f}", 12, FAINT, "rm")
+        for n, mass in enumerate(masses):
+            x = left + n * width
+            self._draw.rectangle((x, bottom - mass * scale, x + width - 2, bottom), BAR)
+        self._draw.line((left, bottom + 1, right, bottom + 1), LINE)
+        mean = left + (values.q_values[action] - atoms[0]) / (atoms[-1] - atoms[0]) * (right - left - width) + width / 2
+        self._draw.line((mean, top - 4, mean, bottom), ACCENT, 2)
+        self._text((left, bottom + 12), f"{atoms[0]:.1f}", 12, FAINT, "lm")
+        self._text((right, bottom + 12), f"{atoms[-1]:.1f}", 12, FAINT, "rm")
+        if left + 50 < mean < right - 50:
+            self._text((mean, bottom + 12), f"mean {values.q_values[action]:.2f}", 12, ACCENT, "mm")
+        return bottom + 22
+
+    def _draw_rewards(self, moment: Moment, box: Box) -> None:
+        left, y, right, _ = box
+        self._caption((left, y), "reward so far")
+        y += 22
+        row = min(22, (HEIGHT - y - 10) // (len(moment.reward_components) + 1))
+        size = min(15, row - 3)
+        for name, value in moment.reward_components.items():
+            colour = GOOD if value > 0 else BAD if value < 0 else FAINT
+            self._text((left + 14, y + row / 2), name.replace("_", " "), size, FAINT, "lm")
+            self._text((right, y + row / 2), f"{value:+.2f}" if value else "0", size, colour, "rm")
+            y += row
+        self._draw.line((left, y + 2, right, y + 2), LINE)
+        self._text((left + 14, y + 4 + row / 2), "sum", size, TEXT, "lm")
+        self._text((right, y + 4 + row / 2), f"{moment.reward:+.2f}", size, TEXT, "rm")
+
+    def _draw_foot(self, moment: Moment) -> None:
+        top = HEAD_HEIGHT + SCREEN_HEIGHT
+        self._clear((0, top, SCREEN_WIDTH, HEIGHT))
+        self._text((MARGIN, top + 40), f"{moment.score:g}", 36, TEXT, "lm")
+        x = MARGIN + _font(36).getlength(f"{moment.score:g}") + 10
+        self._text((x, top + 45), f"of {self._bound:g} {_METRICS[self._task.scenario.metric]}", 15, FAINT, "lm")
+        percent = f"{100 * moment.score / self._bound:.1f} %    tic {moment.frames} of {self._timeout}"
+        self._text((MARGIN, top + 84), percent, 15, FAINT, "lm")
+        self._draw_timeline(moment, (330, top + 12, SCREEN_WIDTH - MARGIN, HEIGHT - 12))
+
+    def _draw_timeline(self, moment: Moment, box: Box) -> None:
+        """Over the episode's time: the value of the best action as a line, and below it rewards, up and down."""
+        left, top, right, bottom = box
+        scale = (right - left) / self._timeout
+        points = [(left + frames * scale, value) for frames, value, _ in self._timeline if value is not None]
+        if points:
+            self._draw_values(points, (left, top, right, (top + bottom) / 2 - 6))
+            top = (top + bottom) / 2 + 6
+        middle = (top + bottom) / 2
+        self._text((left - 10, middle), "reward", 13, FAINT, "rm")
+        self._draw.line((left, middle, right, middle), LINE)
+        largest = max((abs(reward) for _, _, reward in self._timeline), default=0.0)
+        for frames, _, reward in self._timeline:
+            x, height = left + frames * scale, abs(reward) / max(largest, 1e-6) * (bottom - top) / 2
+            if height >= 2:  # not the small change of every decision
+                y = middle - height if reward > 0 else middle
+                self._draw.rectangle((x, y, x + 1, y + height), GOOD if reward > 0 else BAD)
+        now = left + moment.frames * scale
+        self._draw.line((now, box[1], now, bottom), FAINT)
+
+    def _draw_values(self, points: Sequence[tuple[float, float]], box: Box) -> None:
+        """A line through (x, value), from the lowest to the highest so far."""
+        left, top, right, bottom = box
+        low, high = min(value for _, value in points), max(value for _, value in points)
+        scale = (bottom - top) / max(high - low, 1e-6)
+        self._text((left - 10, top + 7), f"value {high:.2f}", 13, FAINT, "rm")
+        self._text((left - 10, bottom - 5), f"{low:.2f}", 13, FAINT, "rm")
+        self._draw.line((left, bottom, right, bottom), LINE)
+        if len(points) > 1:
+            self._draw.line([(x, bottom - (value - low) * scale) for x, value in points], ACCENT, 2)
+
+    def _caption(self, at: tuple[float, float], text: str) -> None:
+        self._text((at[0], at[1] + 10), text, 13, FAINT, "lm")
+
+    def _clear(self, box: Box) -> None:
+        self._draw.rectangle(box, BACKGROUND)
+
+    def _text(self, at: tuple[float, float], text: str, size: float, colour: Colour, anchor: str) -> None:
+        self._draw.text(at, text, colour, _font(size), anchor)
+
+
+@cache
+def _font(size: float) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size)
+
+
+def _fitting(text: str, size: float, width: float) -> float:
+    """The font size, at most `size`, in which a text is no wider than `width` pixels."""
+    while size > 6 and _font(size).getlength(text) > width:
+        size -= 1
+    return size
+
+
+def _button(name: str) -> str:
+    """TURN_LEFT -> turn left."""
+    return name.replace("_", " ").lower()

@@ -1,0 +1,81 @@
+"""Pictures to a video file: H.264 in MP4 by PyAV, animated GIF and WebP by Pillow. Imports pillow; av to write MP4."""
+
+import importlib.util
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from gvz.errors import ConfigError
+
+SUFFIXES = (".mp4", ".gif", ".webp")
+END_S = 1.5
+"""for how long the last picture stays, seconds"""
+
+
+def check_video_file(file: Path) -> None:
+    """Says beforehand whether `write_video` can write there.
+
+    Raises:
+        ConfigError: another kind of file, PyAV is missing for an MP4, or no such directory can be made.
+    """
+    if file.suffix not in SUFFIXES:
+        raise ConfigError(f"--out: got {file.name}, want a name that ends with {', '.join(SUFFIXES)}")
+    if file.suffix == ".mp4" and importlib.util.find_spec("av") is None:
+        raise ConfigError("--out: .mp4 needs PyAV: pip install 'gvizdoom[video]', or write .webp or .gif")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out: {file.parent} cannot be made: {error.strerror}") from error
+
+
+def write_video(file: Path, pictures: Iterable[Image.Image], rate: Fraction) -> None:
+    """Writes a video; the file appears once it is whole.
+
+    Args:
+        file: where to; its suffix, one of SUFFIXES, says which kind.
+        pictures: at least one, all of one size, both sides even. May be drawn over once the next is asked for.
+        rate: pictures a second.
+    """
+    writing = file.with_name(f".writing-{file.name}")
+    try:
+        if file.suffix == ".mp4":
+            _write_mp4(writing, pictures, rate)
+        else:
+            _write_animation(writing, pictures, rate)
+        writing.replace(file)
+    finally:
+        writing.unlink(missing_ok=True)
+
+
+def _write_mp4(file: Path, pictures: Iterable[Image.Image], rate: Fraction) -> None:
+    import av
+
+    shown = _with_end(pictures, rate)
+    first = next(shown)
+    with av.open(str(file), "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=rate, options={"crf": "23", "preset": "veryfast"})
+        stream.width, stream.height = first.size
+        stream.pix_fmt = "yuv420p"  # what browsers play
+        for picture in chain([first], shown):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.asarray(picture), format="rgb24")))
+        container.mux(stream.encode())
+
+
+def _with_end(pictures: Iterable[Image.Image], rate: Fraction) -> Iterator[Image.Image]:
+    """The last picture stays."""
+    picture = None
+    for picture in pictures:
+        yield picture
+    if picture is not None:
+        for _ in range(round(END_S * rate)):
+            yield picture
+
+
+def _write_animation(file: Path, pictures: Iterable[Image.Image], rate: Fraction) -> None:
+    shown = [picture.copy() for picture in pictures]
+    durations_ms = [round(1000 / rate)] * (len(shown) - 1) + [round(1000 * END_S)]
+    shown[0].save(file, save_all=True, append_images=shown[1:], duration=durations_ms, loop=0, quality=70, method=4)
