@@ -1,4 +1,4 @@
-"""The real command on real Doom: two experiments that share a run, one job killed in the middle, run again, a report."""
+"""The real command on real Doom: experiments that share a run, one job killed in the middle, run again, a report."""
 
 import json
 import os
