@@ -122,7 +122,7 @@ def draw_heat_map(
     width = 1.9 + 0.22 * num_marks + 0.62 * num_agents
     with mpl.rc_context({**STYLE, "axes.grid": False}):
         picture = Picture(figsize=(max(PANEL_INCHES[0], width), 1.7 + 0.24 * len(tasks)))
-        marks, heat = picture.subplots(1, 2, sharey=True, width_ratios=(0.22 * num_marks, 0.62 * num_agents))
+        marks, heat = picture.subplots(1, 2, sharey=True, width_ratios=(0.22 * max(1, num_marks), 0.62 * num_agents))
         picture.suptitle(title, fontsize=10)
         table = np.array([[np.nan if v is None else v for v in values] for values in scores.values()]).T
         heat.imshow(table, aspect="auto", cmap="viridis", vmin=0, vmax=100)
