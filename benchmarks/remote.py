@@ -96,6 +96,11 @@ class Remote:
         """
         return self._answer(ANSWER_TIMEOUT_S)
 
+    def has_answered(self) -> bool:
+        """Whether `answer` would not wait."""
+        assert self._process is not None
+        return bool(self._buffer or select.select([self._process.stdout], [], [], 0.0)[0])
+
     def __call__(self, **arguments: Any) -> dict[str, Any]:
         """`ask`, then `answer`."""
         self.ask(**arguments)
@@ -146,7 +151,14 @@ class Remote:
 
 
 def start_peer(script: str, python: Path, *arguments: str, **environment: str) -> "Remote | str":
-    """A peer's process, or why there is none."""
+    """A peer's process, or why there is none.
+
+    A peer that cannot live with the others (TensorFlow and torch in one process do not) has an environment of its
+    own beside theirs, `<theirs>-<peer>`.
+    """
+    venv = python.parent.parent
+    own = venv.with_name(f"{venv.name}-{script.partition('_')[0]}") / "bin" / "python"
+    python = own if own.exists() else python
     try:
         return Remote(script, *arguments, python=python, **environment)
     except RemoteError as error:

@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from benchmarks.rounds import Budget
 
 if TYPE_CHECKING:
     from actors.pool import ActorPool, PoolConfig
+    from gvz.assemble import Parts
     from gvz.config import RunConfig
     from learner.agents.base import Agent
     from learner.replay import ReplaySpec, ReplayState
@@ -25,6 +27,8 @@ TASK = "defend_the_center/default"
 _START_TIMEOUT_S = 300.0
 _DRAIN_RECORDS, _DRAIN_WAIT_S = 256, 0.02
 """as in gvz/train.py"""
+_UPDATES_IN_FLIGHT = 16
+"""calls handed to the device before the next wait: the clock is not to run away from it"""
 _SETTLE_S = 0.3
 """seconds played before the clock starts: what waited in full rings is not counted"""
 
@@ -117,6 +121,100 @@ def filled_replay(spec: "ReplaySpec") -> "ReplayState":
         )
 
     return jax.block_until_ready(fill(jax.random.key(0)))
+
+
+class Learner:
+    """The learner of a run without the run: its state, a full replay, and the jitted functions of gvz/train.py."""
+
+    def __init__(self, config: "RunConfig", parts: "Parts"):
+        import jax
+
+        from learner import replay, train_step
+        from learner.ingest import Ingest
+        from learner.policy import flatten_params
+
+        self.config, self.parts = config, parts
+        init = partial(train_step.init, parts.agent, parts.replay_spec, config.learner)
+        self.state = jax.jit(init)(jax.random.key(0))
+        self.replay = filled_replay(parts.replay_spec)
+        self._weights = jax.numpy.ones(parts.replay_spec.num_tasks)
+        self._train_steps: dict[int, Any] = {}
+        self._add = jax.jit(partial(replay.add, parts.replay_spec), donate_argnums=0)
+        self._flatten = jax.jit(flatten_params)
+        self._ingest = Ingest(parts.replay_spec)
+        self._version = 1
+
+    def acting_params(self) -> np.ndarray:
+        """The parameters as actors take them, float32[P]."""
+        return np.asarray(self._flatten(self.state.params))
+
+    def updates_per_s(self, per_call: int, seconds: float, pool: "ActorPool | None" = None) -> float:
+        """Gradient steps a second, compilation apart; with a pool as fast as both go, its records into the replay.
+
+        Args:
+            per_call: gradient steps in one jitted call.
+            seconds: at least so long, and at least one call.
+            pool: live actors, drained, watched and given new parameters as in a run.
+        """
+        import jax
+
+        self._update(per_call)
+        jax.block_until_ready(self.state.params)
+        start, num_updates, published = time.perf_counter(), 0, 0
+        while num_updates == 0 or time.perf_counter() - start < seconds:
+            if pool is not None:
+                self._collect(pool)
+            self._update(per_call)
+            num_updates += per_call
+            if pool is not None and num_updates >= published + self.config.learner.publish_period_updates:
+                published = num_updates
+                self._publish(pool)
+            elif num_updates % (_UPDATES_IN_FLIGHT * per_call) == 0:
+                jax.block_until_ready(self.state.num_updates)
+        jax.block_until_ready(self.state.params)
+        return num_updates / (time.perf_counter() - start)
+
+    def _update(self, per_call: int) -> None:
+        from learner import train_step
+
+        if per_call not in self._train_steps:
+            config, parts = self.config, self.parts
+            self._train_steps[per_call] = train_step.make_train_step(
+                parts.agent, parts.replay_spec, config.learner, config.replay, per_call
+            )
+        self.state, self.replay = self._train_steps[per_call](self.state, self.replay, self._weights)
+
+    def _collect(self, pool: "ActorPool") -> None:
+        for arrays in self._ingest.arrays(pool.drain(_DRAIN_RECORDS), self._version):
+            self.replay = self._add(self.replay, arrays)
+        pool.poll()
+
+    def _publish(self, pool: "ActorPool") -> None:
+        from gvz.transport.messages import ParamsHeader
+
+        self._version += 1
+        header = ParamsHeader(version=self._version, num_updates=0, layout_hash=self.parts.pool_config.layout_hash)
+        pool.publish(self.acting_params(), header)
+
+    def flops_per_update(self) -> float:
+        """Floating-point operations of loss and gradient of one batch, with plain convolutions."""
+        import jax
+
+        from learner import replay
+
+        agent, spec, batch_size = direct(self.parts.agent), self.parts.replay_spec, self.config.learner.batch_size
+        batch, _ = jax.eval_shape(lambda s, key: replay.sample(spec, s, key, batch_size, 0.5), self.replay, _key())
+
+        def loss(params: Any, batch: replay.Transitions) -> jax.Array:
+            return agent.loss(params, params, jax.random.key(0), batch).loss.mean()
+
+        return flops(jax.grad(loss), self.state.params, batch)
+
+
+def _key() -> Any:
+    import jax
+
+    return jax.random.key(0)
 
 
 def flops(function: Any, *arguments: Any) -> float:

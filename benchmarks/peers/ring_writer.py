@@ -1,0 +1,36 @@
+"""Writes blocks into a ring as fast as its reader makes room: `python ring_writer.py NAME CAPACITY BLOCK`."""
+
+import sys
+import time
+from typing import Any
+
+import numpy as np
+from serve import serve
+
+from gvz.transport.ring import RingWriter
+
+_SHAPE = (84, 84, 3)
+_TIMEOUT_S = 60.0
+
+
+def main() -> None:
+    """Attaches to the ring and serves."""
+    name, capacity, block = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+    ring = RingWriter.attach(name, capacity, _SHAPE)
+    frames = np.random.default_rng(0).integers(0, 256, (block, *_SHAPE), np.uint8)
+
+    def write(seconds: float) -> dict[str, Any]:
+        count, start = 0, time.perf_counter()
+        while time.perf_counter() - start < seconds:
+            ring.wait_for_space(block, _TIMEOUT_S)
+            _, slots = ring.reserve(block)
+            slots[...] = frames
+            ring.commit()
+            count += block
+        return {"count": count, "seconds": time.perf_counter() - start}
+
+    serve(write)
+
+
+if __name__ == "__main__":
+    main()
