@@ -176,7 +176,7 @@ def bootstrap_runs(
     groups: Sequence[Cells],
     statistic: Statistic = mean,
     *,
-    redraw: Redraw | Sequence[Redraw] = "runs",
+    redraw: Sequence[Redraw],
     confidence: float = 0.95,
     num_resamples: int = 2000,
     seed: int = 0,
@@ -186,7 +186,7 @@ def bootstrap_runs(
     Args:
         groups: what the statistic takes, each drawn anew by itself: one scenario's runs each, or ours and theirs.
         statistic: f(scores [..., S, T] of each group) -> [...].
-        redraw: what is drawn anew, in all groups or in each of them. Of a single run only episodes can be.
+        redraw: what is drawn anew in each group. Of a single run only episodes can be.
         confidence: of the interval, 0..1.
         num_resamples: bootstrap samples.
         seed: of the resampling.
@@ -198,44 +198,39 @@ def bootstrap_runs(
     for cells in groups:
         if not cells or not cells[0] or any(len(run) != len(cells[0]) or not all(map(len, run)) for run in cells):
             raise ValueError("bootstrap_runs: want runs with the same tasks, at least one episode in each")
-    if not groups:
-        raise ValueError("bootstrap_runs: got no groups of runs, want at least one")
+    if not groups or len(groups) != len(redraw):
+        raise ValueError(f"bootstrap_runs: got {len(groups)} groups of runs and {len(redraw)} ways, want one for each")
     rng = np.random.default_rng(seed)
-    means = [np.array([[np.mean(cell) for cell in run] for run in cells]) for cells in groups]  # [S, T] each
-    hows = [redraw] * len(groups) if isinstance(redraw, str) else redraw
-    drawn = [
-        _redraw_episodes(cells, num_resamples, rng)
-        if how == "episodes"
-        else _redraw_runs(scores, how, num_resamples, rng)
-        for cells, scores, how in zip(groups, means, hows, strict=True)
-    ]
+    means = [_means(cells) for cells in groups]
+    drawn = [_redrawn(cells, how, num_resamples, rng) for cells, how in zip(groups, redraw, strict=True)]
     return _percentile_interval(statistic(*means), statistic(*drawn), confidence)
 
 
-def _redraw_episodes(cells: Cells, num_resamples: int, rng: np.random.Generator) -> np.ndarray:
-    """Means of episodes drawn anew within each cell, float64[R, S, T]."""
-    return np.stack([np.stack([_means_of_redrawn(cell, num_resamples, rng) for cell in run], -1) for run in cells], -2)
+def _means(cells: Cells) -> np.ndarray:
+    """float64[S, T]"""
+    return np.array([[np.mean(cell) for cell in run] for run in cells])
 
 
-def _means_of_redrawn(scores: np.ndarray, num_resamples: int, rng: np.random.Generator) -> np.ndarray:
-    scores = np.asarray(scores, np.float64)
-    blocks = _blocks(num_resamples, len(scores))
-    return np.concatenate([scores[rng.integers(len(scores), size=(num, len(scores)))].mean(axis=1) for num in blocks])
-
-
-def _redraw_runs(
-    scores: np.ndarray, redraw: Literal["runs", "runs_by_task"], num_resamples: int, rng: np.random.Generator
-) -> np.ndarray:
-    """Runs drawn anew, float64[R, S, T]."""
-    num_runs, num_tasks = scores.shape
+def _redrawn(cells: Cells, redraw: Redraw, num_resamples: int, rng: np.random.Generator) -> np.ndarray:
+    """Means of what was drawn anew, float64[R, S, T]."""
+    num_runs, num_tasks = len(cells), len(cells[0])
     match redraw:
+        case "episodes":
+            means = [[_means_of_redrawn(cell, num_resamples, rng) for cell in run] for run in cells]
+            return np.moveaxis(np.array(means), -1, 0)
         case "runs":
             chosen = rng.integers(num_runs, size=(num_resamples, num_runs, 1))
         case "runs_by_task":
             chosen = rng.integers(num_runs, size=(num_resamples, num_runs, num_tasks))
         case _:
             assert_never(redraw)
-    return scores[chosen, np.arange(num_tasks)]
+    return _means(cells)[chosen, np.arange(num_tasks)]
+
+
+def _means_of_redrawn(scores: np.ndarray, num_resamples: int, rng: np.random.Generator) -> np.ndarray:
+    scores = np.asarray(scores, np.float64)
+    blocks = _blocks(num_resamples, len(scores))
+    return np.concatenate([scores[rng.integers(len(scores), size=(num, len(scores)))].mean(axis=1) for num in blocks])
 
 
 def _blocks(num_resamples: int, width: int) -> list[int]:

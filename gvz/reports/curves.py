@@ -103,7 +103,7 @@ def evaluation_curve(label: str, episodes: pl.DataFrame, tasks: Sequence[str], a
         runs = pick(checkpoint)
         scores = Scores(runs=runs, wanted_seeds=tuple(runs), agents_of_tasks=agents_of_tasks)
         if cells := scores.cells(tasks):
-            estimates.append(bootstrap_runs([cells], redraw=redraw(scores, tasks), num_resamples=300))
+            estimates.append(bootstrap_runs([cells], redraw=[redraw(scores, tasks)], num_resamples=300))
             updates.append(float(checkpoint["num_updates"].median()))  # pyright: ignore[reportArgumentType]  # not empty
     if not estimates:
         return None

@@ -39,9 +39,9 @@ def experiment_section(results: Results, asked: Asked, out: Path) -> Section:
         f"{experiment.num_checkpoints} checkpoints, {experiment.episodes} evaluation episodes a task and checkpoint; "
         f"tables are over the last {experiment.table_checkpoints}."
     )
-    tables = [_table(results, asked), _aggregates(results, asked)]
+    tables = [result_table(results, asked), aggregate_table(results, asked)]
     if experiment.columns != "level":
-        tables.append(_comparisons(results, asked))
+        tables.append(comparison_table(results, asked))
     text = (f"**{experiment.question}** Source: {experiment.source}.", budget, *experiment.notes)
     return Section(
         id=experiment.name.replace("_", "-"),
@@ -108,7 +108,7 @@ def _column_tasks(experiment: Experiment, run: TrainingRun, column: str) -> tupl
     return tuple(t for t in tasks if parse_task(t).level == int(column)) if experiment.columns == "level" else tasks
 
 
-def _table(results: Results, asked: Asked) -> Table:
+def result_table(results: Results, asked: Asked) -> Table:
     """Rows: for every scenario ours and, below, what others published; then the mean over scenarios."""
     experiment, columns = asked.experiment, asked.experiment.column_names
     rows = []
@@ -162,7 +162,7 @@ def _joined(statistic: Statistic) -> Statistic:
     return lambda *groups: statistic(np.concatenate(groups, axis=-1))
 
 
-def _aggregates(results: Results, asked: Asked) -> Table:
+def aggregate_table(results: Results, asked: Asked) -> Table:
     """Mean, interquartile mean and median over all scenarios' tasks."""
     experiment = asked.experiment
     rows = []
@@ -183,7 +183,7 @@ def _aggregates(results: Results, asked: Asked) -> Table:
     )
 
 
-def _comparisons(results: Results, asked: Asked) -> Table:
+def comparison_table(results: Results, asked: Asked) -> Table:
     """Each two columns: difference of the means, and how probable it is that the first is better."""
     experiment = asked.experiment
     rows = []

@@ -47,8 +47,8 @@ def _section(results: Results, scenario: Scenario, out: Path) -> Section:
     blocks = []
     if agents:
         scores = {agent: agent_scores(episodes, agent) for agent in agents}
-        tables = [_by_level(scenario, scores, tasks), _by_task(scenario, scores, tasks, episodes)]
-        if gaps := _gaps(results, scenario, scores, tasks):
+        tables = [level_table(scenario, scores, tasks), task_table(scenario, scores, tasks, episodes)]
+        if gaps := gap_table(results, scenario, scores, tasks):
             tables.append(gaps)
         final = episodes.filter("final")
         pictures = [_heat_map(scenario, scores, tasks, out)]
@@ -79,7 +79,7 @@ def _interval_note(scores: Mapping[str, Scores]) -> str:
     )
 
 
-def _by_level(scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task]) -> Table:
+def level_table(scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task]) -> Table:
     """Agents as rows, levels as columns, then all test tasks together."""
     test = [task.id for task in named_tasks(scenario.id, split="test")]
     played = {task.id for task in tasks}
@@ -103,7 +103,9 @@ def _by_level(scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[
     )
 
 
-def _by_task(scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task], episodes: pl.DataFrame) -> Table:
+def task_table(
+    scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task], episodes: pl.DataFrame
+) -> Table:
     """Tasks as rows, agents as columns; says who has solved a task."""
     who_solved = _solved(scenario, episodes.filter("final"))
     rows = []
@@ -140,7 +142,9 @@ def _solved(scenario: Scenario, final: pl.DataFrame) -> set[tuple[str, str]]:
     return {key for key, value in done.items() if value}
 
 
-def _gaps(results: Results, scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task]) -> Table | None:
+def gap_table(
+    results: Results, scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task]
+) -> Table | None:
     """How much agents lose from the tasks trained on to others, and from levels 0 and 1 to levels 2 to 4."""
     trained_on = {results.agents[str(r.path)]: r.tasks for r in results.runs if r.scenario == scenario.id}
     test = [task.id for task in named_tasks(scenario.id, split="test")]

@@ -78,14 +78,14 @@ RLIABLE = {
 
 @pytest.mark.parametrize("statistic", RLIABLE)
 def test_value_and_interval_are_rliables(statistic):
-    ours = bootstrap_runs([cells(OURS)], statistic, redraw="runs_by_task", num_resamples=20_000)
+    ours = bootstrap_runs([cells(OURS)], statistic, redraw=["runs_by_task"], num_resamples=20_000)
     assert (ours.value, ours.low, ours.high) == pytest.approx(RLIABLE[statistic], abs=0.35)
     assert ours.value == pytest.approx(RLIABLE[statistic][0])
 
 
 def test_the_interval_of_the_probability_of_improvement_is_rliables():
     pair = [cells(OURS), cells(THEIRS)]
-    ours = bootstrap_runs(pair, probability_of_improvement, redraw="runs_by_task", num_resamples=20_000)
+    ours = bootstrap_runs(pair, probability_of_improvement, redraw=["runs_by_task"] * 2, num_resamples=20_000)
     assert ours == Estimate(value=0.75, low=pytest.approx(0.5556, abs=0.03), high=pytest.approx(0.9167, abs=0.03))
 
 
@@ -99,24 +99,24 @@ def test_the_interval_of_a_mean_agrees_with_scipys_bootstrap():
 
 def test_redrawing_episodes_of_one_run_is_the_bootstrap_of_its_episodes():
     scores = np.random.default_rng(1).exponential(300, size=120)
-    one = bootstrap_runs([[[scores]]], redraw="episodes", num_resamples=4000)
+    one = bootstrap_runs([[[scores]]], redraw=["episodes"], num_resamples=4000)
     assert one == bootstrap([scores], num_resamples=4000)
 
 
 def test_a_run_drawn_whole_keeps_its_tasks_together():
     # two runs, each good where the other is bad: whole runs have the same mean, and task by task anything may come
     opposite = cells(np.array([[0.0, 10.0], [10.0, 0.0]]))
-    assert bootstrap_runs([opposite], redraw="runs") == Estimate(value=5.0, low=5.0, high=5.0)
-    assert bootstrap_runs([opposite], redraw="runs_by_task") == Estimate(value=5.0, low=0.0, high=10.0)
+    assert bootstrap_runs([opposite], redraw=["runs"]) == Estimate(value=5.0, low=5.0, high=5.0)
+    assert bootstrap_runs([opposite], redraw=["runs_by_task"]) == Estimate(value=5.0, low=0.0, high=10.0)
 
 
 def test_episodes_are_redrawn_within_their_run_and_task():
     certain = [[np.full(20, 10.0), np.full(5, 30.0)], [np.full(20, 20.0), np.full(1, 40.0)]]
-    assert bootstrap_runs([certain], redraw="episodes") == Estimate(value=25.0, low=25.0, high=25.0)
+    assert bootstrap_runs([certain], redraw=["episodes"]) == Estimate(value=25.0, low=25.0, high=25.0)
 
 
 def test_every_run_and_task_counts_alike_however_many_episodes_it_has():
-    assert bootstrap_runs([[[np.array([0.0]), np.array([6.0, 6.0, 6.0])]]], redraw="episodes").value == 3.0
+    assert bootstrap_runs([[[np.array([0.0]), np.array([6.0, 6.0, 6.0])]]], redraw=["episodes"]).value == 3.0
 
 
 def test_strata_are_resampled_within_themselves():
@@ -157,9 +157,18 @@ def test_nothing_to_resample_is_an_error(strata, confidence):
 @pytest.mark.parametrize("runs", [[], [[]], [[np.zeros(0)]], [[np.ones(1)], [np.ones(1), np.ones(1)]]])
 def test_runs_that_are_no_matrix_are_an_error(runs):
     with pytest.raises(ValueError, match="want runs with the same tasks, at least one episode in each"):
-        bootstrap_runs([runs])
+        bootstrap_runs([runs], redraw=["runs"])
 
 
-def test_no_runs_are_an_error():
-    with pytest.raises(ValueError, match="got no groups of runs"):
-        bootstrap_runs([])
+def test_every_group_of_runs_needs_its_way():
+    with pytest.raises(ValueError, match="got 0 groups of runs and 0 ways, want one for each"):
+        bootstrap_runs([], redraw=[])
+    with pytest.raises(ValueError, match="got 1 groups of runs and 2 ways"):
+        bootstrap_runs([cells(OURS)], redraw=["runs", "runs"])
+
+
+def test_one_side_may_be_redrawn_by_runs_and_the_other_by_episodes():
+    # ours: two runs of 10 and 30; theirs: one run with the episodes 0 and 2, so the difference lies in 8..30
+    theirs = [[np.array([0.0, 2.0])]]
+    gain = bootstrap_runs([[[np.array([10.0])], [np.array([30.0])]], theirs], difference, redraw=["runs", "episodes"])
+    assert gain == Estimate(value=19.0, low=8.0, high=30.0)
