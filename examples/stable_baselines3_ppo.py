@@ -1,0 +1,47 @@
+"""PPO of Stable-Baselines3, trained on some tasks of a scenario and evaluated on others by the benchmark's protocol.
+
+pip install -r examples/requirements.txt; python examples/stable_baselines3_ppo.py --steps 200000 --episodes 20
+"""
+
+from functools import partial
+
+import numpy as np
+import tyro
+from stable_baselines3 import PPO
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack
+
+import gvz
+from gvz.evaluation.play import play_episode
+from gvz.evaluation.players import FramePlayer
+from gvz.tasks import named_tasks
+
+
+def main(
+    scenario: str = "defend_the_center",
+    steps: int = 20_000,
+    n_steps: int = 128,
+    episodes: int = 5,
+    processes: bool = True,
+    max_tasks: int = 4,
+):
+    """Trains on the training set of 4 tasks, then plays `episodes` of the first `max_tasks` test tasks."""
+    games = [lambda task=task: Monitor(gvz.make(task)) for task in named_tasks(scenario, split="train4")]
+    vector = partial(SubprocVecEnv, start_method="spawn") if processes else DummyVecEnv
+    envs = VecFrameStack(vector(games), n_stack=4)  # u8[4, 84, 84, 12], newest frame last
+    model = PPO("CnnPolicy", envs, n_steps=n_steps, batch_size=n_steps, ent_coef=0.01, verbose=1, seed=1)
+    model.learn(total_timesteps=steps)
+    envs.close()
+
+    def choose(stack: np.ndarray) -> int:
+        return int(model.predict(stack, deterministic=True)[0])
+
+    for task in named_tasks(scenario, split="test")[:max_tasks]:
+        env = gvz.make(task)
+        scores = [play_episode(env, FramePlayer(choose), episode)["score"] for episode in range(episodes)]
+        env.close()
+        print(f"{task.id}: mean score {np.mean(scores):.1f} of {episodes} episodes")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
