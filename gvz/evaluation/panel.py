@@ -183,6 +183,8 @@ class Panel:
         """Over the episode's time: the value of the best action as a line, and below it rewards, up and down."""
         left, top, right, bottom = box
         scale = (right - left) / self._timeout
+        now = left + moment.frames * scale
+        self._draw.line((now, top, now, bottom), FAINT)
         points = [(left + frames * scale, value) for frames, value, _ in self._timeline if value is not None]
         if points:
             self._draw_values(points, (left, top, right, (top + bottom) / 2 - 6))
@@ -196,8 +198,6 @@ class Panel:
             if height >= 2:  # not the small change of every decision
                 y = middle - height if reward > 0 else middle
                 self._draw.rectangle((x, y, x + 1, y + height), GOOD if reward > 0 else BAD)
-        now = left + moment.frames * scale
-        self._draw.line((now, box[1], now, bottom), FAINT)
 
     def _draw_values(self, points: Sequence[tuple[float, float]], box: Box) -> None:
         """A line through (x, value), from the lowest to the highest so far."""

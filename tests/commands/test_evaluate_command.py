@@ -1,45 +1,17 @@
 """gvz evaluate, as it is called: bad input, several checkpoints, interruption and going on."""
 
-import json
 import signal
 import subprocess
 import sys
 import time
 
-import jax
-import numpy as np
 import pytest
 
 from gvz import cli
-from gvz.assemble import run_agent
 from gvz.commands.evaluate import run_tasks
-from gvz.config import RunConfig, config_to_dict
 from gvz.evaluation.record import read_rows
 from gvz.selection import TaskSelection
-from gvz.specs import EnvConfig
 from gvz.tasks import named_tasks
-from learner import checkpoint
-from learner.config import AgentConfig
-
-CONFIG = RunConfig(
-    name="small",
-    seed=7,
-    env=EnvConfig(frame_height=24, frame_width=32, grayscale=True),
-    agent=AgentConfig(conv_channels=(4,), conv_kernels=(8,), conv_strides=(4,), hidden_units=8),
-)
-
-
-@pytest.fixture
-def run(tmp_path):
-    """A run directory with the policies of updates 10 and 20."""
-    path = tmp_path / "run"
-    template = jax.eval_shape(run_agent(CONFIG).init, jax.random.key(0))
-    for step in (10, 20):
-        rng = np.random.default_rng(step)
-        params = jax.tree.map(lambda leaf, rng=rng: rng.standard_normal(leaf.shape, np.float32), template)
-        checkpoint.write(path / "policies" / str(step), params, {"num_updates": step})
-    (path / "config.json").write_text(json.dumps(config_to_dict(CONFIG)))
-    return path
 
 
 @pytest.mark.parametrize(
@@ -61,22 +33,22 @@ def run(tmp_path):
         ("{run} --tasks defend_the_center/gor", "unknown attribute 'gor' (did you mean 'gore'?)"),
     ],
 )
-def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, tmp_path, run):
+def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, tmp_path, small_run):
     (tmp_path / "file").write_text("nonsense\n")
-    assert cli.main(["evaluate", *arguments.format(file=tmp_path / "file", run=run).split()]) == 2
+    assert cli.main(["evaluate", *arguments.format(file=tmp_path / "file", run=small_run).split()]) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith("error: ")
     assert message in err
-    assert not (run / "evaluation.jsonl").exists()
+    assert not (small_run / "evaluation.jsonl").exists()
 
 
-def test_a_damaged_policy_is_told_of_before_anything_is_played(capsys, run):
-    (run / "policies" / "10" / "host.msgpack").unlink()
-    assert cli.main(["evaluate", str(run), "--checkpoints", "all"]) == 1
+def test_a_damaged_policy_is_told_of_before_anything_is_played(capsys, small_run):
+    (small_run / "policies" / "10" / "host.msgpack").unlink()
+    assert cli.main(["evaluate", str(small_run), "--checkpoints", "all"]) == 1
     err = capsys.readouterr().err
     assert "policies/10: files missing or unknown: ['host.msgpack']; evaluate another with --checkpoints" in err
-    assert not (run / "evaluation.jsonl").exists()
+    assert not (small_run / "evaluation.jsonl").exists()
 
 
 def test_a_run_is_evaluated_on_the_test_tasks_of_its_scenario_unless_told_otherwise():
@@ -88,20 +60,22 @@ def test_a_run_is_evaluated_on_the_test_tasks_of_its_scenario_unless_told_otherw
 
 
 @pytest.mark.engine
-def test_all_checkpoints_meet_the_same_episodes_and_none_twice(run, capsys):
-    command = f"evaluate {run} --checkpoints all --tasks defend_the_center/default --seeds 0 4 --workers 2".split()
+def test_all_checkpoints_meet_the_same_episodes_and_none_twice(small_run, capsys):
+    command = (
+        f"evaluate {small_run} --checkpoints all --tasks defend_the_center/default --seeds 0 4 --workers 2".split()
+    )
     assert cli.main([*command, "--episodes", "1"]) == 0
     out, err = capsys.readouterr()
     assert [line for line in out.splitlines() if line.startswith("small")] == [
         *("small/seed_7@10", "small/seed_7@10, base seed 4", "small/seed_7@20", "small/seed_7@20, base seed 4")
     ]
     assert err.splitlines()[-1].startswith("4/4  ")
-    rows = read_rows(run / "evaluation.jsonl")
+    rows = read_rows(small_run / "evaluation.jsonl")
     first = {(row["num_updates"], row["base_seed"]): row for row in rows}
     assert len(rows) == len(first) == 4
     assert first[10, 0]["seed"] == first[20, 0]["seed"] != first[10, 4]["seed"]
     assert cli.main([*command, "--episodes", "1"]) == 0
-    assert read_rows(run / "evaluation.jsonl") == rows
+    assert read_rows(small_run / "evaluation.jsonl") == rows
     assert capsys.readouterr().out == out
 
 

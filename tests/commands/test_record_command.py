@@ -1,0 +1,86 @@
+"""gvz record, as it is called."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import av
+import pytest
+from PIL import Image
+
+from gvz import cli
+from gvz.evaluation.record import read_rows
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--out v.webp", "want a run directory or --player"),
+        ("{run} --player idle --out v.webp", "want a run directory or --player"),
+        ("--player idle --out v.webp", "--task: want a task id, for example defend_the_center/gore"),
+        ("--player idle --task defend_the_center/gor --out v.webp", "unknown attribute 'gor' (did you mean 'gore'?)"),
+        ("{run} --out v.avi", "--out: got v.avi, want a name that ends with .mp4, .gif, .webp"),
+        ("{run} --out {file}/v.webp", "cannot be made: File exists"),
+        ("{run} --out v.webp --seconds 0", "--seconds: got 0, want more than 0"),
+        ("{run} --out v.webp --episode -1", "--episode: got -1, want at least 0"),
+        ("{run} --out v.webp --seed -1", "--seed: got -1, want at least 0"),
+        ("{run} --out v.webp --checkpoint 30", "--checkpoints: got '30', want newest"),
+        ("{run} --out v.webp --checkpoint all", "--checkpoint: got all, want one of 10, 20"),
+        ("{run} --out v.webp --task seek_and_kill/blue", "whose buttons are others"),
+        ("{file} --out v.webp", "is not a run directory"),
+    ],
+)
+def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, tmp_path, small_run, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    assert cli.main(["record", *arguments.format(file=tmp_path / "file", run=small_run).split()]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: ")
+    assert message in err
+    assert not (tmp_path / "v.webp").exists()
+
+
+@pytest.mark.engine
+def test_a_recording_ends_with_the_score_that_was_evaluated(small_run, tmp_path, capsys):
+    task = "defend_the_center/complete"
+    assert cli.main(f"evaluate {small_run} --tasks {task} --episodes 1 --seeds 3 --workers 1".split()) == 0
+    [row] = read_rows(small_run / "evaluation.jsonl")
+    capsys.readouterr()
+    video = tmp_path / "video.mp4"
+    assert cli.main(f"record {small_run} --task {task} --seed 3 --out {video}".split()) == 0
+    tics, score = row["length_frames"], row["score"]
+    how = "died" if row["terminated"] else "reached the time-out"
+    assert capsys.readouterr().out == f"{video}: small/seed_7@20 {how} at tic {tics}, score {score:g}\n"
+    with av.open(str(video)) as container:
+        stream = container.streams.video[0]
+        assert (stream.average_rate, stream.frames) == (35, 1 + tics + round(1.5 * 35))
+
+
+@pytest.mark.engine
+def test_an_animation_shows_every_decision_of_the_seconds_asked_for(tmp_path, capsys):
+    video = tmp_path / "video.webp"
+    assert cli.main(f"record --player random --task seek_and_kill/red --seconds 1 --out {video}".split()) == 0
+    assert capsys.readouterr().out.endswith("random was cut off at tic 35, score 0\n")
+    with Image.open(video) as animation:
+        assert animation.n_frames == 1 + 9  # the start, and the decisions of tics 1, 5, .. 33
+
+
+@pytest.mark.engine
+def test_an_interrupted_recording_leaves_nothing(tmp_path):
+    command = [
+        *(sys.executable, "-m", "gvz.cli", "record", "--player", "scripted", "--task", "defend_the_center/default"),
+        *("--out", str(tmp_path / "video.mp4")),
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.glob(".writing-*")):
+        assert time.monotonic() < deadline, "waited 120 s for the first picture"
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (130, "")
+    assert "interrupted; nothing was written" in err
+    assert "Traceback" not in err
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,70 @@
+"""gvz watch, as it is called; SDL's dummy driver stands in for a display."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from gvz import cli
+from gvz.viewer import Window
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--task defend_the_center/gore", "want a run directory or --player"),
+        ("{run} --episodes 0", "--episodes: got 0, want at least 1"),
+        ("{run} --speed 0", "--speed: got 0, want more than 0"),
+    ],
+)
+def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, small_run):
+    assert cli.main(["watch", *arguments.format(run=small_run).split()]) == 2
+    assert capsys.readouterr().err == f"error: {message}\n"
+
+
+def test_without_a_display_the_other_command_is_named(tmp_path):
+    hidden = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+    done = subprocess.run(
+        [sys.executable, "-m", "gvz.cli", "watch", "--player", "random", "--task", "seek_and_kill/red"],
+        env={name: value for name, value in os.environ.items() if name not in hidden},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert "error: watch: no window can be opened, there seems to be no display ($DISPLAY); `gvz record`" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.engine
+def test_episodes_are_shown_one_after_the_other(capsys, monkeypatch, small_run):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    assert cli.main(f"watch {small_run} --task defend_the_center/complete --episodes 2 --speed 1000".split()) == 0
+    lines = capsys.readouterr().out.splitlines()[-2:]
+    assert [line.partition(":")[0] for line in lines] == [
+        *("defend_the_center/complete, episode 0", "defend_the_center/complete, episode 1")
+    ]
+
+
+@pytest.mark.parametrize("event", ["QUIT", "KEYDOWN"])
+def test_a_window_notices_that_it_is_closed(monkeypatch, event):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    window = Window("title", 64, 48)
+    import pygame
+
+    frame = np.zeros((48, 64, 3), np.uint8)
+    window.show(frame)
+    assert not window.closed
+    pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_SPACE))
+    window.show(frame)
+    assert not window.closed
+    pygame.event.post(
+        pygame.event.Event(getattr(pygame, event), **({"key": pygame.K_ESCAPE} if "KEY" in event else {}))
+    )
+    window.show(frame)
+    assert window.closed
+    window.close()
