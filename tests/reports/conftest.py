@@ -4,7 +4,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -14,8 +14,21 @@ from gvz.experiments.plan import Plan, write_plan
 from gvz.experiments.progress import run_directory
 from gvz.tasks import parse_task
 
-Score = Callable[[TrainingRun, str, int, int], float]
-"""f(run, task, checkpoint, episode) -> percent of the upper bound"""
+MISSING = "rainbow_4task/defend_the_center/train8/seed_1111"
+"""the run that is not there in `report_of_all`"""
+
+
+class Played(NamedTuple):
+    """An evaluation episode."""
+
+    run: TrainingRun
+    task: str
+    updates: int
+    episode: int
+
+
+Score = Callable[[Played], float]
+"""percent of the upper bound"""
 
 
 def write_rows(file: Path, rows: list[dict[str, Any]]) -> None:
@@ -74,7 +87,7 @@ def write_evaluation(results: Path, run: TrainingRun, tasks: tuple[str, ...], ep
             f"{name}@{updates}",
             task,
             n,
-            score(run, task, updates, n),
+            score(Played(run, task, updates, n)),
             run=run.config,
             run_seed=run.seed,
             num_updates=updates,
@@ -105,3 +118,19 @@ def write_experiments(results: Path, plan: Plan, score: Score, *, without: tuple
 @pytest.fixture(scope="session")
 def experiments_writer() -> Callable[..., None]:
     return write_experiments
+
+
+@pytest.fixture(scope="session")
+def report_of_all(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of the thesis's four experiments at the smallest scale, one of their runs missing."""
+    from gvz.reports.page import make_report
+
+    results, out = tmp_path_factory.mktemp("all"), tmp_path_factory.mktemp("report")
+    names = ("training_difficulty", "training_set_size", "algorithm_comparison", "rainbow_evaluation")
+    plan = Plan(names=names, scale=0.0001)
+    write_experiments(results, plan, lambda played: 10.0 * played.episode + len(played.run.tasks), without=(MISSING,))
+    videos = results / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111" / "videos"
+    videos.mkdir()
+    (videos / "gore.mp4").touch()
+    make_report([results], out)
+    return out

@@ -1,0 +1,39 @@
+"""The command, as a person types it."""
+
+import gzip
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gvz.cli import main
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.e2e
+def test_a_run_and_chance_beside_it_damaged_and_all(tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(ROOT / "results" / "rainbow_quick", run)
+    chance = gzip.decompress((run / "evaluation_random.jsonl.gz").read_bytes())
+    (run / "evaluation_random.jsonl.gz").unlink()
+    (tmp_path / "random.jsonl").write_bytes(chance[:-40])
+    command = [sys.executable, "-m", "gvz.cli", "report", "run", "random.jsonl", "--out", "out"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["out/report.html", "out/report.md"]
+    assert done.stderr == "note: random.jsonl, line 100: not JSON (half-written?)\n"
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert "rainbow_quick beats random by" in text
+    assert "| rainbow_quick | 54.6 [51.5, 57.7] |" in text  # 601.0 [566.0, 634.9] of 1100 frames, by the README
+    assert (tmp_path / "out" / "figures" / "learning_defend_the_center_rainbow_quick.png").exists()
+
+
+def test_bad_input_is_a_line_and_exit_code_2(tmp_path, capsys):
+    assert main(["report", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out")]) == 2
+    assert "nowhere: no such file or directory" in capsys.readouterr().err
+    assert main(["report", "--out", str(tmp_path / "out")]) == 2
+    assert "report: got nothing to report on" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,55 @@
+"""Curves against hand-worked numbers."""
+
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from gvz.reports.curves import evaluation_curve, learning_curve, running_mean
+from gvz.reports.results import Run
+
+
+def run_of(seed: int, episodes: list[tuple[int, str, float]]) -> Run:
+    frame = pl.DataFrame(episodes, ["num_updates", "task", "normalized_score"], orient="row")
+    config = {"name": "r", "seed": seed, "learner": {"total_updates": 100}}
+    return Run(path=Path("r"), id="r", config=config, tasks=("a/x",), metrics=pl.DataFrame(), training_episodes=frame)
+
+
+def test_the_running_mean_by_hand():
+    assert running_mean(np.array([1.0, 2.0, 6.0, 7.0]), 2).tolist() == [1.0, 1.5, 4.0, 6.5]
+
+
+def test_a_learning_curve_is_the_mean_of_the_seeds_running_means():
+    runs = [run_of(1, [(0, "a/x", 10.0), (99, "a/x", 30.0)]), run_of(2, [(0, "a/x", 20.0), (99, "a/x", 20.0)])]
+    curve = learning_curve("x", runs, ["a/x"])
+    assert curve is not None
+    assert curve.points is None
+    assert curve.values[0] == 15.0  # of 10 and 20
+    assert curve.values[-1] == 20.0  # of (10 + 30) / 2 and 20
+    assert (curve.low[0], curve.high[0]) == (10.0, 20.0)
+
+
+def test_a_curve_of_one_seed_shows_its_episodes():
+    curve = learning_curve("x", [run_of(1, [(0, "a/x", 10.0), (99, "a/x", 30.0)])], ["a/x"])
+    assert curve is not None
+    assert curve.points is not None
+    assert curve.points[1].tolist() == [10.0, 30.0]
+
+
+def test_without_episodes_of_a_task_there_is_no_curve():
+    assert learning_curve("x", [run_of(1, [(0, "a/x", 10.0)])], ["a/x", "a/y"]) is None
+    assert learning_curve("x", [], ["a/x"]) is None
+
+
+def test_an_evaluation_curve_takes_the_nth_checkpoints_together():
+    rows = [
+        ("r1", 1, updates, task, score) for updates, score in ((100, 10.0), (200, 30.0)) for task in ("a/x", "a/y")
+    ] + [("r2", 2, updates, task, score) for updates, score in ((110, 20.0), (200, 50.0)) for task in ("a/x", "a/y")]
+    frame = pl.DataFrame(rows, ["run_dir", "run_seed", "num_updates", "task", "normalized_score"], orient="row")
+    curve = evaluation_curve("r", frame, ["a/x", "a/y"], agents_of_tasks=False)
+    assert curve is not None
+    assert curve.updates.tolist() == [105.0, 200.0]
+    assert curve.values.tolist() == [15.0, 40.0]
+    assert curve.low == pytest.approx([10.0, 30.0])
+    assert evaluation_curve("r", frame, ["a/z"], agents_of_tasks=False) is None

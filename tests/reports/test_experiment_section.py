@@ -1,0 +1,99 @@
+"""Tables of experiments: hand-worked numbers, published ones beside them and apart, missing cells missing."""
+
+import dataclasses
+
+import pytest
+
+from gvz.experiments.base import experiment_named
+from gvz.experiments.plan import Plan
+from gvz.reports.experiment_section import aggregate_table, comparison_table, result_table
+from gvz.reports.results import Asked, read_results
+from gvz.tasks import parse_task
+
+SEEDS = {1111: 0.0, 2222: 3.0, 3333: 6.0}
+
+
+def by_config(played) -> float:
+    """30 + seed for Rainbow, 20 + seed for DQN, at the last checkpoint; nothing before."""
+    if played.updates < played.run.total_updates:
+        return 0.0
+    return (30.0 if played.run.config == "rainbow_quick" else 20.0) + SEEDS[played.run.seed]
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory, experiments_writer):
+    results = tmp_path_factory.mktemp("compared")
+    missing = ("rainbow_quick/defend_the_center/train4/seed_3333",)
+    experiments_writer(results, Plan(names=("quick_comparison",), scale=0.2), by_config, without=missing)
+    return read_results([results])
+
+
+def test_the_table_is_the_mean_over_test_tasks_and_seeds_of_the_last_checkpoints(compared):
+    (asked,) = compared.asked
+    assert asked.experiment.table_checkpoints == 1
+    table = result_table(compared, asked)
+    assert table.columns == ("scenario", "numbers", "dqn_quick", "rainbow_quick")
+    ((scenario, whose, dqn, rainbow),) = table.rows
+    assert (scenario.text, whose.text) == ("Defend the Center", "ours")
+    assert (dqn.text, dqn.note) == ("23.0 [20.0, 26.0]", "")  # 20, 23, 26
+    assert rainbow.estimate is not None
+    assert (rainbow.estimate.value, rainbow.note) == (31.5, "2 of 3 seeds")  # 30, 33
+
+
+def test_the_difference_and_its_probability(compared):
+    ((_, which, gain, probability),) = comparison_table(compared, compared.asked[0]).rows
+    assert which.text == "rainbow_quick against dqn_quick"
+    assert gain.estimate is not None
+    assert gain.estimate.value == 8.5
+    assert probability.text == "1.00 [1.00, 1.00]"
+
+
+def test_aggregates_have_mean_iqm_and_median(compared):
+    dqn, _ = aggregate_table(compared, compared.asked[0]).rows
+    assert [cell.estimate.value for cell in dqn[1:] if cell.estimate] == [23.0, 23.0, 23.0]
+
+
+def test_published_numbers_stand_below_ours_and_in_no_mean_of_ours(tmp_path, experiments_writer):
+    plan = Plan(names=("training_set_size",), scale=0.01, scenarios=("health_gathering", "seek_and_kill"))
+    experiments_writer(tmp_path, plan, lambda played: float(len(played.run.tasks)))
+    results = read_results([tmp_path])
+    rows = result_table(results, results.asked[0]).rows
+    assert [(row[0].text, row[1].text) for row in rows] == [
+        ("Health Gathering", "ours"),
+        ("Health Gathering", "thesis"),
+        ("Seek and Kill", "ours"),
+        ("Seek and Kill", "thesis"),
+        ("P_norm: mean over scenarios", "ours"),
+        ("P_norm: mean over scenarios", "thesis"),
+    ]
+    assert [cell.text for cell in rows[1][2:]] == ["27.92", "35.75", "32.91"]
+    assert {cell.kind for row in rows for cell in row[2:] if row[1].text == "thesis"} == {"theirs"}
+    assert [cell.estimate.value for cell in rows[4][2:] if cell.estimate] == [1.0, 4.0, 8.0]
+    assert [cell.text for cell in rows[5][2:]] == ["27.63", "34.50", "28.41"]  # (27.92 + 27.34) / 2, ...
+
+
+def test_a_level_is_the_mean_of_its_tasks_each_trained_alone(tmp_path, experiments_writer):
+    def score(played) -> float:
+        return 80.0 - 10 * parse_task(played.task).level + (4.0 if "gore" in played.task else 0.0)
+
+    plan = Plan(names=("training_difficulty",), scale=0.01, scenarios=("defend_the_center",))
+    alone = "rainbow_4task/defend_the_center/complete/seed_1111"
+    experiments_writer(tmp_path, plan, score, without=(alone,))
+    results = read_results([tmp_path])
+    table = result_table(results, results.asked[0])
+    ours, published = table.rows
+    values = [round(cell.estimate.value, 2) for cell in ours[2:6] if cell.estimate]
+    assert values == [80.0, round(70 + 4 / 7, 2), round(60 + 8 / 6, 2), round(50 + 8 / 3, 2)]
+    assert (ours[6].kind, ours[6].text, ours[6].note) == ("missing", "-", "0 of 1 seeds")
+    assert published[2].text == "87.48"
+
+
+def test_an_experiment_without_any_results_is_a_table_of_missing_cells(tmp_path):
+    experiment = experiment_named("algorithm_comparison")
+    (tmp_path / "random.jsonl").touch()
+    results = read_results([tmp_path])
+    asked = Asked(results=tmp_path, experiment=dataclasses.replace(experiment, published={}), scale=1.0)
+    rows = result_table(results, asked).rows
+    assert len(rows) == 5
+    assert {cell.text for row in rows for cell in row[2:]} == {"-"}
+    assert {cell.note for row in rows for cell in row[2:]} == {"0 of 3 seeds"}

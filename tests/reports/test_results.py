@@ -1,0 +1,95 @@
+"""What a report reads: runs, agents and plans; what is damaged is told and the rest is there."""
+
+import gzip
+import json
+import shutil
+
+import polars as pl
+import pytest
+
+from gvz.errors import ConfigError
+from gvz.experiments.plan import Plan
+from gvz.reports.results import EACH, read_results, training_time_s
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory, experiments_writer):
+    """Runs of two experiments that share some, one seed, one scenario."""
+    results = tmp_path_factory.mktemp("small")
+    plan = Plan(names=("training_set_size", "training_difficulty"), scale=0.0001)
+    experiments_writer(results, plan, lambda _: 50.0)
+    return results
+
+
+def test_agents_are_told_apart_by_what_they_were_trained_on(small):
+    results = read_results([small])
+    assert not results.problems
+    assert set(results.agents.values()) == {
+        *(f"rainbow_4task, {n}" for n in ("1 task", "4 tasks", "8 tasks")),
+        f"rainbow_4task, {EACH}",
+    }
+    assert set(results.episodes["agent"]) == {*results.agents.values(), "random"}
+    assert [asked.experiment.name for asked in results.asked] == ["training_set_size", "training_difficulty"]
+    assert {asked.scale for asked in results.asked} == {0.0001}
+
+
+def test_an_agent_trained_in_one_way_needs_no_more_than_its_name(small, tmp_path):
+    one = small / "runs" / "rainbow_4task" / "defend_the_center" / "train4"
+    shutil.copytree(one, tmp_path / "elsewhere")
+    results = read_results([tmp_path / "elsewhere" / "seed_1111"])
+    assert list(results.agents.values()) == ["rainbow_4task"]
+    (run,) = results.runs
+    assert (run.id, run.training, run.seed) == ("seed_1111", "4 tasks", 1111)
+
+
+def test_final_are_the_last_quarter_of_a_runs_checkpoints(small):
+    episodes = read_results([small]).episodes
+    final = episodes.filter(pl.col("final") & pl.col("run").is_not_null())
+    assert set(final["num_updates"]) == {run.total_updates for run in read_results([small]).runs}  # 1 of 2
+    assert episodes.filter(player="random")["final"].all()
+
+
+def test_damaged_runs_and_plans_are_named_and_the_rest_is_read(small, tmp_path):
+    shutil.copytree(small, tmp_path / "r")
+    runs = sorted((tmp_path / "r" / "runs").rglob("config.json"))
+    runs[0].write_text("{")
+    (runs[1].parent / "evaluation.jsonl").unlink()
+    with (runs[2].parent / "episodes.jsonl").open("a") as stream:
+        stream.write('{"half')
+    (tmp_path / "r" / "plan.json").write_text('{"schema": 9}')
+    results = read_results([tmp_path / "r"])
+    assert len(results.runs) == len(runs) - 1
+    told = "\n".join(results.problems)
+    assert f"{runs[0]}: not a configuration of ours (JSONDecodeError" in told
+    assert f"{runs[1].parent}: no evaluation of this run yet; make one with `gvz evaluate {runs[1].parent}`" in told
+    assert f"{runs[2].parent / 'episodes.jsonl'}, line " in told
+    assert "plan.json: schema 9, want 1; its experiments are not in this report" in told
+
+
+def test_a_missing_path_is_an_error(tmp_path):
+    with pytest.raises(ConfigError, match="no such file or directory"):
+        read_results([tmp_path / "nowhere"])
+
+
+def test_pauses_between_processes_are_no_training_time():
+    metrics = pl.DataFrame(
+        {
+            "num_updates": [100, 200, 300],
+            "time_s": [0.0, 10.0, 5000.0],  # stopped for more than an hour
+            "learner/updates_per_s": [10.0, 10.0, 20.0],
+        }
+    )
+    assert training_time_s(metrics) == 10 + 10 + 5
+
+
+def test_records_may_be_compressed(small, tmp_path):
+    source = small / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111"
+    shutil.copy(source / "config.json", tmp_path)
+    for name in ("metrics", "episodes", "evaluation"):
+        (tmp_path / f"{name}.jsonl.gz").write_bytes(gzip.compress((source / f"{name}.jsonl").read_bytes()))
+    results = read_results([tmp_path])
+    (run,) = results.runs
+    assert len(run.metrics) == 20
+    assert run.training_episodes["normalized_score"].max() == 100.0
+    assert json.loads((tmp_path / "config.json").read_text())["resolved"]["tasks"] == list(run.tasks)
+    assert len(results.episodes) > 0
