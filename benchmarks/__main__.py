@@ -1,6 +1,7 @@
 """The command: `python -m benchmarks NAME... [--quick] [--out DIR] [--peers PYTHON]`, or `--list`."""
 
 import shlex
+import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -39,6 +40,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name, module in runner.benchmarks().items():
             print(f"{name:16} {(module.__doc__ or '').splitlines()[0]}")
         return 0
+    for number in (signal.SIGINT, signal.SIGTERM):  # also where a shell has started us with Ctrl-C ignored
+        signal.signal(number, signal.default_int_handler)
     budget = replace(rounds.QUICK if options.quick else rounds.FULL, peers=options.peers.absolute())
     failures = []
     try:

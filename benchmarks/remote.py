@@ -18,9 +18,9 @@ from types import TracebackType
 from typing import Any
 
 PEERS = Path(__file__).parent / "peers"
-START_TIMEOUT_S = 240.0
+START_TIMEOUT_S = 600.0
 """a process that has not said who it is by then is given up: imports of torch and TensorFlow take a minute when cold"""
-ANSWER_TIMEOUT_S = 120.0
+ANSWER_TIMEOUT_S = 300.0
 _END_TIMEOUT_S = 10.0
 
 

@@ -14,7 +14,7 @@ import time
 import traceback
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType, ModuleType
+from types import ModuleType
 
 from benchmarks import record, rounds
 from benchmarks.rounds import Budget
@@ -106,13 +106,9 @@ def _plain(budget: Budget) -> dict[str, object]:
     return {"rounds": budget.rounds, "body_s": budget.body_s, "quick": budget.quick, "peers": str(budget.peers)}
 
 
-def _terminated(_number: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt  # so that every context manager closes what it opened
-
-
 def main() -> int:
     """The process of one benchmark: `python -m benchmarks.runner NAME ARGUMENTS`."""
-    signal.signal(signal.SIGTERM, _terminated)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that every context manager closes what it opened
     name, arguments = sys.argv[1], json.loads(sys.argv[2])
     budget = replace(Budget(**arguments["budget"]), peers=Path(arguments["budget"]["peers"]))
     try:

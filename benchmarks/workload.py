@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from learner.replay import ReplaySpec, ReplayState
 
 TASK = "defend_the_center/default"
-_START_TIMEOUT_S = 300.0
+_START_TIMEOUT_S = 600.0
 _DRAIN_RECORDS, _DRAIN_WAIT_S = 256, 0.02
 """as in gvz/train.py"""
 _UPDATES_IN_FLIGHT = 16
@@ -33,20 +33,38 @@ _SETTLE_S = 0.3
 """seconds played before the clock starts: what waited in full rings is not counted"""
 
 
-def run_config(budget: Budget) -> "RunConfig":
-    """`rainbow_4task` on its default task; in a quick run with the smallest network and replay."""
+QUICK: dict[str, dict[str, Any]] = {
+    "agent": {"conv_channels": (4, 4, 4), "hidden_units": 8},
+    "replay": {"capacity": 2_000},
+    "learner": {"warmup_steps": 100, "batch_size": 8},
+    "actors": {"num_actors": 1, "games_per_actor": 4},
+}
+"""what a quick run changes of `rainbow_4task`"""
+
+
+def four_task_config(budget: Budget) -> "RunConfig":
+    """`rainbow_4task`; in a quick run with the smallest network and replay."""
     from gvz.config import load_config
 
-    config = dataclasses.replace(load_config("rainbow_4task.py"), training_set=1)
-    if not budget.quick:
-        return config
-    return dataclasses.replace(
-        config,
-        agent=dataclasses.replace(config.agent, conv_channels=(4, 4, 4), hidden_units=8),
-        replay=dataclasses.replace(config.replay, capacity=2_000),
-        learner=dataclasses.replace(config.learner, warmup_steps=100, batch_size=8),
-        actors=dataclasses.replace(config.actors, num_actors=1, games_per_actor=2),
-    )
+    config = load_config("rainbow_4task.py")
+    changes = QUICK if budget.quick else {}
+    groups = {group: dataclasses.replace(getattr(config, group), **fields) for group, fields in changes.items()}
+    return dataclasses.replace(config, **groups)
+
+
+def quick_flags(budget: Budget) -> list[str]:
+    """QUICK as words of the command line; none if the budget is full."""
+    words = []
+    for group, fields in QUICK.items() if budget.quick else ():
+        for name, value in fields.items():
+            words.append(f"--{group}.{name.replace('_', '-')}")
+            words += map(str, value if isinstance(value, tuple) else (value,))
+    return words
+
+
+def run_config(budget: Budget) -> "RunConfig":
+    """`four_task_config` on its default task alone."""
+    return dataclasses.replace(four_task_config(budget), training_set=1)
 
 
 def random_players(config: "PoolConfig", **changes: Any) -> "PoolConfig":

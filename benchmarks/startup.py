@@ -1,0 +1,68 @@
+"""Seconds to the help page, and from the command to the first episode's row of `rainbow_4task` on a warm cache.
+
+The first run fills the caches (compiled maps, compiled programs) and is thrown away. Goals: `--help` under 0.5 s
+without importing jax, the first row within 15 s.
+"""
+
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks import workload
+from benchmarks.rounds import Budget, Row, alternate, goal, measured
+from benchmarks.whole import end_run
+
+_LAUNCH = [sys.executable, "-m", "gvz.launch"]
+_TIMEOUT_S = 600.0
+_POLL_S = 0.05
+
+
+def measure(budget: Budget) -> list[Row]:
+    """Alternates both."""
+    with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
+        counter = iter(range(1000))
+        values = alternate(
+            min(budget.rounds, 3),
+            {"help": _help_s, "episode": lambda: _first_episode_s(Path(directory) / f"run_{next(counter)}", budget)},
+            warm_up=not budget.quick,
+        )
+    return [
+        goal(8, "`--help`", values["help"], at_most=0.5, unit="s"),
+        measured("modules of jax that `--help` imports", "modules", [_jax_modules_of_help()]),
+        goal(8, "from the command to the first episode's row", values["episode"], at_most=15.0, unit="s"),
+    ]
+
+
+def _help_s() -> float:
+    start = time.perf_counter()
+    subprocess.run([*_LAUNCH, "--help"], stdout=subprocess.DEVNULL, check=True)
+    return time.perf_counter() - start
+
+
+def _jax_modules_of_help() -> int:
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "gvz.launch", "--help"], capture_output=True, text=True, check=True
+    )
+    names = [line.rpartition("|")[2].strip() for line in done.stderr.splitlines()]
+    return sum(name == "jax" or name.startswith("jax.") for name in names)
+
+
+def _first_episode_s(directory: Path, budget: Budget) -> float:
+    """Runs the real command until episodes.jsonl holds a line, then ends it."""
+    records = directory / "episodes.jsonl"
+    start = time.perf_counter()
+    process = subprocess.Popen(
+        [*_LAUNCH, "--config", "rainbow_4task.py", "--run-dir", str(directory), *workload.quick_flags(budget)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        while not (records.exists() and b"\n" in records.read_bytes()):
+            if process.poll() is not None or time.perf_counter() - start > _TIMEOUT_S:
+                raise RuntimeError(f"{directory}: no episode within {_TIMEOUT_S:.0f} s, exit code {process.returncode}")
+            time.sleep(_POLL_S)
+        return time.perf_counter() - start
+    finally:
+        end_run(process)

@@ -1,0 +1,152 @@
+"""`rainbow_4task` as a whole: learner and actors together against each alone, first gradient step, memory, staleness.
+
+The run is the real command with a shorter end. Beside it, in turns, the learner alone (full replay, no actors) and the
+actors alone (full network acting, drained, no learner). Work is a share of what the machine does of it alone: goal is
+that gradient steps and decisions of the run add up to 0.9 or more. The memory of all its processes, whose peak is its
+last checkpoint, is to be within 10% of the bill it prints.
+"""
+
+import contextlib
+import json
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from benchmarks import workload
+from benchmarks.rounds import Budget, Row, goal, measured, rates
+
+_RUN_TIMEOUT_S = 800.0
+_MEASURED_UPDATES, _SETTLED_UPDATES = 300, 20
+"""gradient steps of a run, and how many of them pass before its rates count"""
+_MEMORY_PERIOD_S = 0.25
+
+
+def measure(budget: Budget) -> list[Row]:
+    """Alternates the run, the learner alone and the actors alone."""
+    import jax
+
+    from gvz.assemble import assemble
+
+    config = workload.four_task_config(budget)
+    num_runs, updates = (1, 4) if budget.quick else (2, _MEASURED_UPDATES)
+    settled = 1 if budget.quick else _SETTLED_UPDATES
+    with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
+        parts = assemble(config, workload.work_directory(directory))
+        runs, learner_alone, actors_alone = [], [], []
+        for number in range(num_runs):
+            runs.append(_run(Path(directory) / f"run_{number}", budget, updates))
+            learner = workload.Learner(config, parts)
+            per_call = parts.num_updates_per_call
+            learner_alone.append(learner.updates_per_s(per_call, 3 * budget.body_s))
+            params = learner.acting_params()
+            del learner  # its replay: the next run is to have the machine to itself
+            with workload.playing(parts.pool_config, params) as pool:
+                actors_alone.append(workload.decisions_per_s(pool, 3 * budget.body_s))
+    together = [_rates(run["rows"], settled) for run in runs]
+    updates_per_s, decisions_per_s = [u for u, _ in together], [d for _, d in together]
+    shares = [
+        u / alone_u + d / alone_d
+        for (u, d), alone_u, alone_d in zip(together, learner_alone, actors_alone, strict=True)
+    ]
+    last_rows = [run["rows"][-1] for run in runs]
+    bill, batch_size = parts.bill.memory_bytes, config.learner.batch_size
+    peaks = [run["peak_bytes"] for run in runs]
+    on = "" if jax.default_backend() == "cpu" else f" on a {jax.default_backend()}"
+    return [
+        rates(
+            f"the run, both together{on}",
+            decisions_per_s=decisions_per_s,
+            updates_per_s=updates_per_s,
+            batch_size=batch_size,
+        ),
+        rates(f"learner alone{on}", updates_per_s=learner_alone, batch_size=batch_size),
+        rates("actors alone, full network", decisions_per_s=actors_alone),
+        goal(6, "useful work of both together, against each alone", shares, at_least=0.9, unit="x"),
+        measured("from the command to the first gradient step", "s", [run["first_update_s"] for run in runs]),
+        measured("peak of the memory of all processes", "GB", [peak / 1e9 for peak in peaks]),
+        measured("memory on the bill", "GB", [bill / 1e9]),
+        goal(6, "peak memory off the bill", [abs(p / bill - 1) for p in peaks], at_most=0.1, unit="x"),
+        *(
+            measured(
+                f"age of the acting parameters, {name}",
+                "gradient steps",
+                [row[f"actors/staleness_{name}_versions"] * config.learner.publish_period_updates for row in last_rows],
+            )
+            for name in ("mean", "p95", "max")
+        ),
+    ]
+
+
+def _run(directory: Path, budget: Budget, updates: int) -> dict[str, Any]:
+    """One run of the real command: its rows of metrics, its peak of memory, when its first gradient step was done."""
+    flags = ["--learner.total-updates", str(updates), "--log.period-updates", "1", *workload.quick_flags(budget)]
+    command = [sys.executable, "-m", "gvz.launch", "--config", "rainbow_4task.py", "--run-dir", str(directory), *flags]
+    start = time.time()
+    with tempfile.TemporaryFile() as output:
+        process = subprocess.Popen(command, stdout=output, stderr=output)
+        try:
+            with _peak_memory(process.pid) as peak:
+                code = process.wait(_RUN_TIMEOUT_S)
+        finally:
+            end_run(process)
+        output.seek(0)
+        if code != 0:
+            raise RuntimeError(f"{' '.join(command)}: exit code {code}: {output.read().decode()[-2000:]}")
+    rows = [json.loads(line) for line in (directory / "metrics.jsonl").read_text().splitlines()]
+    return {"rows": rows, "peak_bytes": peak[0], "first_update_s": rows[0]["time_s"] - start}
+
+
+def end_run(process: "subprocess.Popen[bytes]") -> None:
+    """Ends a run that is not done: twice Ctrl-C stops it at once, and its actors and engines with it."""
+    for _ in range(2):
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(5.0)
+    if process.poll() is None:
+        process.kill()
+        process.wait()
+
+
+def _rates(rows: list[dict[str, Any]], settled: int) -> tuple[float, float]:
+    """Gradient steps and decisions a second, from the row after `settled` rows to the last."""
+    first, last = rows[settled], rows[-1]
+    seconds = last["time_s"] - first["time_s"]
+    updates, decisions = (last[name] - first[name] for name in ("num_updates", "actors/env_steps"))
+    return updates / seconds, decisions / seconds
+
+
+@contextlib.contextmanager
+def _peak_memory(pid: int) -> Any:
+    """Yields a list of one number: the largest sum of proportional set sizes of a process and all below it, bytes."""
+    peak, done = [0], threading.Event()
+
+    def watch() -> None:
+        while not done.wait(_MEMORY_PERIOD_S):
+            peak[0] = max(peak[0], _tree_bytes(pid))
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    try:
+        yield peak
+    finally:
+        done.set()
+        thread.join()
+
+
+def _tree_bytes(pid: int) -> int:
+    total = 0
+    with contextlib.suppress(psutil.NoSuchProcess):
+        process = psutil.Process(pid)
+        for each in (process, *process.children(recursive=True)):
+            with contextlib.suppress(psutil.NoSuchProcess, psutil.AccessDenied, OSError):
+                smaps = Path(f"/proc/{each.pid}/smaps_rollup").read_text()
+                total += sum(int(line.split()[1]) for line in smaps.splitlines() if line.startswith("Pss:")) * 1024
+    return total
