@@ -4,6 +4,7 @@ pip install -r examples/requirements.txt; python examples/stable_baselines3_ppo.
 """
 
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import tyro
@@ -12,8 +13,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack
 
 import gvz
-from gvz.evaluation.play import play_episode
 from gvz.evaluation.players import FramePlayer
+from gvz.evaluation.record import evaluate_player
 from gvz.tasks import named_tasks
 
 
@@ -23,9 +24,10 @@ def main(
     n_steps: int = 128,
     episodes: int = 5,
     processes: bool = True,
-    max_tasks: int = 4,
+    max_tasks: int = 7,
+    out: Path = Path("sb3_ppo.jsonl"),
 ):
-    """Trains on the training set of 4 tasks, then plays `episodes` of the first `max_tasks` test tasks."""
+    """Trains on the training set of 4 tasks, then plays `episodes` of the first `max_tasks` test tasks into `out`."""
     games = [lambda task=task: Monitor(gvz.make(task)) for task in named_tasks(scenario, split="train4")]
     vector = partial(SubprocVecEnv, start_method="spawn") if processes else DummyVecEnv
     envs = VecFrameStack(vector(games), n_stack=4)  # u8[4, 84, 84, 12], newest frame last
@@ -36,11 +38,11 @@ def main(
     def choose(stack: np.ndarray) -> int:
         return int(model.predict(stack, deterministic=True)[0])
 
-    for task in named_tasks(scenario, split="test")[:max_tasks]:
-        env = gvz.make(task)
-        scores = [play_episode(env, FramePlayer(choose), episode)["score"] for episode in range(episodes)]
-        env.close()
-        print(f"{task.id}: mean score {np.mean(scores):.1f} of {episodes} episodes")
+    tasks = named_tasks(scenario, split="test")[:max_tasks]
+    rows = evaluate_player(partial(FramePlayer, choose), tasks, out, name=f"sb3_ppo@{steps}", episodes=episodes)
+    for task in tasks:
+        score = np.mean([row["score"] for row in rows if row["task"] == task.id])
+        print(f"{task.id}: mean score {score:.1f} of {episodes} episodes")
 
 
 if __name__ == "__main__":

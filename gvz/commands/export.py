@@ -1,0 +1,110 @@
+"""`gvz export`: the records of runs as tables. Imports gvz.{errors,rundir}; polars, gvz.evaluation.frame once it runs."""
+
+import json
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+
+from gvz.errors import ConfigError
+from gvz.rundir import RECORD_FILES, read_records
+
+if TYPE_CHECKING:
+    import polars as pl
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write the records of runs as CSV or Parquet: a table of metrics, episodes, faults and evaluations each.
+
+    The rows of all runs go into one table; `run_dir`, `run` and `run_seed` say whose they are.
+
+    Example: gvz export runs/rainbow_4task/seed_* --format parquet --out tables
+    """
+
+    run_dirs: tyro.conf.Positional[tuple[Path, ...]]
+    """run directories of the trainer"""
+    format: Literal["csv", "parquet"] = "csv"
+    """csv, or parquet, which keeps the types"""
+    out: Path = Path("tables")
+    """directory to write to"""
+
+    def run(self) -> int:
+        """Writes the tables that have rows; says where they are, and what could not be read."""
+        if not self.run_dirs:
+            raise ConfigError("export: got no run directory, want at least one")
+        from gvz.evaluation.frame import collect_evaluations
+
+        problems: list[str] = []
+        tables = {Path(name).stem: run_table(self.run_dirs, name, problems) for name in RECORD_FILES}
+        tables["evaluation"], damaged = collect_evaluations(self.run_dirs)
+        try:
+            self.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"--out: {self.out} cannot be made: {error.strerror}") from error
+        for name, table in tables.items():
+            if not table.is_empty():
+                print(write_table(table, self.out / f"{name}.{self.format}"))
+        for problem in problems + damaged:
+            print(f"note: {problem}", file=sys.stderr)
+        return 0
+
+
+COMMAND = Export
+
+
+def run_table(run_dirs: Sequence[Path], name: str, problems: list[str]) -> "pl.DataFrame":
+    """The rows of one record file of each run, one after the other.
+
+    Args:
+        run_dirs: run directories; one without such a file has no rows.
+        name: one of RECORD_FILES.
+        problems: is added a message for every line that cannot be read.
+
+    Returns:
+        A column for each field of any row; `reward_components` become columns `reward/<name>`.
+
+    Raises:
+        ConfigError: not a run directory.
+    """
+    rows: list[dict[str, Any]] = []
+    for run_dir in run_dirs:
+        try:
+            config = json.loads((run_dir / "config.json").read_text())["config"]
+            whose = {"run_dir": str(run_dir), "run": config["name"], "run_seed": config["seed"]}
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ConfigError(f"{run_dir} is not a run directory: its config.json cannot be read: {error}") from error
+        if (run_dir / name).exists():
+            found, damaged = read_records(run_dir / name)
+            rows += ({**whose, **_flat(row)} for row in found)
+            problems += damaged
+    return _frame(rows)
+
+
+def write_table(table: "pl.DataFrame", file: Path) -> Path:
+    """Writes .csv (lists as their elements with a +) or .parquet; the file appears once it is whole."""
+    import polars as pl
+
+    temporary = file.with_name(file.name + ".tmp")
+    if file.suffix == ".csv":
+        lists = [name for name, kind in table.schema.items() if isinstance(kind, pl.List)]
+        table.with_columns(pl.col(lists).list.join("+")).write_csv(temporary)
+    else:
+        table.write_parquet(temporary)
+    return temporary.replace(file)
+
+
+def _flat(row: dict[str, Any]) -> dict[str, Any]:
+    components = {f"reward/{name}": value for name, value in row.get("reward_components", {}).items()}
+    return {name: value for name, value in row.items() if name != "reward_components"} | components
+
+
+def _frame(rows: Iterable[dict[str, Any]]) -> "pl.DataFrame":
+    import polars as pl
+
+    rows = list(rows)
+    names = dict.fromkeys(name for row in rows for name in row)
+    return pl.DataFrame([pl.Series(name, [row.get(name) for row in rows], strict=False) for name in names])

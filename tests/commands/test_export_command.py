@@ -1,0 +1,62 @@
+"""gvz export, as it is called."""
+
+import json
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from gvz import cli
+
+
+@pytest.fixture
+def run_dirs(tmp_path: Path) -> list[Path]:
+    """Two runs: both with metrics, the second with an episode, an evaluation and a damaged line."""
+    runs = []
+    for seed in (1, 2):
+        run = tmp_path / f"seed_{seed}"
+        run.mkdir()
+        config = {"config": {"name": "tiny", "seed": seed}, "resolved": {"tasks": ["health_gathering/lava"]}}
+        (run / "config.json").write_text(json.dumps(config))
+        rows = [{"schema": 1, "num_updates": n, "learner/loss": 0.5 * n} for n in (0, 1)]
+        (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+        runs.append(run)
+    episode = {"schema": 1, "task": "health_gathering/lava", "score": 4, "reward_components": {"health": 0.25}}
+    (runs[1] / "episodes.jsonl").write_text(json.dumps(episode) + "\nhalf")
+    evaluation = {"schema": 1, "player": "p", "task": "health_gathering/obstacles+slime", "episode": 0, "seed": 3}
+    (runs[1] / "evaluation.jsonl").write_text(json.dumps({**evaluation, "score": 210.0, "terminated": True}) + "\n")
+    return runs
+
+
+def test_csv_has_a_table_of_each_kind_of_record_and_names_damage(run_dirs, tmp_path, capsys):
+    out = tmp_path / "tables"
+    assert cli.main(["export", *map(str, run_dirs), "--out", str(out)]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.splitlines() == [str(out / f"{n}.csv") for n in ("metrics", "episodes", "evaluation")]
+    assert "episodes.jsonl, line 2: not JSON" in printed.err
+    metrics = pl.read_csv(out / "metrics.csv")
+    assert metrics["run_seed"].to_list() == [1, 1, 2, 2]
+    assert metrics["learner/loss"].to_list() == [0.0, 0.5, 0.0, 0.5]
+    assert pl.read_csv(out / "episodes.csv")["reward/health"].to_list() == [0.25]
+    evaluation = pl.read_csv(out / "evaluation.csv")
+    assert evaluation["attributes"].to_list() == ["obstacles+slime"]
+    assert evaluation["normalized_score"].to_list() == [10.0]
+
+
+def test_parquet_keeps_types(run_dirs, tmp_path, capsys):
+    assert cli.main(["export", str(run_dirs[1]), "--format", "parquet", "--out", str(tmp_path / "t")]) == 0
+    capsys.readouterr()
+    evaluation = pl.read_parquet(tmp_path / "t" / "evaluation.parquet")
+    assert evaluation["attributes"].to_list() == [["obstacles", "slime"]]
+    assert evaluation["terminated"].to_list() == [True]
+    assert not list((tmp_path / "t").glob("*.tmp"))
+
+
+def test_bad_input_is_named(run_dirs, tmp_path, capsys):
+    assert cli.main(["export"]) == 2
+    assert "got no run directory, want at least one" in capsys.readouterr().err
+    assert cli.main(["export", str(tmp_path)]) == 2
+    assert f"{tmp_path} is not a run directory: its config.json cannot be read" in capsys.readouterr().err
+    (tmp_path / "file").touch()
+    assert cli.main(["export", str(run_dirs[0]), "--out", str(tmp_path / "file")]) == 2
+    assert "--out: " in capsys.readouterr().err
