@@ -50,6 +50,8 @@ class LogConfig:
     """gradient steps between rows of metrics.jsonl and TensorBoard"""
     tensorboard: bool = True
     """write TensorBoard events too"""
+    wandb: bool = False
+    """send the scalars to Weights & Biases too (extra `wandb`); WANDB_MODE=offline keeps them in the run directory"""
 
     def __post_init__(self) -> None:
         if self.period_updates < 1:

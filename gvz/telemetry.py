@@ -1,19 +1,27 @@
-"""What a run records about itself: rows of metrics, episodes and faults, TensorBoard events, the status panel.
+"""What a run records about itself: rows of metrics, episodes and faults, TensorBoard events, Weights & Biases.
 
-Scalars are named `group/name_unit` and are the same in metrics.jsonl and in TensorBoard. Episode rows carry no
-wall-clock time, so that two synchronous runs with one seed write the same bytes.
+Scalars are named `group/name_unit` and are the same in metrics.jsonl and wherever else they go; each is explained in
+docs/reference/metrics.md. Episode rows carry no wall-clock time, so that two synchronous runs with one seed write the
+same bytes. Imports gvz.{errors,progress,rundir}, gvz.transport, tensorboardX; wandb where it is asked for.
 """
 
+import json
+import os
 import time
+import uuid
 from collections import deque
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tensorboardX import SummaryWriter
 
+from gvz.errors import ConfigError
 from gvz.progress import TaskStatus
 from gvz.rundir import RunDir
 from gvz.transport.messages import EpisodeStats, Fault
+
+if TYPE_CHECKING:
+    import wandb
 
 RECENT_EPISODES = 30
 """episodes in a task's recent score (thesis 4.3.2 uses 30 for its KPI)"""
@@ -38,7 +46,16 @@ class Rates:
 class Telemetry:
     """Writes the records of one run and remembers the recent score of each task."""
 
-    def __init__(self, run: RunDir, *, tasks: tuple[str, ...], upper_bound: float, tensorboard: bool, num_updates: int):
+    def __init__(
+        self,
+        run: RunDir,
+        *,
+        tasks: tuple[str, ...],
+        upper_bound: float,
+        tensorboard: bool,
+        num_updates: int,
+        wandb: bool = False,
+    ):
         """Opens the records.
 
         Args:
@@ -47,11 +64,16 @@ class Telemetry:
             upper_bound: of the scenario's score.
             tensorboard: write events too.
             num_updates: gradient steps done; later events of a killed run are hidden.
+            wandb: send the scalars to Weights & Biases, too.
+
+        Raises:
+            ConfigError: wandb is wanted, and not installed or not logged in.
         """
         self._run, self._tasks, self._upper_bound = run, tasks, upper_bound
         self._recent: list[deque[float]] = [deque(maxlen=RECENT_EPISODES) for _ in tasks]
         self._episodes = [0] * len(tasks)
         self._events = SummaryWriter(str(run.tensorboard), purge_step=num_updates) if tensorboard else None
+        self._wandb = start_wandb(run) if wandb else None
 
     def episode(self, stats: EpisodeStats, *, num_updates: int, env_steps: int) -> None:
         """Records a finished episode."""
@@ -102,6 +124,8 @@ class Telemetry:
         if self._events is not None:
             for name, value in row.items():
                 self._events.add_scalar(name, value, num_updates)
+        if self._wandb is not None:
+            self._wandb.log({"num_updates": num_updates, **row})
 
     def task_statuses(self) -> tuple[TaskStatus, ...]:
         """Recent play of each task."""
@@ -125,6 +149,51 @@ class Telemetry:
         self._recent = [deque(r, maxlen=RECENT_EPISODES) for r in state["recent"]]
 
     def close(self) -> None:
-        """Flushes the events."""
+        """Flushes the events. Can be repeated."""
         if self._events is not None:
             self._events.close()
+        if self._wandb is not None:
+            self._wandb.finish()
+            self._wandb = None
+
+
+def start_wandb(run: RunDir) -> "wandb.Run":
+    """The Weights & Biases run of a run directory, begun or, where one began before, gone on with.
+
+    WANDB_MODE, WANDB_PROJECT, WANDB_ENTITY and the others of its environment variables hold; with WANDB_MODE=offline
+    all stays in `wandb/` of the run directory, for `wandb sync`.
+
+    Args:
+        run: a run directory with its config.json.
+
+    Raises:
+        ConfigError: wandb is not installed, or does not know who logs.
+    """
+    try:
+        import wandb
+    except ImportError as error:
+        raise ConfigError(
+            f"log.wandb: {error}; install it (pip install 'gvizdoom[wandb]') or leave --log.wandb out"
+        ) from error
+    saved = json.loads((run.path / "config.json").read_text())
+    id_file = run.path / "wandb_id"  # a resumed run is the same run there, one begun with --fresh another
+    if not id_file.exists():
+        id_file.write_text(uuid.uuid4().hex[:12])
+    try:
+        started = wandb.init(
+            dir=str(run.path),
+            project=None if "WANDB_PROJECT" in os.environ else "gvizdoom",
+            id=id_file.read_text(),
+            resume="allow",
+            name=f"{saved['config']['name']}/seed_{saved['config']['seed']}",
+            config=saved,
+            settings=wandb.Settings(console="off", silent=True),
+        )
+    except wandb.Error as error:
+        raise ConfigError(
+            f"log.wandb: {error}; log in (wandb login), set WANDB_MODE=offline, or leave --log.wandb out"
+        ) from error
+    # a resumed run may repeat the rows after its checkpoint: their place is their gradient step, not their number
+    started.define_metric("num_updates")
+    started.define_metric("*", step_metric="num_updates")
+    return started

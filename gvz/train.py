@@ -95,6 +95,7 @@ class Trainer:
             upper_bound=config.resolved_scenario().upper_bound(config.env.profile),
             tensorboard=config.log.tensorboard,
             num_updates=self._counts.updates,
+            wandb=config.log.wandb,
         )
         if host is not None:
             self._ingest.restore(host["ingest"])
