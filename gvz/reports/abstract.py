@@ -45,7 +45,9 @@ def what_was_run(results: Results) -> list[str]:
 
 
 def what_beats_what(results: Results) -> list[str]:
-    """For each scenario the agents in order, each compared with the next on the tasks that all have."""
+    """For each scenario the trained agents in order, each compared with the next on the tasks that all have; then the
+    best of them with the players that do not learn.
+    """
     sentences = []
     for name in scenarios():
         episodes = results.episodes.filter(scenario=name).drop_nulls("normalized_score")
@@ -56,8 +58,12 @@ def what_beats_what(results: Results) -> list[str]:
         means = {
             agent: np.mean([[np.mean(c) for c in run] for run in one.cells(tasks)]) for agent, one in scores.items()
         }
-        order = sorted(means, key=lambda agent: -means[agent])
-        compared = [_comparison(scores, better, worse, tasks) for better, worse in itertools.pairwise(order)]
+        trained = set(episodes.drop_nulls("run")["agent"])
+        order = sorted(means, key=lambda agent: (agent not in trained, -means[agent]))
+        learners, players = order[: len(trained)], order[len(trained) :]
+        pairs = list(itertools.pairwise(learners or players))
+        pairs += [(learners[0], player) for player in players] if learners else []
+        compared = [_comparison(scores, one, other, tasks) for one, other in pairs]
         over = f"{scenario_named(name).title}, {_described(name, tasks)}"
         sentences.append(f"{over}: {'; '.join(compared)}.")
     return sentences
@@ -79,13 +85,12 @@ def _described(scenario: str, tasks: Sequence[str]) -> str:
     return f"mean of the {len(tasks)} tasks that all played"
 
 
-def _comparison(scores: dict[str, Scores], better: str, worse: str, tasks: Sequence[str]) -> str:
-    groups = [(scores[better], tasks), (scores[worse], tasks)]
-    gain = estimate_groups(groups, difference).estimate
+def _comparison(scores: dict[str, Scores], one: str, other: str, tasks: Sequence[str]) -> str:
+    gain = estimate_groups([(scores[one], tasks), (scores[other], tasks)], difference).estimate
     assert gain is not None, "all have these tasks"
-    if gain.low <= 0:
-        return f"{better} and {worse} are not told apart ({gain} points)"
-    return f"{better} beats {worse} by {gain} points"
+    if gain.low <= 0 <= gain.high:
+        return f"{one} and {other} are not told apart (difference {gain} points)"
+    return f"{one} {'beats' if gain.value > 0 else 'is behind'} {other} by {gain} points"
 
 
 def caveats(results: Results) -> list[str]:

@@ -119,7 +119,8 @@ def draw_heat_map(
         scores: agent -> mean score in percent of the bound by task, None where there is none.
     """
     num_marks, num_agents = len(attributes), len(scores)
-    width = 1.9 + 0.22 * num_marks + 0.62 * num_agents
+    mark_inches, agent_inches = 0.25, 0.55
+    width = 2.4 + mark_inches * num_marks + agent_inches * num_agents
     with mpl.rc_context({**STYLE, "axes.grid": False}):
         picture = Picture(figsize=(max(PANEL_INCHES[0], width), 1.7 + 0.24 * len(tasks)))
         marks, heat = picture.subplots(1, 2, sharey=True, width_ratios=(0.22 * max(1, num_marks), 0.62 * num_agents))
@@ -130,13 +131,13 @@ def draw_heat_map(
             text = "-" if np.isnan(value) else f"{value:.0f}"
             shade = "white" if value < 60 else "black"
             heat.text(column, row, text, ha="center", va="center", fontsize=8, color=GREY if np.isnan(value) else shade)
-        heat.set_xticks(range(num_agents), list(scores), rotation=60, ha="left", rotation_mode="anchor")
+        heat.set_xticks(range(num_agents), list(scores), rotation=90)
         for row, (_, _, having) in enumerate(tasks):
             marks.plot(range(num_marks), [row] * num_marks, ".", color="#dddddd", markersize=5)
             columns = [attributes.index(name) for name in having]
             marks.plot(columns, [row] * len(columns), "-", color="black", linewidth=1)
             marks.plot(columns, [row] * len(columns), "o", color="black", markersize=4.5)
-        marks.set_xticks(range(num_marks), list(attributes), rotation=60, ha="left", rotation_mode="anchor")
+        marks.set_xticks(range(num_marks), list(attributes), rotation=90)
         marks.set_xlim(-0.7, num_marks - 0.3)
         marks.set_yticks(range(len(tasks)), [f"{level}  {name}" for name, level, _ in tasks])
         for axes in (marks, heat):

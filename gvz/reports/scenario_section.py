@@ -92,7 +92,7 @@ def level_table(scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequenc
             statistics = (mean, interquartile_mean, median)
             cells += [estimate(one, test, s) if one.played(test) else missing() for s in statistics]
         rows.append((words(agent), *cells))
-    columns = ["agent", *(f"{title} ({len(ids)} tasks)" for title, ids in levels)]
+    columns = ["agent", *(f"{title} ({len(ids)} task{'s' * (len(ids) > 1)})" for title, ids in levels)]
     columns += ["P: mean of the 7 test tasks", "their IQM", "their median"] if set(test) <= played else []
     return Table(
         id=f"{scenario.id}_levels",

@@ -89,4 +89,4 @@ def estimate_groups(groups: Sequence[tuple[Scores, Sequence[str]]], statistic: S
     if not groups or not all(tasks and runs for (_, tasks), runs in zip(groups, cells, strict=True)):
         return missing(note)
     how: list[Redraw] = [redraw(scores, tasks) for scores, tasks in groups]
-    return ours(bootstrap_runs(cells, statistic, redraw=how, num_resamples=1000), note, digits)
+    return ours(bootstrap_runs(cells, statistic, redraw=how), note, digits)
