@@ -2,9 +2,9 @@
 seed alone, so that every player meets the same episodes. Imports gvz.evaluation.players, gvz.specs; gvz.env to play.
 
 One game a process. A policy that decides for 4 or 8 games at once would save CPU time: with the network of
-`rainbow_4task` 3.37 -> 2.93 and 2.89 ms a decision, engine included, with that of `rainbow_quick` 2.00 -> 1.38 and 1.34 ms
-(medians of 1 and 3 runs of 1200 decisions, 2 cores of an EPYC 7003 under a load of 8 and 17, 2026-11). It is not done:
-the rows of an episode would depend on the size of the batch, and some of the gain goes where games end at different times.
+`rainbow_4task` 3.37 -> 2.93 and 2.89 ms a decision, engine included, with that of `rainbow_quick` 2.00 -> 1.38 and
+1.34 ms (medians of 1 and 3 runs of 1200 decisions, 2 cores of an EPYC 7003 under a load of 8 and 17, 2026-11). It is
+not done: rows would depend on the size of the batch, and games that end at different times take some of it back.
 """
 
 import ctypes
