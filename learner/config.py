@@ -25,7 +25,7 @@ class AgentConfig:
     """
 
     name: str = "rainbow"
-    """module in learner/agents"""
+    """module in learner/agents, or the path of a Python file (docs/AGENTS.md)"""
     double: bool = True
     """double Q-learning (thesis eq. 4.9)"""
     dueling: bool = True

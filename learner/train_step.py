@@ -30,6 +30,8 @@ class MetricSums:
     num_updates: Int[Array, ""]
     loss: Float[Array, ""]
     priority: Float[Array, ""]
+    td_error: Float[Array, ""]
+    """of magnitudes, as `task_td_error`"""
     q_mean: Float[Array, ""]
     q_max: Float[Array, ""]
     """the largest seen, not a sum"""
@@ -40,6 +42,7 @@ class MetricSums:
     task_samples: Float[Array, "Z"]
     task_loss: Float[Array, "Z"]
     task_priority: Float[Array, "Z"]
+    task_td_error: Float[Array, "Z"]
 
 
 @jax.tree_util.register_dataclass
@@ -152,7 +155,7 @@ def read_metrics(
         diagnostics_dir: existing directory where the batch of a non-finite update is saved.
 
     Returns:
-        (metrics, the state with empty sums). A task without samples has no loss and priority entries.
+        (metrics, the state with empty sums). A task without samples has no loss, priority and TD error.
 
     Raises:
         NonFiniteError: a loss or gradient was NaN or infinite since the last read; the batch is saved.
@@ -164,6 +167,7 @@ def read_metrics(
     metrics = {
         "loss": float(sums.loss) / n,
         "priority": float(sums.priority) / n,
+        "td_error": float(sums.td_error) / n,
         "q_mean": float(sums.q_mean) / n,
         "grad_norm": float(sums.grad_norm) / n,
         "importance_weight": float(sums.importance_weight) / n,
@@ -177,6 +181,7 @@ def read_metrics(
         if samples > 0:
             metrics[f"loss/{name}"] = float(sums.task_loss[i]) / samples
             metrics[f"priority/{name}"] = float(sums.task_priority[i]) / samples
+            metrics[f"td_error/{name}"] = float(sums.task_td_error[i]) / samples
     return metrics, replace(state, metrics=_no_metrics(len(task_names)))
 
 
@@ -258,6 +263,7 @@ def _no_metrics(num_tasks: int) -> MetricSums:
         num_updates=jnp.zeros((), jnp.int32),
         loss=scalar,
         priority=scalar,
+        td_error=scalar,
         q_mean=scalar,
         q_max=jnp.full((), -jnp.inf, jnp.float32),
         grad_norm=scalar,
@@ -266,6 +272,7 @@ def _no_metrics(num_tasks: int) -> MetricSums:
         task_samples=per_task,
         task_loss=per_task,
         task_priority=per_task,
+        task_td_error=per_task,
     )
     return jax.tree.map(jnp.copy, sums)  # donation refuses a buffer that stands in two places
 
@@ -278,10 +285,12 @@ def _add_metrics(
     info: SampleInfo,
     task: Int[Array, "B"],
 ) -> MetricSums:
+    magnitude = jnp.abs(losses.td_error)
     return MetricSums(
         num_updates=sums.num_updates + 1,
         loss=sums.loss + loss,
         priority=sums.priority + losses.priority.mean(),
+        td_error=sums.td_error + magnitude.mean(),
         q_mean=sums.q_mean + losses.q_tm1.mean(),
         q_max=jnp.maximum(sums.q_max, losses.q_tm1.max()),
         grad_norm=sums.grad_norm + grad_norm,
@@ -290,6 +299,7 @@ def _add_metrics(
         task_samples=sums.task_samples.at[task].add(1.0),
         task_loss=sums.task_loss.at[task].add(losses.loss),
         task_priority=sums.task_priority.at[task].add(losses.priority),
+        task_td_error=sums.task_td_error.at[task].add(magnitude),
     )
 
 

@@ -1,10 +1,16 @@
 """What an agent is: four pure functions. May import jax, learner.networks, learner.replay, gvz.registry.
 
-A third agent is one file beside this one that sets `AGENT` to something callable as `AGENT(config, spec)` which
-returns an `Agent`; its file name is its `agent.name`.
+A third agent is one file that sets `AGENT` to something callable as `AGENT(config, spec)` which returns an `Agent`.
+Beside this file its `agent.name` is its file name; anywhere else, its path. docs/AGENTS.md has a worked example.
 """
 
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
+from types import ModuleType
 from typing import NamedTuple, Protocol
 
 import jax
@@ -60,6 +66,8 @@ class AgentLoss(NamedTuple):
     """how surprising the sample was, >= 0: |TD error|, or the KL divergence if distributional"""
     q_tm1: Float[Array, "B"]
     """online Q(s, a) of the action taken"""
+    td_error: Float[Array, "B"]
+    """r + discount * Q'(s', a') - Q(s, a), for the records"""
 
 
 class Agent(Protocol):
@@ -95,15 +103,31 @@ class Agent(Protocol):
 
 
 def make_agent(config: AgentConfig, spec: AgentSpec) -> Agent:
-    """Builds the agent that `config.name` names.
+    """Builds the agent that `config.name` names: a module in learner/agents, or the path of a Python file.
 
     Raises:
         ConfigError: no such agent, or a configuration that the agent cannot be built from.
     """
+    if config.name.endswith(".py"):
+        return _agent_in_file(Path(config.name).resolve())(config, spec)
     agents = {name: m.AGENT for name, m in discover("learner.agents").items() if hasattr(m, "AGENT")}
     if config.name not in agents:
-        raise ConfigError(f"agent.name: got {config.name!r}, want one of {', '.join(agents)}")
+        raise ConfigError(
+            f"agent.name: got {config.name!r}, want one of {', '.join(agents)}, or the path of a file, ./my_agent.py"
+        )
     return agents[config.name](config, spec)
+
+
+@cache  # two agents of one configuration are equal, so their class must be one
+def _agent_in_file(file: Path) -> Callable[[AgentConfig, AgentSpec], Agent]:
+    if not file.is_file():
+        raise ConfigError(f"agent.name: no file {file}; give a path from here, or an absolute one")
+    name = f"agent_in_{file.stem}"
+    module = sys.modules[name] = ModuleType(name)
+    SourceFileLoader(name, str(file)).exec_module(module)
+    if not hasattr(module, "AGENT"):
+        raise ConfigError(f"agent.name: {file} does not set AGENT, want `AGENT = TheClassOfTheAgent` at its end")
+    return module.AGENT
 
 
 def epsilon_greedy(key: PRNGKeyArray, q_values: Float[Array, "B A"], epsilon: Float[Array, ""]) -> Int[Array, "B"]:

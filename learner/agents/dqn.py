@@ -64,7 +64,8 @@ class DQN:
         q_tm1 = self.q_values(online_params, batch.obs_tm1, batch.task)
         q_t = self.q_values(target_params, batch.obs_t, batch.task)
         td = losses.q_learning_td(q_tm1, batch.a_tm1, batch.r_t, batch.discount_t, q_t)
-        return AgentLoss(losses.huber(td), jnp.abs(jax.lax.stop_gradient(td)), losses.take_action(q_tm1, batch.a_tm1))
+        td_error = jax.lax.stop_gradient(td)
+        return AgentLoss(losses.huber(td), jnp.abs(td_error), losses.take_action(q_tm1, batch.a_tm1), td_error)
 
     def _network(self) -> QNetwork:
         return QNetwork(self.config, self.spec.num_actions, self.spec.num_tasks)

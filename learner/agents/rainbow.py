@@ -91,15 +91,16 @@ class Rainbow:
         q_t_selector = None
         if self.config.double:
             q_t_selector = self.q_values(self.logits(online, batch.obs_t, batch.task))
-        q_tm1 = self.q_values(logits_tm1)
+        q_tm1, q_t = self.q_values(logits_tm1), self.q_values(logits_t)
+        td = losses.q_learning_td(q_tm1, batch.a_tm1, batch.r_t, batch.discount_t, q_t, q_t_selector)
         if self.config.distributional:
             loss, priority = losses.categorical_q_learning(
                 logits_tm1, batch.a_tm1, batch.r_t, batch.discount_t, logits_t, self.atoms, q_t_selector
             )
         else:
-            td = losses.q_learning_td(q_tm1, batch.a_tm1, batch.r_t, batch.discount_t, logits_t[:, :, 0], q_t_selector)
             loss, priority = losses.huber(td), jnp.abs(td)
-        return AgentLoss(loss, jax.lax.stop_gradient(priority), losses.take_action(q_tm1, batch.a_tm1))
+        priority, td_error = jax.lax.stop_gradient((priority, td))
+        return AgentLoss(loss, priority, losses.take_action(q_tm1, batch.a_tm1), td_error)
 
     def _value_range(self) -> tuple[float, float]:
         config, spec = self.config, self.spec

@@ -1,7 +1,9 @@
-"""Agents: the contract of everything discovered, DQN as Rainbow without its parts, each part's effect."""
+"""Agents: the contract of all there are, DQN as Rainbow without its parts, each part's effect, agents in files."""
 
+import re
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +29,23 @@ AGENT_NAMES = [name for name, module in discover("learner.agents").items() if ha
 
 def plain_config(name: str) -> AgentConfig:
     """A small configuration that agent `name` accepts."""
-    return RAINBOW if name == "rainbow" else replace(ALL_OFF, name=name)
+    return RAINBOW if name == "rainbow" else replace(ALL_OFF, name=name, n_steps=1)
+
+
+@pytest.fixture(scope="session")
+def agent_file(tmp_path_factory) -> Path:
+    """The agent that docs/AGENTS.md writes, as a file."""
+    page = Path(__file__).parents[2] / "docs" / "AGENTS.md"
+    (example,) = re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL)
+    file = tmp_path_factory.mktemp("agents") / "munchausen.py"
+    file.write_text(example)
+    return file
+
+
+@pytest.fixture(params=[*AGENT_NAMES, "in a file"])
+def agent_name(request, agent_file: Path) -> str:
+    """Every agent there is: those discovered by file name, and the documented one by its path."""
+    return str(agent_file) if request.param == "in a file" else request.param
 
 
 def batch(seed: int = 0) -> Transitions:
@@ -65,11 +83,11 @@ def test_both_examples_are_discovered():
     assert {"rainbow", "dqn"} <= set(AGENT_NAMES)
 
 
-@pytest.mark.parametrize("name", AGENT_NAMES)
-def test_every_agent_keeps_the_contract(name: str):
-    agent, act, evaluate, loss = jitted(plain_config(name))
+def test_every_agent_keeps_the_contract(agent_name: str):
+    agent, act, evaluate, loss = jitted(plain_config(agent_name))
     init = jax.jit(agent.init)
-    assert hash(agent) == hash(make_agent(plain_config(name), SPEC)), "two agents of one configuration are equal"
+    assert agent == make_agent(plain_config(agent_name), SPEC), "two agents of one configuration are equal"
+    assert hash(agent) == hash(make_agent(plain_config(agent_name), SPEC))
     assert agent.spec == SPEC
     params, target = init(jax.random.key(0)), init(jax.random.key(1))
     jax.tree.map(np.testing.assert_array_equal, params, init(jax.random.key(0)))
@@ -83,15 +101,14 @@ def test_every_agent_keeps_the_contract(name: str):
     assert evaluation.q_values.shape == (B, A)
     np.testing.assert_array_equal(evaluation.action, np.asarray(evaluation.q_values).argmax(-1))
     result = loss(params, target, jax.random.key(3), b)
-    for value in (result.loss, result.priority, result.q_tm1):
+    for value in result:
         assert value.shape == (B,)
         assert np.isfinite(value).all()
     assert (np.asarray(result.priority) >= 0).all()
 
 
-@pytest.mark.parametrize("name", AGENT_NAMES)
-def test_no_gradient_reaches_the_target_parameters(name: str):
-    agent, _, _, _ = jitted(plain_config(name))
+def test_no_gradient_reaches_the_target_parameters(agent_name: str):
+    agent, _, _, _ = jitted(plain_config(agent_name))
     params, target = (made_up_params(agent, seed) for seed in (0, 1))
 
     def total(online, target):
@@ -123,6 +140,7 @@ def test_dqn_loss_is_algorithm_1_with_the_huber_loss():
     q_tm1 = np.asarray(evaluate(params, b.obs_tm1, b.task).q_values, np.float64)[np.arange(B), b.a_tm1]
     q_t = np.asarray(evaluate(target, b.obs_t, b.task).q_values, np.float64).max(1)
     td = np.asarray(b.r_t) + np.asarray(b.discount_t) * q_t - q_tm1
+    np.testing.assert_allclose(result.td_error, td, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(result.priority, np.abs(td), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(result.loss, np.where(np.abs(td) < 1, td**2 / 2, np.abs(td) - 0.5), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(result.q_tm1, q_tm1, rtol=1e-5)
@@ -145,15 +163,50 @@ def test_rainbow_loss_is_its_equations_with_one_noise_for_online_and_a_fresh_one
         at_tm1, online_t = (agent.evaluate(online, obs, b.task) for obs in (b.obs_tm1, b.obs_t))
         target_t = agent.evaluate(add_noise(target, key_target, "factorized"), b.obs_t, b.task)
         selector, rest = online_t.q_values if double else None, (b.a_tm1, b.r_t, b.discount_t)
+        td = losses.q_learning_td(at_tm1.q_values, *rest, target_t.q_values, selector)
         if distributional:
             logits_tm1, logits_t = jnp.log(at_tm1.probabilities), jnp.log(target_t.probabilities)
-            return losses.categorical_q_learning(logits_tm1, *rest, logits_t, at_tm1.atoms, selector)
-        td = losses.q_learning_td(at_tm1.q_values, *rest, target_t.q_values, selector)
-        return losses.huber(td), jnp.abs(td)
+            return *losses.categorical_q_learning(logits_tm1, *rest, logits_t, at_tm1.atoms, selector), td
+        return losses.huber(td), jnp.abs(td), td
 
-    wanted, priority = by_hand(params, target)
+    wanted, priority, td = by_hand(params, target)
+    np.testing.assert_allclose(result.td_error, td, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(result.loss, wanted, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(result.priority, priority, rtol=1e-3, atol=1e-4)
+
+
+def test_gradient_of_the_whole_rainbow_loss_equals_finite_differences():
+    """Through noise, dueling streams and convolutions, along random directions; a rectifier's kink is rarely met."""
+    agent, _, _, loss = jitted(RAINBOW)
+    params, target, b = made_up_params(agent, 0), made_up_params(agent, 1), batch()
+
+    def mean_loss(params):
+        return loss(params, target, jax.random.key(3), b).loss.mean()
+
+    grads, step = jax.jit(jax.grad(mean_loss))(params), 1e-3
+    for seed in range(4):
+        toward = made_up_params(agent, seed + 10, sigma=0.2)
+        above = jax.tree.map(lambda p, d: p + step * d, params, toward)
+        below = jax.tree.map(lambda p, d: p - step * d, params, toward)
+        slope = (float(mean_loss(above)) - float(mean_loss(below))) / (2 * step)
+        along = sum(np.vdot(g, d) for g, d in zip(jax.tree.leaves(grads), jax.tree.leaves(toward), strict=True))
+        np.testing.assert_allclose(along, slope, rtol=0.02, atol=2e-3)
+
+
+def test_bfloat16_activations_change_the_loss_little_and_keep_its_gradient_float32():
+    params, target = (made_up_params(jitted(RAINBOW)[0], seed) for seed in (0, 1))
+    found = []
+    for dtype in ("float32", "bfloat16"):
+        agent = make_agent(replace(RAINBOW, activation_dtype=dtype), SPEC)
+
+        @jax.jit
+        def slope(params, agent=agent):
+            return jax.grad(lambda p: agent.loss(p, target, jax.random.key(3), batch()).loss.mean())(params)
+
+        found.append(np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(slope(params))]))
+    full, half = found
+    assert half.dtype == np.float32
+    assert np.linalg.norm(half - full) < 0.1 * np.linalg.norm(full)
 
 
 def test_distribution_masses_sum_to_one_and_their_mean_is_q():
@@ -199,8 +252,24 @@ def test_epsilon_is_the_share_of_uniformly_random_actions():
 
 
 def test_unknown_agent_is_refused_with_the_known_ones():
-    with pytest.raises(ConfigError, match=r"agent\.name: got 'rainbw', want one of .*dqn, .*rainbow"):
+    with pytest.raises(
+        ConfigError, match=r"agent\.name: got 'rainbw', want one of dqn, rainbow, or the path of a file"
+    ):
         make_agent(replace(RAINBOW, name="rainbw"), SPEC)
+
+
+def test_a_file_that_is_no_agent_is_refused(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"agent\.name: no file .*/mine\.py; give a path from here"):
+        make_agent(replace(RAINBOW, name=str(tmp_path / "mine.py")), SPEC)
+    (tmp_path / "mine.py").write_text("class Mine: ...\n")
+    with pytest.raises(ConfigError, match=r"mine\.py does not set AGENT, want `AGENT = TheClassOfTheAgent`"):
+        make_agent(replace(RAINBOW, name=str(tmp_path / "mine.py")), SPEC)
+
+
+def test_a_path_from_here_names_the_same_agent(agent_file: Path, monkeypatch):
+    from_anywhere = make_agent(plain_config(str(agent_file)), SPEC)
+    monkeypatch.chdir(agent_file.parent)
+    assert type(make_agent(plain_config("./munchausen.py"), SPEC)) is type(from_anywhere)
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ class OneWeight:
         del key
         w, away = online_params["w"], online_params["w"] - target_params["w"]
         value = batch.r_t * w + jnp.sqrt(jnp.maximum(w, 0.0))
-        return AgentLoss(value + 0.0 * away, jnp.abs(batch.r_t), w * jnp.ones(B))
+        return AgentLoss(value + 0.0 * away, jnp.abs(batch.r_t), w * jnp.ones(B), batch.r_t)
 
 
 @cache
@@ -154,10 +154,13 @@ def test_updates_equal_those_done_by_hand(tmp_path: Path):
 
     metrics, state = train_step.read_metrics(state, NAMES, tmp_path)
     tasks = np.concatenate([n[4] for n in seen])
-    losses_seen, priorities = (np.concatenate([getattr(n[1], f) for n in seen]) for f in ("loss", "priority"))
+    losses_seen, priorities, td_errors = (
+        np.concatenate([getattr(n[1], name) for n in seen]) for name in ("loss", "priority", "td_error")
+    )
     wanted = {
         "loss": np.mean([n[0] for n in seen]),
         "priority": priorities.mean(),
+        "td_error": np.abs(td_errors).mean(),
         "q_mean": np.mean([n[1].q_tm1 for n in seen]),
         "q_max": np.max([n[1].q_tm1 for n in seen]),
         "grad_norm": np.mean([n[2] for n in seen]),
@@ -168,6 +171,7 @@ def test_updates_equal_those_done_by_hand(tmp_path: Path):
         wanted[f"sample_share/{name}"] = np.mean(tasks == i)
         wanted[f"loss/{name}"] = losses_seen[tasks == i].mean()
         wanted[f"priority/{name}"] = priorities[tasks == i].mean()
+        wanted[f"td_error/{name}"] = np.abs(td_errors[tasks == i]).mean()
     assert metrics.keys() == wanted.keys()
     for name, value in wanted.items():
         np.testing.assert_allclose(metrics[name], value, rtol=1e-3, atol=1e-5, err_msg=name)
