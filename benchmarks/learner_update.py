@@ -19,7 +19,6 @@ from benchmarks.rounds import Budget, Row, absent, alternate, goal, measured, ra
 
 PEERS = {"Tianshou": ("tianshou_rainbow", 1.0), "Dopamine": ("dopamine_rainbow", 2.0)}
 """name -> (script, how many times as fast the goal asks us to be)"""
-_PRODUCT_SIZE = 2048
 
 
 def measure(budget: Budget) -> list[Row]:
@@ -52,7 +51,7 @@ def measure(budget: Budget) -> list[Row]:
         else:
             pool = stack.enter_context(workload.playing(parts.pool_config, learner.acting_params()))
             bodies["learner with live actors"] = partial(learner.updates_per_s, scans[-1], budget.body_s, pool)
-        bodies["products"] = partial(_products_per_s, budget.body_s)
+        bodies["products"] = partial(_products_per_s, 256 if budget.quick else 2048, budget.body_s)
         values = alternate(budget.rounds, bodies)
         products = values.pop("products")
         profile = _profile(learner, budget)
@@ -77,15 +76,15 @@ def measure(budget: Budget) -> list[Row]:
     ]
 
 
-def _products_per_s(seconds: float) -> float:
+def _products_per_s(size: int, seconds: float) -> float:
     """FLOP/s of square float32 matrix products on all that the learner may use."""
     import jax
     import jax.numpy as jnp
 
-    a = jnp.ones((_PRODUCT_SIZE, _PRODUCT_SIZE), jnp.float32) / _PRODUCT_SIZE
+    a = jnp.ones((size, size), jnp.float32) / size
     product = jax.jit(lambda a, b: jnp.matmul(a, b, precision="highest"))
     product(a, a).block_until_ready()
-    return 2 * _PRODUCT_SIZE**3 / seconds_per_call(lambda: product(a, a).block_until_ready(), seconds)
+    return 2 * size**3 / seconds_per_call(lambda: product(a, a).block_until_ready(), seconds)
 
 
 def _profile(learner: "workload.Learner", budget: Budget) -> list[Row]:

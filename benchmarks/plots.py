@@ -9,25 +9,25 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from benchmarks.record import Record
-from benchmarks.report import curves
+from benchmarks.report import PICTURES, curves
 from benchmarks.rounds import Row, Spread
+
+RATE_OF = {"actors": ("decisions_per_s", "decisions/s"), "learner_update": ("updates_per_s", "gradient steps/s")}
 
 
 def draw(records: Sequence[Record], directory: Path) -> list[Path]:
     """Draws what there are CPU records of; returns the files."""
-    by_name = {made.benchmark: made.rows for made in records if made.device == "cpu"}
     files = []
-    if "actors" in by_name and "acting" in by_name:
-        files.append(directory / "performance_actors.png")
-        rows = [row for name in ("actors", "acting") for row in by_name[name] if row["kind"] == "rates"]
-        _bars([(r["name"], r["decisions_per_s"]) for r in rows], "decisions/s", files[-1])
-    if "learner_update" in by_name:
-        files.append(directory / "performance_learner.png")
-        rows = [row for row in by_name["learner_update"] if row["kind"] == "rates"]
-        _bars([(r["name"], r["updates_per_s"]) for r in rows], "gradient steps/s", files[-1])
-    if "growth" in by_name:
-        files.append(directory / "performance_growth.png")
-        _growth(by_name["growth"], files[-1])
+    for made in records:
+        if made.device != "cpu" or made.benchmark not in PICTURES:
+            continue
+        files.append(directory / PICTURES[made.benchmark])
+        if made.benchmark == "growth":
+            _growth(made.rows, files[-1])
+        else:
+            quantity, unit = RATE_OF[made.benchmark]
+            rates = [row for row in made.rows if row["kind"] == "rates"]
+            _bars([(row["name"], row[quantity]) for row in rates], unit, files[-1])
     return files
 
 

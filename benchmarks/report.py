@@ -28,6 +28,12 @@ GOALS = {
     8: ("startup", "Start-up"),
 }
 """number -> (benchmark, title)"""
+PICTURES = {
+    "actors": "performance_actors.png",
+    "learner_update": "performance_learner.png",
+    "growth": "performance_growth.png",
+}
+"""benchmark -> the plot of its CPU record, in docs/images"""
 RATES = ("decisions", "frames", "updates", "samples")
 
 
@@ -72,7 +78,10 @@ def section(records: Sequence[Record], benchmark: str) -> str:
     mine = [r for r in records if r.benchmark == benchmark]
     if not mine:
         return f"There is no record of this benchmark; `python -m benchmarks {benchmark}` makes one."
-    return "\n\n".join(part for made in mine for part in _parts(made))
+    parts = [part for made in mine for part in _parts(made)]
+    if benchmark in PICTURES and any(made.device == "cpu" for made in mine):
+        parts.append(f"![{benchmark}: the figures above as a plot](images/{PICTURES[benchmark]})")
+    return "\n\n".join(parts)
 
 
 def _parts(made: Record) -> Iterator[str]:

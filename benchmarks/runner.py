@@ -1,7 +1,7 @@
 """Finds the benchmarks, and runs each in a process of its own, so that none can sink, slow or outlive the rest.
 
 A benchmark is a file of this package with a docstring and a function `measure(budget) -> list of rows`; its file name
-is its name. Imports the standard library, gvz.{errors,janitor,registry} and benchmarks.{record,rounds}.
+is its name. Imports the standard library, gvz.{cache,errors,janitor,registry} and benchmarks.{record,rounds}.
 """
 
 import contextlib
@@ -19,6 +19,7 @@ from types import ModuleType
 from benchmarks import record, rounds
 from benchmarks.rounds import Budget
 from gvz import janitor
+from gvz.cache import xla_cache_directory
 from gvz.errors import ConfigError
 from gvz.registry import discover
 
@@ -50,6 +51,7 @@ def run_in_process(name: str, budget: Budget, command: str) -> record.Record:
     """Measures one benchmark here and now."""
     import jax
 
+    jax.config.update("jax_compilation_cache_dir", str(xla_cache_directory()))
     machine, commit = record.machine(), record.commit()
     date, start = time.strftime("%Y-%m-%d %H:%M", time.gmtime()), time.monotonic()
     rows = benchmarks()[name].measure(budget)

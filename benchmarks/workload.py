@@ -125,10 +125,8 @@ def filled_replay(spec: "ReplaySpec") -> "ReplayState":
         priorities = jnp.where(drawable, jax.random.uniform(keys[1], (K,)) + 0.01, 0.0)
         return dataclasses.replace(
             empty,
-            # bytes that differ from frame to frame and cost little to make
-            frames=(
-                jnp.arange(K, dtype=jnp.uint32)[:, None] * 2654435761 + jnp.arange(empty.frames.shape[1])[None]
-            ).astype(jnp.uint8),
+            frames=jnp.arange(K).astype(jnp.uint8)[:, None] * jnp.uint8(177)
+            + jnp.arange(empty.frames.shape[1]).astype(jnp.uint8)[None],
             reward=jax.random.uniform(keys[2], (K,)),
             action=jax.random.randint(keys[3], (K,), 0, 3),
             task=jnp.zeros(K, jnp.int32),

@@ -26,6 +26,7 @@ def main() -> None:
     gin.bind_parameter("JaxDQNAgent.stack_size", _STACK)
     gin.bind_parameter("JaxDQNAgent.update_horizon", 3)
     gin.bind_parameter("ReplayBuffer.max_capacity", capacity)
+    gin.bind_parameter("PrioritizedSamplingDistribution.max_capacity", capacity)
     gin.bind_parameter("ReplayBuffer.batch_size", batch_size)
     agent = JaxFullRainbowAgent(num_actions=_NUM_ACTIONS, seed=0)
     rng = np.random.default_rng(0)
