@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 ARGS   ?=
 
-.PHONY: help install install-cuda train test test-fast test-slow test-browser lint format lock bench clean
+.PHONY: help install install-cuda train test test-fast test-slow test-browser lint format lock bench bench-micro docs clean
 
 help:            ## show this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -45,8 +45,15 @@ format: install  ## apply formatting and safe fixes
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-bench: install   ## benchmark bodies, timed
+bench: install   ## throughput beside limits and peers, 20 minutes on 2 quiet cores; then the page made of it
+	$(BIN)/python -m benchmarks all --out results/performance $(ARGS)
+	$(BIN)/python -m benchmarks.report
+
+bench-micro: install ## timed bodies of tests/perf
 	$(BIN)/python -m pytest tests/perf --benchmark-enable $(ARGS)
+
+docs: install    ## the documentation as a site, in site/
+	$(BIN)/python -m mkdocs build --strict
 
 lock: install    ## resolve requirements.lock anew from pyproject.toml
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev pyproject.toml \

@@ -180,14 +180,9 @@ def check_devices() -> Finding:
 
 
 def check_ffmpeg() -> Finding:
-    """`gvz record` writes mp4 with it; GIF and WebP need nothing."""
-    try:
-        import imageio_ffmpeg
-
-        return Finding(name="ffmpeg", state="ok", found=imageio_ffmpeg.get_ffmpeg_exe())
-    except (ImportError, RuntimeError) as error:
-        remedy = "pip install imageio-ffmpeg, or record to .gif or .webp"
-        return Finding(name="ffmpeg", state="note", found=f"none ({error})", remedy=remedy)
+    """`gvz record` writes mp4 with FFmpeg's libraries, which PyAV brings along; GIF and WebP need nothing."""
+    remedy = "pip install av, or record to .gif or .webp"
+    return _try("ffmpeg", "import av; print(f'libraries of PyAV {av.__version__}'); av.Codec('libx264', 'w')", remedy)
 
 
 def check_leftovers() -> Finding:
