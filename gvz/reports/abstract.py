@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 
 from gvz.evaluation.metrics import difference
+from gvz.reports.document import count
 from gvz.reports.results import Results
 from gvz.reports.scenario_section import agents_of, played_tasks
 from gvz.reports.scores import Scores, agent_scores, estimate_groups
@@ -25,7 +26,7 @@ def what_was_run(results: Results) -> list[str]:
     for asked in results.asked:
         e = asked.experiment
         sentences.append(
-            f"Experiment “{e.title}”: {len(e.runs())} runs of {e.total_updates:,} gradient steps asked for"
+            f"Experiment “{e.title}”: {count(len(e.runs()), 'run')} of {e.total_updates:,} gradient steps asked for"
             + (f", at scale {asked.scale:g} of the full experiment." if asked.scale < 1 else ".")
         )
     if results.runs:
@@ -34,13 +35,13 @@ def what_was_run(results: Results) -> list[str]:
         seeds = {run.seed for run in results.runs}
         agents = sorted(set(results.agents.values()))
         sentences.append(
-            f"{_count(len(results.runs), 'training run')} of {_count(len(agents), 'agent')} ({', '.join(agents)}), "
-            f"{_count(len(seeds), 'training seed')}, {budget} gradient steps each."
+            f"{count(len(results.runs), 'training run')} of {count(len(agents), 'agent')} ({', '.join(agents)}), "
+            f"{count(len(seeds), 'training seed')}, {budget} gradient steps each."
         )
     tasks = results.episodes["task"].n_unique()
     players = results.episodes.filter(pl.col("run").is_null())["player"].unique().sort().to_list()
     beside = f", among them players that do not learn: {', '.join(players)}" if players else ""
-    sentences.append(f"{len(results.episodes):,} evaluation episodes on {_count(tasks, 'task')}{beside}.")
+    sentences.append(f"{count(len(results.episodes), 'evaluation episode')} on {count(tasks, 'task')}{beside}.")
     return sentences
 
 
@@ -122,7 +123,3 @@ def caveats(results: Results) -> list[str]:
                 f"{asked.experiment.title}: {len(absent)} of {len(asked.experiment.runs())} runs are not there yet."
             )
     return found
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"

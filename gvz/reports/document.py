@@ -94,6 +94,11 @@ class Document:
     made_with: str = field(default="")
 
 
+def count(number: int, what: str) -> str:
+    """ "1 run", "2 runs"."""
+    return f"{number:,} {what}" if number == 1 else f"{number:,} {what}s"
+
+
 def words(text: str) -> Cell:
     """A cell of text."""
     return Cell(text=text)

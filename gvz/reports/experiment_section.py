@@ -22,7 +22,7 @@ from gvz.evaluation.metrics import (
 from gvz.experiments.base import Experiment, TrainingRun
 from gvz.experiments.progress import run_directory
 from gvz.reports.curves import evaluation_curve, learning_curve
-from gvz.reports.document import Block, Cell, Figure, Section, Table, missing, theirs, words
+from gvz.reports.document import Block, Cell, Figure, Section, Table, count, missing, theirs, words
 from gvz.reports.draw import draw_curves
 from gvz.reports.results import Asked, Results
 from gvz.reports.scores import Scores, estimate, estimate_groups, pick
@@ -35,21 +35,21 @@ def experiment_section(results: Results, asked: Asked, out: Path) -> Section:
     """Everything the report says of an experiment."""
     experiment = asked.experiment
     budget = (
-        f"{len(experiment.seeds)} training seeds, {experiment.total_updates:,} gradient steps, "
-        f"{experiment.num_checkpoints} checkpoints, {experiment.episodes} evaluation episodes a task and checkpoint; "
-        f"tables are over the last {experiment.table_checkpoints}."
+        f"{count(len(experiment.seeds), 'training seed')}, {experiment.total_updates:,} gradient steps, "
+        f"{count(experiment.num_checkpoints, 'checkpoint')}, {count(experiment.episodes, 'evaluation episode')} a task "
+        f"and checkpoint; tables are over the last {count(experiment.table_checkpoints, 'checkpoint')}."
     )
     tables = [result_table(results, asked), aggregate_table(results, asked)]
     if experiment.columns != "level":
         tables.append(comparison_table(results, asked))
     text = (f"**{experiment.question}** Source: {experiment.source}.", budget, *experiment.notes)
+    curves = Block(heading="Curves", figures=tuple(_figures(results, asked, out)))
+    if not curves.figures:
+        curves = Block(text=("No run of this experiment has been evaluated yet: there are no curves.",))
     return Section(
         id=experiment.name.replace("_", "-"),
         title=experiment.title,
-        blocks=(
-            Block(text=text, tables=tuple(tables)),
-            Block(heading="Curves", figures=tuple(_figures(results, asked, out))),
-        ),
+        blocks=(Block(text=text, tables=tuple(tables)), curves),
     )
 
 
@@ -136,8 +136,11 @@ def result_table(results: Results, asked: Asked) -> Table:
                 )
     return Table(
         id=experiment.name,
-        caption=f"{experiment.title}: percent of the upper bound ({experiment.source}). Rows in italics are others' "
-        "published numbers, to stand beside ours; nothing of ours is made of them.",
+        caption=f"{experiment.title}: percent of the upper bound ({experiment.source})."
+        + (
+            " Rows in italics are others' published numbers; nothing of ours is made of them."
+            * bool(experiment.published)
+        ),
         columns=("scenario", "numbers", *(column_title(experiment, column) for column in columns)),
         rows=tuple(rows),
         notes=(interval_note(experiment),),
@@ -234,7 +237,7 @@ def _learning_curves(results: Results, asked: Asked, scenario: str, out: Path) -
     by_level = {f"level {level}": [task for task in tasks if parse_task(task).level == level] for level in range(5)}
     of_level_1 = {task.partition("/")[2]: [task] for task in by_level["level 1"]}
     figures = []
-    for id, lines, what in (("levels", by_level, "by level"), ("level_1", of_level_1, "each task of level 1")):
+    for id, lines, what in (("levels", by_level, "by level"), ("level_1", of_level_1, "on each task of level 1")):
         curves = [learning_curve(label, trained, chosen) for label, chosen in lines.items() if chosen]
         if any(curves):
             caption = f"{title}: training scores {what}, running mean of 30 episodes; band: training seeds redrawn."

@@ -175,7 +175,7 @@ def _agents(runs: Sequence[Run]) -> dict[str, str]:
 
     trainings = {name: {training(run) for run in runs if run.name == name} for name in {run.name for run in runs}}
     return {
-        str(run.path): run.name if len(trainings[run.name]) == 1 else f"{run.name}, {training(run)}" for run in runs
+        str(run.path): run.name if len(trainings[run.name]) == 1 else f"{run.name} ({training(run)})" for run in runs
     }
 
 

@@ -25,8 +25,7 @@ def test_agents_are_told_apart_by_what_they_were_trained_on(small):
     results = read_results([small])
     assert not results.problems
     assert set(results.agents.values()) == {
-        *(f"rainbow_4task, {n}" for n in ("1 task", "4 tasks", "8 tasks")),
-        f"rainbow_4task, {EACH}",
+        *(f"rainbow_4task ({training})" for training in ("1 task", "4 tasks", "8 tasks", EACH)),
     }
     assert set(results.episodes["agent"]) == {*results.agents.values(), "random"}
     assert [asked.experiment.name for asked in results.asked] == ["training_set_size", "training_difficulty"]
