@@ -230,7 +230,7 @@ class Trainer:
         row = self._measure()
         if logging:
             learner = {f"learner/{name}": value for name, value in self._metrics.items()}
-            self._telemetry.scalars(counts.updates, {**row, **learner})
+            self._telemetry.scalars(counts.updates, {**row, **learner, **self._replay_shares()})
         self._progress.show(self._status(row))
 
     def _save(self, *, force: bool = False) -> None:
@@ -288,6 +288,12 @@ class Trainer:
             "actors/staleness_max_versions": staleness.max,
             "replay/fill_share": min(1.0, counts.records / self._parts.replay_spec.num_slots),
         }
+
+    def _replay_shares(self) -> dict[str, float]:
+        """Each task's share of the records stored."""
+        counts = np.asarray(replay.records_per_task(self._parts.replay_spec, self._replay))
+        tasks = self._parts.pool_config.tasks
+        return {f"replay/share/{name}": float(n) / counts.sum() for name, n in zip(tasks, counts, strict=True)}
 
     def _status(self, row: Mapping[str, float]) -> Status:
         counts, learner = self._counts, self._config.learner
