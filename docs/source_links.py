@@ -15,7 +15,7 @@ def on_page_markdown(markdown, *, page, config, files):
     def replace(link):
         text, target = link.groups()
         file = (Path(page.file.abs_src_path).parent / target).resolve()
-        if file.is_relative_to(config.docs_dir):
+        if file.is_relative_to(config.docs_dir) or not file.exists():  # mkdocs says so itself
             return link[0]
         if file.is_dir():
             return text

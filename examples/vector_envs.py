@@ -31,6 +31,7 @@ def main(
         wrappers=[partial(FrameStackObservation, stack_size=4), RecordEpisodeStatistics],
     )
     observations, _ = envs.reset(seed=1)  # game i gets seed 1 + i
+    envs.action_space.seed(1)
     print(f"gvizdoom {gvz.__version__}, {mode}: observations {observations.shape} {observations.dtype}")
     for _ in range(steps):
         observations, _, terminated, truncated, infos = envs.step(envs.action_space.sample())

@@ -45,6 +45,32 @@ def test_own_agent_is_evaluated_on_the_episodes_of_everybody(tmp_path):
     assert {row["player"] for row in rows} == {"motion"}
 
 
+EXECUTE = """
+import sys, nbclient, nbformat
+notebook = nbformat.read(sys.argv[1], as_version=4)
+nbclient.NotebookClient(notebook, timeout=240, resources={"metadata": {"path": sys.argv[2]}}).execute()
+nbformat.write(notebook, sys.argv[3])
+"""
+
+
+def outputs(notebook: Path, kind: str) -> list:
+    """What the cells print (`text`), or show (`data`)."""
+    cells = json.loads(notebook.read_text())["cells"]
+    return [output[kind] for cell in cells for output in cell.get("outputs", ()) if kind in output]
+
+
+@pytest.mark.engine
+@pytest.mark.timeout(600)
+def test_the_notebook_runs_and_prints_what_is_committed(tmp_path):
+    committed, executed = EXAMPLES / "tour.ipynb", tmp_path / "tour.ipynb"
+    command = [sys.executable, "-c", EXECUTE, committed, EXAMPLES, executed]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
+    assert done.returncode == 0, done.stderr
+    assert outputs(executed, "text") == outputs(committed, "text")
+    assert [set(shown) for shown in outputs(committed, "data")] == [{"image/png", "text/plain"}] * 3
+    assert committed.stat().st_size < 500_000
+
+
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.py")), ids=lambda file: file.name)
 def test_an_example_is_short_and_says_how_it_is_run(file):
     text = file.read_text()

@@ -1,4 +1,4 @@
-"""`gvz export`: records of runs as tables. Imports gvz.{errors,rundir}; polars and gvz.evaluation.frame once it runs."""
+"""`gvz export`: records of runs as tables. Imports gvz.{errors,rundir}; polars, gvz.evaluation.frame once it runs."""
 
 import json
 import sys
