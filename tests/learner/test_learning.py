@@ -187,7 +187,8 @@ def test_dqn_reaches_the_optimum_of_a_credit_task(seeds):
 
 
 def test_rainbow_reaches_the_optimum_of_catch(seeds):
-    assert_optimal(Training(CATCH, RAINBOW, 1500, replay=PRIORITIZED), seeds)
+    num_updates = 600 if len(seeds) == 1 else 1500  # the third seed needs more than 600
+    assert_optimal(Training(CATCH, RAINBOW, num_updates, replay=PRIORITIZED), seeds)
 
 
 @pytest.mark.slow
