@@ -3,6 +3,7 @@
 The engine and jax are tried in sub-processes, since a broken one can end the process that tries it.
 """
 
+import dataclasses
 import os
 import platform
 import re
@@ -179,10 +180,11 @@ def check_devices() -> Finding:
     return finding
 
 
-def check_ffmpeg() -> Finding:
-    """`gvz record` writes mp4 with FFmpeg's libraries, which PyAV brings along; GIF and WebP need nothing."""
-    remedy = "pip install av, or record to .gif or .webp"
-    return _try("ffmpeg", "import av; print(f'libraries of PyAV {av.__version__}'); av.Codec('libx264', 'w')", remedy)
+def check_video() -> Finding:
+    """`gvz record` writes mp4 by FFmpeg's libraries, which PyAV brings along; GIF and WebP need nothing."""
+    remedy = "pip install 'gvizdoom[video]', or record to .gif or .webp"
+    finding = _try("video", "import av; av.Codec('libx264', 'w'); print(f'PyAV {av.__version__}')", remedy)
+    return dataclasses.replace(finding, state="note") if finding.state == "bad" else finding
 
 
 def check_leftovers() -> Finding:
@@ -197,7 +199,7 @@ def check_leftovers() -> Finding:
 
 CHECKS: tuple[Callable[[], Finding], ...] = (
     *(check_system, check_python, check_packages, check_cores, check_memory, check_shared_memory),
-    *(check_temporary_directory, check_cache, check_leftovers, check_engine, check_devices, check_ffmpeg),
+    *(check_temporary_directory, check_cache, check_leftovers, check_engine, check_devices, check_video),
 )
 
 

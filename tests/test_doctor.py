@@ -19,7 +19,7 @@ def test_this_machine_is_fit():
     assert [f for f in findings if f.state == "bad"] == []
     assert [f.name for f in findings] == [
         *("system", "python", "packages", "cores", "memory", "/dev/shm", "tmp", "cache", "leftovers"),
-        *("vizdoom", "jax", "ffmpeg"),
+        *("vizdoom", "jax", "video"),
     ]
 
 

@@ -43,6 +43,8 @@ class Evaluate:
     """run directories: their policies play greedily, noise off; by default the test tasks of their scenario"""
     player: SimplePlayer | None = None
     """random: uniformly random buttons; idle: presses nothing; scripted: the scenario's simple script"""
+    agent: Path | None = None
+    """the Python file of the run's agent, if it is in a file of its own: playing executes it"""
     checkpoints: tuple[str, ...] = ("newest",)
     """which of a run's policies: newest, all, last5 (or another number), or numbers of gradient steps"""
     select: Annotated[TaskSelection, tyro.conf.arg(name="")] = ALL_TASKS
@@ -103,7 +105,7 @@ class Evaluate:
             return {simple_entrant(self.player, EnvConfig(profile=self.profile)): (self.select.resolve(), out)}
         found = {}
         for run_dir in dict.fromkeys(self.run_dirs):
-            config = read_run_config(run_dir)
+            config = read_run_config(run_dir, self.agent)
             tasks = run_tasks(self.select, config.resolved_scenario().id)
             check_tasks(config, tasks)
             out = run_dir / "evaluation.jsonl" if self.out is None else self.out

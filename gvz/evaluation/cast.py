@@ -27,6 +27,8 @@ class Cast:
     """a run directory: its policy plays greedily, noise off"""
     player: SimplePlayer | None = None
     """instead: random, idle, or the scenario's simple script"""
+    agent: Path | None = None
+    """the Python file of the run's agent, if it is in a file of its own: playing executes it"""
     checkpoint: str = "newest"
     """which of the run's policies: gradient steps, or newest"""
     task: str | None = None
@@ -57,7 +59,7 @@ class Cast:
             if self.task is None:
                 raise ConfigError("--task: want a task id, for example defend_the_center/gore (gvz tasks lists them)")
             return simple_entrant(self.player, EnvConfig(profile=self.profile)), parse_task(self.task)
-        config = read_run_config(self.run_dir)
+        config = read_run_config(self.run_dir, self.agent)
         task = config.resolved_tasks()[0] if self.task is None else parse_task(self.task)
         check_tasks(config, [task])
         found = find_checkpoints(self.run_dir, [self.checkpoint])

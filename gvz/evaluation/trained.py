@@ -1,9 +1,10 @@
 """The policies of a training run as players, read from its run directory.
 
-Imports gvz.config, gvz.evaluation.play; jax, gvz.assemble, learner where a policy is read. Nothing in a run directory
-is executed or unpickled.
+Imports gvz.config, gvz.evaluation.play; jax, gvz.assemble, learner where a policy is read. Nothing that a run directory
+holds or names is executed or unpickled; an agent in a file of its own is asked for by name.
 """
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -41,19 +42,31 @@ class Values:
     """f32[N], the returns that `probabilities` are of"""
 
 
-def read_run_config(run_dir: Path) -> RunConfig:
+def read_run_config(run_dir: Path, agent_file: Path | None = None) -> RunConfig:
     """The configuration a run was trained with.
 
+    Args:
+        run_dir: of the run.
+        agent_file: the Python file of its agent, if that is none of learner/agents; playing executes it.
+
     Raises:
-        ConfigError: not a run directory, or its config.json is damaged.
+        ConfigError: not a run directory, its config.json is damaged, or its agent is in a file that is not given.
     """
     file = run_dir / "config.json"
     try:
-        return config_from_dict(json.loads(file.read_text()))
+        config = config_from_dict(json.loads(file.read_text()))
     except OSError as error:
         raise ConfigError(f"{run_dir} is not a run directory ({file.name}: {error.strerror})") from error
     except ValueError as error:
         raise ConfigError(f"{file} cannot be read: {error}") from error
+    if not config.agent.name.endswith(".py"):
+        return config
+    if agent_file is None:
+        raise ConfigError(
+            f"{run_dir}: its agent is a Python file ({config.agent.name}), which a run directory alone never gets "
+            f"executed; if you trust that file, name it: --agent {config.agent.name}"
+        )
+    return dataclasses.replace(config, agent=dataclasses.replace(config.agent, name=str(agent_file)))
 
 
 def check_tasks(config: RunConfig, tasks: Sequence[Task]) -> None:
@@ -122,6 +135,7 @@ def trained_entrant(run_dir: Path, config: RunConfig, num_updates: int) -> Entra
     digest = hashlib.blake2b(digest_size=8)
     for leaf in jax.tree.leaves(params):
         digest.update(np.asarray(leaf, np.float32).tobytes())
+    agent_file = Path(config.agent.name) if config.agent.name.endswith(".py") else None
     name = f"{config.name}/seed_{config.seed}"
     player = {
         "player": f"{name}@{num_updates}",
@@ -131,7 +145,7 @@ def trained_entrant(run_dir: Path, config: RunConfig, num_updates: int) -> Entra
         "params": digest.hexdigest(),
     }
     return Entrant(
-        make_player=partial(TrainedPlayer, run_dir, num_updates),
+        make_player=partial(TrainedPlayer, run_dir, num_updates, agent_file),
         env=config.env,
         identity=row_identity(player, config.env),
     )
@@ -143,13 +157,14 @@ class TrainedPlayer:
     Args:
         run_dir: of the run.
         num_updates: gradient steps of one in `policies/`.
+        agent_file: as of `read_run_config`.
 
     Raises:
         ConfigError, CheckpointError: it cannot be read.
     """
 
-    def __init__(self, run_dir: Path, num_updates: int):
-        config = read_run_config(run_dir)
+    def __init__(self, run_dir: Path, num_updates: int, agent_file: Path | None = None):
+        config = read_run_config(run_dir, agent_file)
         agent, params = _read_params(run_dir, config, num_updates)
         import jax
 

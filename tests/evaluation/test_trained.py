@@ -130,6 +130,23 @@ def test_what_is_no_run_is_an_error(tmp_path, run):
         read_run_config(run)
 
 
+def test_an_agents_file_is_executed_only_if_it_is_named(tmp_path, run):
+    source, mark = tmp_path / "theirs.py", tmp_path / "executed"
+    source.write_text(
+        f"open({str(mark)!r}, 'w').close()\nfrom learner.agents.{CONFIG.agent.name} import AGENT as AGENT\n"
+    )
+    config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, name=str(source)))
+    (run / "config.json").write_text(json.dumps(config_to_dict(config)))
+    with pytest.raises(ConfigError, match=r"its agent is a Python file .* if you trust that file, name it: --agent "):
+        read_run_config(run)
+    with pytest.raises(ConfigError, match="its agent is a Python file"):
+        TrainedPlayer(run, 20)
+    assert not mark.exists()
+    entrant = trained_entrant(run, read_run_config(run, source), 20)
+    assert pickle.loads(pickle.dumps(entrant)).make_player().values is None
+    assert mark.exists()
+
+
 def test_a_damaged_policy_is_an_error_that_names_the_file(run):
     file = next(f for f in (run / "policies" / "20" / "arrays").rglob("*") if f.is_file() and f.stat().st_size > 100)
     file.write_bytes(file.read_bytes()[:-9])
