@@ -37,6 +37,7 @@ from tests.learner.games import (
 )
 
 LANES = 4
+ALL_SEEDS = (1111, 2222, 3333)
 OFF = AgentConfig(
     double=False,
     dueling=False,
@@ -167,7 +168,7 @@ CATCH, CREDIT = catch(), umbrella()
 @pytest.fixture(
     params=[
         pytest.param((1111,), id="one seed"),
-        pytest.param((1111, 2222, 3333), id="three seeds", marks=pytest.mark.slow),
+        pytest.param(ALL_SEEDS, id="three seeds", marks=pytest.mark.slow),
     ]
 )
 def seeds(request) -> tuple[int, ...]:
@@ -194,7 +195,7 @@ def test_rainbow_reaches_the_optimum_of_catch(seeds):
 @pytest.mark.slow
 @pytest.mark.parametrize("training", [Training(CATCH, DQN, 1000), Training(CREDIT, RAINBOW, 1000, replay=PRIORITIZED)])
 def test_each_agent_reaches_the_optimum_of_the_other_game_too(training: Training):
-    assert_optimal(training, (1111, 2222, 3333))
+    assert_optimal(training, ALL_SEEDS)
 
 
 # --- what each part is for ----------------------------------------------------------------------------------------
@@ -269,9 +270,9 @@ def test_the_distributional_loss_learns_what_a_stochastic_reward_is_worth(seeds)
 
 
 @pytest.mark.slow
-def test_the_huber_loss_alone_takes_a_stochastic_reward_for_less(seeds):
+def test_the_huber_loss_alone_takes_a_stochastic_reward_for_less():
     """Where 0.2 * 1 = 0.8 * q its slopes balance: q = 0.25, below the safe 0.5, though the mean is 1.6."""
-    for seed in seeds:
+    for seed in ALL_SEEDS:
         result = lottery_training(distributional=False)(seed)
         ticket, safe = q_values(result, LOTTERY, t=0)
         assert ticket == pytest.approx(0.25, abs=0.15)
@@ -291,7 +292,7 @@ def test_noise_alone_explores_a_deep_sea(seeds):
 @pytest.mark.slow
 def test_without_noise_and_epsilon_not_every_run_crosses_it():
     config = replace(OFF, epsilon_start=0.0, epsilon_end=0.0)
-    crossed = [Training(SEA, config, 1000)(seed).returns.mean() == 1.0 for seed in (1111, 2222, 3333)]
+    crossed = [Training(SEA, config, 1000)(seed).returns.mean() == 1.0 for seed in ALL_SEEDS]
     assert sum(crossed) <= 1  # a network that is still changing wanders across now and then
 
 
