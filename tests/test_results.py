@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gvz.evaluation.metrics import Estimate, bootstrap
+from gvz.tasks import named_tasks
 
 ROOT = Path(__file__).parent.parent
 
@@ -26,3 +27,22 @@ def test_the_quick_run_is_better_than_chance_on_the_same_episodes():
     readme = (ROOT / "README.md").read_text()
     assert f"| random | {chance} |" in readme
     assert f"| rainbow_quick, 20,000 updates | {trained} |" in readme
+
+
+def test_the_quick_comparison_says_what_its_records_give():
+    """Means alone; gvz/reports has its own tests of intervals."""
+    folder = ROOT / "results" / "quick_comparison"
+    test_tasks = {task.id for task in named_tasks("defend_the_center", split="test")}
+    readme = (folder / "README.md").read_text()
+    for config in ("rainbow_quick", "dqn_quick"):
+        files = sorted(folder.glob(f"runs/{config}/*/*/*/evaluation.jsonl.gz"))
+        assert len(files) == 3
+        rows = [json.loads(line) for file in files for line in gzip.decompress(file.read_bytes()).splitlines()]
+        assert len(rows) == 3 * 2 * 18 * 25
+        final = [row for row in rows if row["num_updates"] == 20_000]
+        (line,) = (line for line in readme.splitlines() if line.startswith(f"| {config} |"))
+        said = [float(cell.split()[0]) for cell in line.split("|")[2:-1]]
+        for level, value in enumerate(said[:-1]):
+            tasks = {task.id for task in named_tasks("defend_the_center", level=level)}
+            assert value == round(np.mean([row["normalized_score"] for row in final if row["task"] in tasks]), 1)
+        assert said[-1] == round(np.mean([row["normalized_score"] for row in final if row["task"] in test_tasks]), 1)
