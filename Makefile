@@ -2,9 +2,10 @@
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
+INTEROP := .venv-interop
 ARGS   ?=
 
-.PHONY: help install install-cuda train test test-fast test-slow test-browser lint format lock bench bench-micro docs clean
+.PHONY: help install install-cuda train test test-fast test-slow test-browser test-interop lint format lock bench bench-micro docs clean
 
 help:            ## show this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -36,6 +37,15 @@ test-slow: install ## learning and fault tests that take minutes each
 test-browser: install ## reports opened in headless Chromium (Debian: apt-get install chromium)
 	$(BIN)/python -m pytest -m browser $(ARGS)
 
+test-interop: $(INTEROP)/.installed ## other libraries train on the environments, in .venv-interop, without JAX
+	$(INTEROP)/bin/python -m pytest -o addopts= --import-mode importlib --confcutdir tests/interop tests/interop $(ARGS)
+
+$(INTEROP)/.installed: examples/requirements.txt
+	$(PYTHON) -m venv $(INTEROP)
+	$(INTEROP)/bin/python -m pip install --quiet --disable-pip-version-check -r examples/requirements.txt
+	$(INTEROP)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	@touch $@
+
 lint: install    ## format check, lint, types
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
@@ -60,4 +70,4 @@ lock: install    ## resolve requirements.lock anew from pyproject.toml
 	  --no-emit-index-url --no-header --no-annotate --no-emit-package opencv-python --output-file requirements.lock
 
 clean:           ## remove the virtual environment and caches
-	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis build dist
+	rm -rf $(VENV) $(INTEROP) .pytest_cache .ruff_cache .hypothesis build dist
