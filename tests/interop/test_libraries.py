@@ -5,6 +5,7 @@ Run by that environment's pytest (examples/requirements.txt); the project's own 
 
 import importlib.util
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -15,8 +16,15 @@ EXAMPLES = Path(__file__).parent.parent.parent / "examples"
 
 
 def run(name: str, *arguments: str, where: Path) -> str:
-    command = [sys.executable, str(EXAMPLES / name), *arguments]
-    done = subprocess.run(command, cwd=where, capture_output=True, text=True, timeout=550, check=False)
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLES / name), *arguments],
+        cwd=where,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},  # threads of torch that spin stand in the games' way
+        capture_output=True,
+        text=True,
+        timeout=550,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 

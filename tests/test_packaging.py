@@ -1,0 +1,117 @@
+"""Wheel and sdist: what they hold, that they install, and that the benchmark runs where JAX cannot be imported."""
+
+import os
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+pytestmark = pytest.mark.timeout(600)
+PACKAGES = ("gvz", "actors", "learner", "configs")
+
+
+def run(*command: str | Path, where: Path, **environment: str) -> str:
+    done = subprocess.run(
+        list(map(str, command)),
+        cwd=where,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def tracked_files() -> set[str]:
+    """What git knows of the packages."""
+    return set(run("git", "ls-files", *PACKAGES, where=ROOT).splitlines())
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory) -> Path:
+    """A directory with wheel and sdist, built by the environment's own hatchling: nothing is downloaded."""
+    out = tmp_path_factory.mktemp("dist")
+    run(sys.executable, "-m", "hatchling", "build", "-d", out, where=ROOT)
+    return out
+
+
+@pytest.fixture(scope="module")
+def installed(built, tmp_path_factory) -> Path:
+    """A clean environment with the wheel in it, and the dependencies of this one; the repository is not on its path."""
+    where = tmp_path_factory.mktemp("clean") / "venv"
+    run(sys.executable, "-m", "venv", "--without-pip", where, where=built)
+    (packages,) = where.glob("lib/python*/site-packages")
+    (wheel,) = built.glob("*.whl")
+    python = where / "bin" / "python"
+    run(
+        sys.executable,
+        "-m",
+        "uv",
+        "pip",
+        "install",
+        "-q",
+        "--offline",
+        "--no-deps",
+        "--python",
+        python,
+        wheel,
+        where=built,
+    )
+    # a line of a .pth is a directory to search; those of the editable installation there are not followed
+    (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    return where / "bin"
+
+
+def test_the_wheel_holds_every_file_of_the_packages_and_nothing_else(built):
+    (wheel,) = built.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name for name in archive.namelist() if ".dist-info/" not in name}
+    assert tracked_files() <= names
+    assert {name.partition("/")[0] for name in names} == set(PACKAGES)
+    for needed in ("gvz/py.typed", "gvz/reports/templates/report.html.j2"):
+        assert needed in names
+
+
+def test_the_sdist_holds_what_a_wheel_is_built_from(built):
+    (sdist,) = built.glob("*.tar.gz")
+    with tarfile.open(sdist) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert tracked_files() | {"pyproject.toml", "README.md", "LICENSE"} <= names
+
+
+@pytest.mark.engine
+def test_an_installed_wheel_works_from_an_empty_directory(installed, tmp_path):
+    assert len(run(installed / "gvz", "tasks", "--json", where=tmp_path).splitlines()) == 76
+    code = (
+        "import gvz; e = gvz.make('dodge_projectiles/city'); print(gvz.__file__, e.reset(seed=1)[0].shape); e.close()"
+    )
+    file, _, shape = run(installed / "python", "-c", code, where=tmp_path).partition(" ")
+    assert Path(file).is_relative_to(installed.parent)
+    assert shape.strip() == "(84, 84, 3)"
+    assert "--learner.total-updates" in run(
+        installed / "gvz", "train", "--config", "dqn_quick", "--help", where=tmp_path
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.engine
+def test_environments_and_their_evaluation_need_no_jax(tmp_path):
+    (tmp_path / "jax").mkdir()
+    (tmp_path / "jax" / "__init__.py").write_text("raise ImportError('there is no jax here')")
+    here = {"where": tmp_path, "PYTHONPATH": str(tmp_path)}
+    with pytest.raises(AssertionError, match="there is no jax here"):
+        run(sys.executable, "-c", "import jax", **here)
+    task = "health_gathering/supreme"
+    code = f"import gvz, gymnasium; e = gvz.make('{task}'); e.reset(seed=1); print(e.step(0)[1]); e.close()"
+    assert float(run(sys.executable, "-c", code, **here)) > 0
+    gvz = (sys.executable, "-m", "gvz.cli")
+    assert task in run(*gvz, "tasks", **here)
+    playing = ("--player", "random", "--tasks", task, "--episodes", "1", "--workers", "1", "--out", "random.jsonl")
+    assert task in run(*gvz, "evaluate", *playing, **here)
