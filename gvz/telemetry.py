@@ -21,7 +21,7 @@ from gvz.rundir import RunDir
 from gvz.transport.messages import EpisodeStats, Fault
 
 if TYPE_CHECKING:
-    import wandb
+    import wandb  # pyright: ignore[reportMissingImports]  # an extra
 
 RECENT_EPISODES = 30
 """episodes in a task's recent score (thesis 4.3.2 uses 30 for its KPI)"""
@@ -170,7 +170,7 @@ def start_wandb(run: RunDir) -> "wandb.Run":
         ConfigError: wandb is not installed, or does not know who logs.
     """
     try:
-        import wandb
+        import wandb  # pyright: ignore[reportMissingImports]  # an extra
     except ImportError as error:
         raise ConfigError(
             f"log.wandb: {error}; install it (pip install 'gvizdoom[wandb]') or leave --log.wandb out"
