@@ -19,7 +19,7 @@ def make(task: "str | Task", **options: Any) -> "DoomEnv":
     """The Gymnasium environment of a task.
 
     Args:
-        task: "<scenario>/<attribute>+<attribute>...", for example "defend_the_center/gore+mossy_bricks".
+        task: `<scenario>/<attribute>+<attribute>...`, for example "defend_the_center/gore+mossy_bricks".
         **options: arguments of gvz.env.DoomEnv and fields of gvz.specs.EnvConfig.
     """
     from gvz.env import DoomEnv  # here, so that `import gvz` loads nothing

@@ -40,18 +40,18 @@ _EPISODE_SEEDS = 2**31
 class DoomEnv(gymnasium.Env[Observation, np.int64]):
     """One game of a task.
 
-    Observation: uint8 [H, W, C], the screen as the player sees it; with `config.buffers` a dict of `screen` and of
-        `depth`, `labels` [H, W, 1] and `automap` [H, W, C].
-    Actions: `action_meanings`, each held for `config.frame_skip` game tics.
-    Reward: the sum of `info["reward_components"]`.
-    Termination: the agent died; the final observation is the moment of it. (The buffers are those before it.)
-    Truncation: the time-out, with its true final observation; or the engine crashed (`info["engine_crash"]`), then
-        the last observation is given once more and the reward is 0.
-    Info, each step: score, normalized_score (percent of upper_bound), upper_bound, reward_components, variables
-        (what the agent may see), kills (the engine's count, infighting included), player_kills, episode_frames,
-        episode_seed, engine_crash; with the last one solved_episode (a survival scenario's time-out was reached).
-    Seeds: `reset(seed=n)` seeds the sequence of episodes; each draws its own, `info["episode_seed"]`, and
-        `reset(options={"episode_seed": m})` plays that episode again, alone.
+    - Observation: uint8 [H, W, C], the screen as the player sees it; with `config.buffers` a dict of `screen` and of
+      `depth`, `labels` [H, W, 1] and `automap` [H, W, C].
+    - Actions: `action_meanings`, each held for `config.frame_skip` game tics.
+    - Reward: the sum of `info["reward_components"]`.
+    - Termination: the agent died; the final observation is the moment of it. (The buffers are those before it.)
+    - Truncation: the time-out, with its true final observation; or the engine crashed (`info["engine_crash"]`), then
+      the last observation is given once more and the reward is 0.
+    - Info, each step: score, normalized_score (percent of upper_bound), upper_bound, reward_components, variables
+      (what the agent may see), kills (the engine's count, infighting included), player_kills, episode_frames,
+      episode_seed, engine_crash; with the last one solved_episode (a survival scenario's time-out was reached).
+    - Seeds: `reset(seed=n)` seeds the sequence of episodes; each draws its own, `info["episode_seed"]`, and
+      `reset(options={"episode_seed": m})` plays that episode again, alone.
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": TICS_PER_SECOND}  # noqa: RUF012  Gymnasium's

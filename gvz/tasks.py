@@ -34,7 +34,7 @@ def parse_task(text: str) -> Task:
     """The task with this id.
 
     Args:
-        text: "<scenario>/default", "<scenario>/complete" or "<scenario>/<attribute>+<attribute>...", attributes
+        text: `<scenario>/default`, `<scenario>/complete` or `<scenario>/<attribute>+<attribute>...`, attributes
             in any order.
 
     Raises:
