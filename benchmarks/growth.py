@@ -131,7 +131,7 @@ def _batch(budget: Budget) -> list[Row]:
     def change(config: Any, size: int) -> Any:
         return dataclasses.replace(config, learner=dataclasses.replace(config.learner, batch_size=size))
 
-    values = _updates(budget, (8, 16) if budget.quick else (32, 128, 512, 1024), change)
+    values = _updates(budget, (8, 16) if budget.quick else (32, 128, 1024), change)
     return [
         *_curve("gradient step over the batch", "ms", "transitions in a batch", values, 1e3),
         goal(7, "exponent of a gradient step in its batch", exponent(values), at_most=1 + _SLACK),
@@ -185,7 +185,7 @@ def _actors(budget: Budget) -> list[Row]:
     from gvz.assemble import assemble
 
     cores = len(os.sched_getaffinity(0))
-    counts = (1, 2) if budget.quick else sorted({1, cores // 2 or 1, cores, cores + cores // 2, 2 * cores})
+    counts = (1, 2) if budget.quick else sorted({1, cores, cores + cores // 2, 2 * cores})
     with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
         config = workload.run_config(budget)
         base = workload.random_players(assemble(config, Path(directory)).pool_config)
@@ -211,7 +211,7 @@ def _tasks(budget: Budget) -> list[Row]:
 
     cores, tasks = (1 if budget.quick else len(os.sched_getaffinity(0))), named_tasks()
     env = EnvConfig(action_set="unified")
-    counts = (1, 2) if budget.quick else (1, 8, 24, len(tasks))
+    counts = (1, 2) if budget.quick else (1, 8, len(tasks))
     values: dict[float, list[float]] = {}
     with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
         for count in counts:

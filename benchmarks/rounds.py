@@ -31,7 +31,7 @@ class Budget:
     """interpreter of the peers' virtual environment; what is not installed there is reported as absent"""
 
 
-FULL = Budget(rounds=5, body_s=3.0, quick=False, peers=Path(".venv-peers/bin/python"))
+FULL = Budget(rounds=5, body_s=2.5, quick=False, peers=Path(".venv-peers/bin/python"))
 QUICK = Budget(rounds=1, body_s=0.3, quick=True, peers=Path(".venv-peers/bin/python"))
 
 

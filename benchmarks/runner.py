@@ -80,6 +80,8 @@ def run(name: str, budget: Budget, command: str, out: Path, *, timeout_s: float 
     process = subprocess.Popen(
         [sys.executable, "-m", "benchmarks.runner", name, json.dumps(arguments)],
         cwd=record.ROOT,
+        # a run that a benchmark starts needs room on the GPU beside it
+        env={"XLA_PYTHON_CLIENT_PREALLOCATE": "false", **os.environ},
         start_new_session=True,  # Ctrl-C reaches us alone, and what it starts can be ended as one group
     )
     try:

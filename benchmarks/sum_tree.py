@@ -24,7 +24,9 @@ def measure(budget: Budget) -> list[Row]:
     batches = (32,) if budget.quick else (32, 512) if on_cpu else (32, 256, 512)
     rows: list[Row] = []
     with contextlib.ExitStack() as stack:
-        peer = start_peer("flashbax_tree", budget.peers, str(num_leaves), str(STEPS_PER_CALL))
+        peer = "its goal is on a CPU"
+        if on_cpu:
+            peer = start_peer("flashbax_tree", budget.peers, str(num_leaves), str(STEPS_PER_CALL), JAX_PLATFORMS="cpu")
         bodies: dict[str, Callable[[], float]] = {}
         for batch in batches:
             bodies[f"sum tree, batch {batch}"] = partial(seconds_per_call, _steps(num_leaves, batch), budget.body_s)

@@ -34,12 +34,20 @@ _SETTLE_S = 0.3
 
 
 QUICK: dict[str, dict[str, Any]] = {
-    "agent": {"conv_channels": (4, 4, 4), "hidden_units": 8},
+    "agent": {
+        "conv_channels": (4,),
+        "conv_kernels": (8,),
+        "conv_strides": (8,),
+        "hidden_units": 8,
+        "dueling": False,
+        "distributional": False,
+        "noisy": "off",
+    },
     "replay": {"capacity": 2_000},
     "learner": {"warmup_steps": 100, "batch_size": 8},
     "actors": {"num_actors": 1, "games_per_actor": 4},
 }
-"""what a quick run changes of `rainbow_4task`"""
+"""what a quick run changes of `rainbow_4task`: above all, what takes XLA long to compile"""
 
 
 def four_task_config(budget: Budget) -> "RunConfig":
@@ -57,8 +65,11 @@ def quick_flags(budget: Budget) -> list[str]:
     words = []
     for group, fields in QUICK.items() if budget.quick else ():
         for name, value in fields.items():
-            words.append(f"--{group}.{name.replace('_', '-')}")
-            words += map(str, value if isinstance(value, tuple) else (value,))
+            flag = name.replace("_", "-")
+            if isinstance(value, bool):
+                words.append(f"--{group}.{'' if value else 'no-'}{flag}")
+            else:
+                words += [f"--{group}.{flag}", *map(str, value if isinstance(value, tuple) else (value,))]
     return words
 
 
@@ -150,8 +161,7 @@ class Learner:
         from learner.policy import flatten_params
 
         self.config, self.parts = config, parts
-        init = partial(train_step.init, parts.agent, parts.replay_spec, config.learner)
-        self.state = jax.jit(init)(jax.random.key(0))
+        self.state = train_step.init(parts.agent, parts.replay_spec, config.learner, jax.random.key(0))
         self.replay = filled_replay(parts.replay_spec)
         self._weights = jax.numpy.ones(parts.replay_spec.num_tasks)
         self._train_steps: dict[int, Any] = {}

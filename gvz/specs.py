@@ -1,4 +1,4 @@
-"""The vocabulary of sizes that game, actors and learner share. Imports numpy and the standard library only."""
+"""The vocabulary of sizes that game, actors and learner share. Imports gvz.errors and the standard library only."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -9,6 +9,8 @@ ActionSet = Literal["buttons", "combinations", "unified"]
 Profile = Literal["thesis", "levdoom"]
 Buffer = Literal["depth", "labels", "automap"]
 Interpolation = Literal["linear", "area"]
+SimplePlayer = Literal["random", "idle", "scripted"]
+"""who plays without training"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -15,7 +15,7 @@ def test_help_loads_neither_jax_nor_vizdoom_nor_anything_heavy():
         "import sys; from gvz import cli\n"
         "try: cli.main(['--help'])\n"
         "except SystemExit as end: assert end.code == 0\n"
-        "heavy = ('jax', 'vizdoom', 'cv2', 'PIL', 'gymnasium', 'orbax')\n"
+        "heavy = ('numpy', 'jax', 'vizdoom', 'cv2', 'PIL', 'gymnasium', 'orbax', 'polars', 'matplotlib')\n"
         "print([m for m in heavy if m in sys.modules], file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)

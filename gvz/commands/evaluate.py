@@ -1,5 +1,5 @@
-"""`gvz evaluate`: plays evaluation episodes and prints the scores. Imports gvz.{selection,specs,tasks} and
-gvz.evaluation.players; what plays only once it runs.
+"""`gvz evaluate`: plays evaluation episodes and prints the scores. Imports gvz.{selection,specs}; what plays only
+once it runs.
 """
 
 import dataclasses
@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from gvz.errors import ConfigError
-from gvz.evaluation.players import SimplePlayer
 from gvz.scenarios.base import Task
 from gvz.selection import ALL_TASKS, TaskSelection
-from gvz.specs import EnvConfig, Profile
+from gvz.specs import EnvConfig, Profile, SimplePlayer
 
 if TYPE_CHECKING:
     from gvz.evaluation.play import Entrant, Row

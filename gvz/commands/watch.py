@@ -6,7 +6,6 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import tyro
 
 from gvz.errors import ConfigError, ResourceError
@@ -68,6 +67,8 @@ class Watch:
 
     def _show(self, window: "Window", entrant: "Entrant", task: Task, episode: int) -> None:
         """Plays an episode in the window, unless somebody closes it before."""
+        import numpy as np
+
         from gvz.env import TICS_PER_SECOND
         from gvz.evaluation.performance import perform
         from gvz.evaluation.play import Episode

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 import tyro
 
 from gvz.errors import ConfigError
-from gvz.evaluation.players import SimplePlayer
 from gvz.scenarios.base import Task
-from gvz.specs import EnvConfig, Profile
+from gvz.specs import EnvConfig, Profile, SimplePlayer
 from gvz.tasks import parse_task
 
 if TYPE_CHECKING:

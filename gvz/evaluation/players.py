@@ -4,19 +4,17 @@ actors.preprocess, gvz.evaluation.scripted. The policy of a training run is in g
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Literal, Protocol, assert_never
+from typing import TYPE_CHECKING, Any, Protocol, assert_never
 
 import numpy as np
 
 from actors.preprocess import push_frame, start_stack
 from gvz.evaluation.scripted import ScriptedPlayer
-from gvz.specs import EnvConfig
+from gvz.specs import EnvConfig, SimplePlayer
 
 if TYPE_CHECKING:
     from gvz.env import DoomEnv
     from gvz.observation import Observation
-
-SimplePlayer = Literal["random", "idle", "scripted"]
 
 
 class Player(Protocol):

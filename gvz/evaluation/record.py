@@ -10,9 +10,9 @@ from typing import Any
 
 from gvz.errors import ConfigError
 from gvz.evaluation.play import Entrant, Episode, Row, play
-from gvz.evaluation.players import SIMPLE_PLAYERS, Player, SimplePlayer, player_env
+from gvz.evaluation.players import SIMPLE_PLAYERS, Player, player_env
 from gvz.rundir import RECORDS_SCHEMA, read_records
-from gvz.specs import EnvConfig
+from gvz.specs import EnvConfig, SimplePlayer
 from gvz.tasks import Task, parse_task
 
 

@@ -13,6 +13,7 @@ from gvz.config import load_config
 from gvz.errors import ConfigError
 from gvz.registry import discover
 from gvz.scenarios.base import Split, nearest
+from gvz.specs import SimplePlayer
 from gvz.tasks import Task, named_tasks, scenario_named
 
 SCENARIOS = ("defend_the_center", "health_gathering", "seek_and_kill", "dodge_projectiles")
@@ -23,7 +24,6 @@ EACH_TASK = "each"
 
 EvaluateOn = Literal["own", "test", "all"]
 Columns = Literal["level", "training", "config"]
-PlayerName = Literal["random", "idle", "scripted"]
 
 Published = Mapping[str, Mapping[str, tuple[float, ...]]]
 """who published -> scenario id -> percent of the upper bound, by column of the table"""
@@ -92,7 +92,7 @@ class Experiment:
     """the table is over the last so many checkpoints"""
     columns: Columns
     """of the table"""
-    players: tuple[PlayerName, ...] = ("random",)
+    players: tuple[SimplePlayer, ...] = ("random",)
     """who else plays the evaluation episodes"""
     published: Published = field(default_factory=lambda: MappingProxyType({}))
     """to stand beside the table, never in it"""

@@ -18,9 +18,10 @@ from typing import IO, Any, Protocol
 
 from gvz.config import load_config
 from gvz.experiments import progress
-from gvz.experiments.base import PlayerName, TrainingRun
+from gvz.experiments.base import TrainingRun
 from gvz.experiments.plan import Evaluation
 from gvz.experiments.scale import scaled_settings
+from gvz.specs import SimplePlayer
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -119,7 +120,7 @@ class PlayerJob:
     """Plays the evaluation episodes as a player that needs no training."""
 
     results: Path
-    player: PlayerName
+    player: SimplePlayer
     evaluation: Evaluation
 
     @property

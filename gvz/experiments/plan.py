@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from gvz.errors import ConfigError
-from gvz.experiments.base import Experiment, PlayerName, TrainingRun, experiment_named
+from gvz.experiments.base import Experiment, TrainingRun, experiment_named
 from gvz.experiments.scale import scaled
+from gvz.specs import SimplePlayer
 from gvz.tasks import scenario_named
 
 PLAN_SCHEMA = 1
@@ -99,9 +100,9 @@ class Plan:
                 found[run.id] = before.joined(experiment.evaluation_tasks(run), experiment.episodes)
         return found
 
-    def players(self) -> dict[PlayerName, Evaluation]:
+    def players(self) -> dict[SimplePlayer, Evaluation]:
         """Player -> the episodes that stand beside its experiments' runs."""
-        found: dict[PlayerName, Evaluation] = {}
+        found: dict[SimplePlayer, Evaluation] = {}
         for experiment in self.experiments():
             for run in experiment.runs():
                 for player in experiment.players:
