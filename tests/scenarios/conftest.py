@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -21,18 +22,23 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Callable[[tuple[Job, .
     batches: dict[tuple[Job, ...], dict[Job, dict[str, Any]]] = {}
 
     def play(jobs: tuple[Job, ...]) -> dict[Job, dict[str, Any]]:
-        process = subprocess.run(
+        with subprocess.Popen(
             [sys.executable, str(Path(__file__).with_name("measure.py"))],
-            input=json.dumps(jobs),
-            capture_output=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
             text=True,
-            timeout=60 + 10 * len(jobs),
             env={**os.environ, "GVZ_CACHE_DIR": cache},
-            check=False,
-        )
-        answers = [json.loads(line) for line in process.stdout.splitlines()]
+            start_new_session=True,
+        ) as process:
+            try:
+                out, err = process.communicate(json.dumps(jobs), timeout=60 + 10 * len(jobs))
+            except BaseException:
+                os.killpg(process.pid, signal.SIGKILL)  # the bare engine would outlive its client
+                raise
+        answers = [json.loads(line) for line in out.splitlines()]
         if len(answers) < len(jobs):
-            answers.append({"died": f"{jobs[len(answers)]}: exit {process.returncode}\n{process.stderr[-2000:]}"})
+            answers.append({"died": f"{jobs[len(answers)]}: exit {process.returncode}\n{err[-2000:]}"})
         return dict(zip(jobs, answers, strict=False))
 
     def measurements(jobs: tuple[Job, ...], job: Job) -> dict[str, Any]:
