@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 INTEROP := .venv-interop
 ARGS   ?=
 
-.PHONY: help install install-cuda train test test-fast test-slow test-browser test-interop lint format lock bench bench-micro docs clean
+.PHONY: help install install-cuda train test test-fast test-slow test-browser test-interop pipeline lint format lock bench bench-micro docs clean
 
 help:            ## show this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -33,6 +33,11 @@ test-fast: install ## unit tests that start no engine
 
 test-slow: install ## learning and fault tests that take minutes each
 	$(BIN)/python -m pytest -m slow --timeout 1800 $(ARGS)
+
+pipeline: install ## all four experiments at a thousandth of their size, and their report, in runs/pipeline
+	$(BIN)/gvz experiment run training_difficulty training_set_size algorithm_comparison rainbow_evaluation \
+	  --results runs/pipeline --scale 0.001 --jobs 2
+	$(BIN)/gvz report runs/pipeline --out runs/pipeline/report
 
 test-browser: install ## reports opened in headless Chromium (Debian: apt-get install chromium)
 	$(BIN)/python -m pytest -m browser $(ARGS)
