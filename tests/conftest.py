@@ -9,7 +9,15 @@ import tempfile
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ["XDG_RUNTIME_DIR"] = tempfile.mkdtemp(prefix="gvz-tests-")
-atexit.register(shutil.rmtree, os.environ["XDG_RUNTIME_DIR"], ignore_errors=True)
+
+
+@atexit.register
+def _clean_up() -> None:
+    """Removes what tests that kill with SIGKILL have left, as the next start would; then the records of it."""
+    from gvz import janitor
+
+    janitor.clean_dead_instances()
+    shutil.rmtree(os.environ["XDG_RUNTIME_DIR"], ignore_errors=True)
 
 
 def pytest_configure() -> None:
