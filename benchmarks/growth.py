@@ -189,7 +189,7 @@ def _actors(budget: Budget) -> list[Row]:
     with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
         config = workload.run_config(budget)
         base = workload.random_players(assemble(config, Path(directory)).pool_config)
-        values = {n: _play(budget, dataclasses.replace(base, num_actors=n)) for n in counts}
+        values: dict[float, list[float]] = {n: _play(budget, dataclasses.replace(base, num_actors=n)) for n in counts}
     return [
         *_curve("actor pool over actors", "decisions/s", "actors", values),
         goal(7, "exponent of a decision's time in the actors", exponent(_times(values)), at_most=1 + _SLACK),

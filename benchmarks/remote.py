@@ -99,6 +99,7 @@ class Remote:
     def has_answered(self) -> bool:
         """Whether `answer` would not wait."""
         assert self._process is not None
+        assert self._process.stdout is not None
         return bool(self._buffer or select.select([self._process.stdout], [], [], 0.0)[0])
 
     def __call__(self, **arguments: Any) -> dict[str, Any]:

@@ -105,7 +105,7 @@ def _parts(made: Record) -> Iterator[str]:
             f"| {row['name']} | {cell(row)} | {row['unit']} |" for row in single
         )
     for name, points in curves(made.rows).items():
-        xs = " | ".join(f"{row['x']:,g}" for row in points)
+        xs = " | ".join(f"{row['x']:,.0f}" for row in points)
         values = " | ".join(cell(row) for row in points)
         yield (
             f"| {name}, {points[0]['x_unit']} | {xs} |\n|{'---|' * (len(points) + 1)}\n"

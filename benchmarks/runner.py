@@ -139,7 +139,7 @@ def line(row: rounds.Row) -> str:
     if row["kind"] == "goal":
         bound = f">= {row['at_least']:g}" if row["at_least"] is not None else f"<= {row['at_most']:g}"
         return f"goal {row['number']}, {text}; want {bound}: {'met' if rounds.met(row) else 'missed'}"
-    return text if row["x"] is None else f"{text} at {row['x']:,g} {row['x_unit']}"
+    return text if row["x"] is None else f"{text} at {row['x']:,.0f} {row['x_unit']}"
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import contextlib
 import json
 import shutil
 import signal
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -56,7 +57,14 @@ def measure(budget: Budget) -> list[Row]:
         u / alone_u + d / alone_d
         for (u, d), alone_u, alone_d in zip(together, learner_alone, actors_alone, strict=True)
     ]
-    last_rows = [run["rows"][-1] for run in runs]
+    ages = {
+        name: [
+            summed([row[f"actors/staleness_{name}_versions"] for row in run["rows"][settled:]])
+            * config.learner.publish_period_updates
+            for run in runs
+        ]
+        for name, summed in (("mean", statistics.fmean), ("p95", statistics.median), ("max", max))
+    }
     bill, batch_size = parts.bill.memory_bytes, config.learner.batch_size
     peaks = [run["peak_bytes"] for run in runs]
     on = "" if jax.default_backend() == "cpu" else f" on a {jax.default_backend()}"
@@ -74,14 +82,7 @@ def measure(budget: Budget) -> list[Row]:
         measured("peak of the memory of all processes", "GB", [peak / 1e9 for peak in peaks]),
         measured("memory on the bill", "GB", [bill / 1e9]),
         goal(6, "peak memory off the bill", [abs(p / bill - 1) for p in peaks], at_most=0.1, unit="x"),
-        *(
-            measured(
-                f"age of the acting parameters, {name}",
-                "gradient steps",
-                [row[f"actors/staleness_{name}_versions"] * config.learner.publish_period_updates for row in last_rows],
-            )
-            for name in ("mean", "p95", "max")
-        ),
+        *(measured(f"age of the acting parameters, {name}", "gradient steps", found) for name, found in ages.items()),
     ]
 
 

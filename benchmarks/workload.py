@@ -229,7 +229,9 @@ class Learner:
         from learner import replay
 
         agent, spec, batch_size = direct(self.parts.agent), self.parts.replay_spec, self.config.learner.batch_size
-        batch, _ = jax.eval_shape(lambda s, key: replay.sample(spec, s, key, batch_size, 0.5), self.replay, _key())
+        batch, _ = jax.eval_shape(
+            lambda s, key: replay.sample(spec, s, key, batch_size, 0.5), self.replay, jax.random.key(0)
+        )
 
         def loss(params: Any, batch: replay.Transitions) -> jax.Array:
             return agent.loss(params, params, jax.random.key(0), batch).loss.mean()
@@ -237,18 +239,13 @@ class Learner:
         return flops(jax.grad(loss), self.state.params, batch)
 
 
-def _key() -> Any:
-    import jax
-
-    return jax.random.key(0)
-
-
 def flops(function: Any, *arguments: Any) -> float:
     """Floating-point operations of one call as XLA counts them before it optimizes; arguments may be shapes."""
     import jax
 
     analysis = jax.jit(function).lower(*arguments).cost_analysis()
-    return float((analysis[0] if isinstance(analysis, list) else analysis)["flops"])
+    assert analysis is not None, "every backend of XLA counts operations"
+    return float(analysis["flops"])
 
 
 def direct(agent: "Agent") -> "Agent":
