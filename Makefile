@@ -3,9 +3,10 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 INTEROP := .venv-interop
+PEERS  := .venv-peers
 ARGS   ?=
 
-.PHONY: help install install-cuda train test test-fast test-slow test-browser test-interop pipeline lint format lock bench bench-micro docs clean
+.PHONY: help install install-cuda train test test-fast test-slow test-browser test-interop pipeline lint format lock bench bench-peers bench-micro soak docs clean
 
 help:            ## show this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -64,6 +65,24 @@ bench: install   ## throughput beside limits and peers, 20 minutes on 2 quiet co
 	$(BIN)/python -m benchmarks all --out results/performance $(ARGS)
 	$(BIN)/python -m benchmarks.report
 
+bench-peers: $(PEERS)/.installed $(PEERS)-dopamine/.installed ## the peers of `make bench`, in environments of their own
+
+$(PEERS)/.installed: $(VENV)/.installed benchmarks/peers/requirements.txt
+	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(PEERS)
+	$(BIN)/uv pip install --quiet --python $(PEERS)/bin/python -r benchmarks/peers/requirements.txt
+	$(BIN)/uv pip install --quiet --python $(PEERS)/bin/python --no-deps levdoom==1.0.3
+	@touch $@
+
+$(PEERS)-dopamine/.installed: $(VENV)/.installed benchmarks/peers/requirements-dopamine.txt
+	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(PEERS)-dopamine
+	$(BIN)/uv pip install --quiet --python $(PEERS)-dopamine/bin/python -r benchmarks/peers/requirements-dopamine.txt
+	$(BIN)/uv pip install --quiet --python $(PEERS)-dopamine/bin/python --no-deps baselines==0.1.5
+	@touch $@
+
+soak: install    ## the main job for an hour while its actors are killed; then the page and plot made of it
+	$(BIN)/python -m benchmarks.soak $(ARGS)
+	$(BIN)/python -m benchmarks.soak_report
+
 bench-micro: install ## timed bodies of tests/perf
 	$(BIN)/python -m pytest tests/perf --benchmark-enable $(ARGS)
 
@@ -75,4 +94,4 @@ lock: install    ## resolve requirements.lock anew from pyproject.toml
 	  --no-emit-index-url --no-header --no-annotate --no-emit-package opencv-python --output-file requirements.lock
 
 clean:           ## remove the virtual environment and caches
-	rm -rf $(VENV) $(INTEROP) .pytest_cache .ruff_cache .hypothesis build dist
+	rm -rf $(VENV) $(INTEROP) $(PEERS) $(PEERS)-dopamine .pytest_cache .ruff_cache .hypothesis build dist

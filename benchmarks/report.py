@@ -129,18 +129,24 @@ def write_page(page: str, records: Sequence[Record]) -> str:
     Raises:
         ConfigError: a marker is missing.
     """
-    page = _between(page, "goals", goals_table(records))
+    command = "python -m benchmarks.report"
+    page = between(page, PAGE, "goals", goals_table(records), command)
     for benchmark, _ in GOALS.values():
-        page = _between(page, benchmark, section(records, benchmark))
+        page = between(page, PAGE, benchmark, section(records, benchmark), command)
     return page
 
 
-def _between(page: str, name: str, text: str) -> str:
-    begin, end = f"<!-- {name}: written by `python -m benchmarks.report` -->", f"<!-- end of {name} -->"
+def between(page: str, file: Path, name: str, text: str, command: str) -> str:
+    """A page with `text` between the markers of `name`, which `command` writes.
+
+    Raises:
+        ConfigError: a marker is missing in the page, whose file is `file`.
+    """
+    begin, end = f"<!-- {name}: written by `{command}` -->", f"<!-- end of {name} -->"
     head, found_begin, rest = page.partition(begin)
     _, found_end, tail = rest.partition(end)
     if not found_begin or not found_end:
-        raise ConfigError(f"{PAGE}: the lines {begin!r} and {end!r} are missing; what is measured goes between them")
+        raise ConfigError(f"{file}: the lines {begin!r} and {end!r} are missing; what is measured goes between them")
     return f"{head}{begin}\n\n{text}\n\n{end}{tail}"
 
 

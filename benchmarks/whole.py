@@ -133,7 +133,7 @@ def _peak_memory(pid: int) -> Any:
 
     def watch() -> None:
         while not done.wait(_MEMORY_PERIOD_S):
-            peak[0] = max(peak[0], _tree_bytes(pid))
+            peak[0] = max(peak[0], tree_bytes(pid))
 
     thread = threading.Thread(target=watch)
     thread.start()
@@ -144,7 +144,8 @@ def _peak_memory(pid: int) -> Any:
         thread.join()
 
 
-def _tree_bytes(pid: int) -> int:
+def tree_bytes(pid: int) -> int:
+    """Sum of the proportional set sizes of a process and all below it, bytes."""
     total = 0
     with contextlib.suppress(psutil.NoSuchProcess):
         process = psutil.Process(pid)

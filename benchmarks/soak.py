@@ -1,0 +1,266 @@
+"""The soak: the main job for an hour at full speed while its actors are killed one after the other.
+
+    python -m benchmarks.soak                      # 60 minutes of kills, a kill every 20 s; record, page and plot
+    python -m benchmarks.soak --minutes 2          # shorter: nothing is written but to --out
+
+The run is the real command. Stretches with kills take turns with short ones without, so that the price of the kills is
+a ratio within one run on one machine. Memory, descriptors, shared memory and processes are sampled all the time; at the
+end the run is stopped by SIGTERM, its checkpoint verified, and what it left behind counted. Imports psutil and gvz.
+"""
+
+import contextlib
+import json
+import shlex
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+import tyro
+from rich.console import Console
+
+from benchmarks import record
+from benchmarks.whole import end_run, tree_bytes
+from gvz.rundir import read_records
+
+SCHEMA = 1
+DIRECTORY = record.ROOT / "results" / "reliability"
+SHARED_MEMORY = Path("/dev/shm")
+_START_TIMEOUT_S, _STOP_TIMEOUT_S = 900.0, 120.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Soak:
+    """Run the main job while its actors are killed; record what grows, what is lost, what it costs."""
+
+    minutes: float = 60.0
+    """of kills in all"""
+    kill_every_s: float = 20.0
+    """seconds between two kills; the actors take turns"""
+    stretches: int = 6
+    """the minutes are cut into so many, with an undisturbed one before, between and after them"""
+    undisturbed_minutes: float = 2.0
+    """length of an undisturbed stretch"""
+    sample_s: float = 5.0
+    """seconds between two samples"""
+    out: Path = DIRECTORY / "soak.json"
+    """where the record goes"""
+    flags: tyro.conf.Positional[tuple[str, ...]] = ()
+    """further words for `python -m gvz.launch --config rainbow_4task.py`, after a `--`"""
+
+
+class Watched:
+    """A run of the real command, its actors and what it takes of the machine."""
+
+    def __init__(self, directory: Path, flags: Sequence[str]):
+        self.directory = directory
+        words = ["--config", "rainbow_4task.py", "--run-dir", str(directory), "--log.period-updates", "5", *flags]
+        self.command = [sys.executable, "-m", "gvz.launch", *words]
+        self._output = (directory.parent / "output.log").open("w+b")
+        self.process = subprocess.Popen(self.command, stdout=self._output, stderr=self._output, cwd=record.ROOT)
+        self._root = psutil.Process(self.process.pid)
+
+    def output(self) -> str:
+        """The end of what the command has printed."""
+        self._output.seek(0)
+        return self._output.read().decode(errors="replace")[-4000:]
+
+    def wait_for_updates(self, count: int) -> None:
+        """Waits until metrics.jsonl is past warm-up and `count` updates."""
+        deadline = time.monotonic() + _START_TIMEOUT_S
+        while not (rows := self.metrics()) or rows[-1]["num_updates"] < count:
+            self.check()
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"soak: no {count} updates within {_START_TIMEOUT_S:.0f} s; {self.output()}")
+            time.sleep(0.5)
+
+    def check(self) -> None:
+        """Raises RuntimeError: the run has ended."""
+        if self.process.poll() is not None:
+            raise RuntimeError(f"soak: the run ended with code {self.process.returncode}:\n{self.output()}")
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """Rows of metrics.jsonl so far."""
+        file = self.directory / "metrics.jsonl"
+        return read_records(file)[0] if file.exists() else []
+
+    def actors(self) -> list[psutil.Process]:
+        """Living actor processes, oldest first."""
+        found = []
+        for child in self._root.children(recursive=True):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                if "actors.worker" in child.cmdline() and child.status() != psutil.STATUS_ZOMBIE:
+                    found.append(child)
+        return sorted(found, key=lambda process: process.create_time())
+
+    def sample(self) -> dict[str, float]:
+        """What the run takes now: bytes of memory, counts of descriptors, processes and files in /dev/shm."""
+        mapped = [f for f in SHARED_MEMORY.iterdir() if f.name.startswith(("gvz-", "ViZDoom"))]
+        sizes = []
+        for file in mapped:
+            with contextlib.suppress(FileNotFoundError):
+                sizes.append(file.stat().st_size)
+        return {
+            "learner_bytes": self._root.memory_info().rss,
+            "all_bytes": tree_bytes(self.process.pid),
+            "learner_descriptors": self._root.num_fds(),
+            "processes": 1 + len(self._root.children(recursive=True)),
+            "shared_memory_files": len(sizes),
+            "shared_memory_bytes": sum(sizes),
+        }
+
+
+def soak(options: Soak, console: Console) -> dict[str, Any]:
+    """Runs it all; returns the record."""
+    started = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
+    machine, commit = record.machine(), record.commit()
+    with tempfile.TemporaryDirectory(prefix="gvz-soak-") as directory:
+        run = Watched(Path(directory) / "run", options.flags)
+        samples: list[dict[str, float]] = []
+        kills: list[float] = []
+        stretches: list[dict[str, Any]] = []
+        try:
+            run.wait_for_updates(20)
+            console.print(f"warm; {options.minutes:g} minutes of kills begin")
+            begin = time.time()
+            for kind, seconds in _plan(options):
+                stretch = {"kind": kind, "begin_s": time.time() - begin}
+                for now in _ticks(seconds, options.sample_s):
+                    run.check()
+                    samples.append({"time_s": round(time.time() - begin, 1), **run.sample()})
+                    due = kind == "kills" and now >= options.kill_every_s * (_killed_since(kills, stretch) + 1)
+                    if due and (actors := run.actors()):
+                        actors[0].kill()  # the one that has lived longest, so that they take turns
+                        kills.append(round(time.time() - begin, 1))
+                stretches.append({**stretch, "end_s": time.time() - begin})
+                console.print(f"{(time.time() - begin) / 60:5.1f} min  {kind:11} {len(kills)} kills so far")
+            run.process.send_signal(signal.SIGTERM)
+            code = run.process.wait(_STOP_TIMEOUT_S)
+        finally:
+            end_run(run.process)
+        rows, problems = read_records(run.directory / "metrics.jsonl")
+        faults, _ = read_records(run.directory / "faults.jsonl")
+        for stretch in stretches:
+            stretch["updates_per_s"] = _rate(rows, begin, stretch)
+        return {
+            "schema": SCHEMA,
+            "date": started,
+            "commit": commit,
+            "command": "python -m benchmarks.soak " + shlex.join(_words(options)),
+            "machine": machine,
+            "versions": record.versions(),
+            "settings": {**asdict(options), "out": None, "flags": list(options.flags)},
+            "kills": kills,
+            "stretches": [{k: v if k == "kind" else round(v, 3) for k, v in s.items()} for s in stretches],
+            "samples": {name: [sample[name] for sample in samples] for name in samples[0]},
+            "faults": _count(fault["kind"] for fault in faults),
+            "restarts": int(rows[-1]["actors/restarts"]),
+            "updates": rows[-1]["num_updates"],
+            "exit_code": code,
+            "damaged_rows": len(problems),
+            "sequence_errors": run.output().count("TransportError"),
+            "left_behind": run_leftovers(run.process.pid),
+        }
+
+
+def summary(made: dict[str, Any]) -> dict[str, float]:
+    """The figures that the promises are about: ratios of the last to the first fifth, and of killed to undisturbed."""
+    samples = made["samples"]
+    fifth = max(1, len(samples["time_s"]) // 5)
+    grown = {
+        name: statistics.median(samples[name][-fifth:]) / statistics.median(samples[name][:fifth])
+        for name in samples
+        if name != "time_s"
+    }
+    killed, undisturbed = (
+        statistics.fmean(s["updates_per_s"] for s in made["stretches"] if s["kind"] == kind)
+        for kind in ("kills", "undisturbed")
+    )
+    return {**grown, "updates_per_s": killed / undisturbed}
+
+
+def run_leftovers(pid: int) -> list[str]:
+    """Segments of a run that has ended, by its process id, and of engines that no process has mapped."""
+    mapped = ""
+    for process in psutil.process_iter():
+        with contextlib.suppress(OSError):
+            mapped += Path(f"/proc/{process.pid}/maps").read_text()
+    left = [f.name for f in SHARED_MEMORY.iterdir() if f.name.startswith((f"gvz-{pid}-", "ViZDoom"))]
+    return sorted(name for name in left if f"/dev/shm/{name}" not in mapped)
+
+
+def _plan(options: Soak) -> Iterator[tuple[str, float]]:
+    """Kinds and seconds of the stretches, in order."""
+    quiet = ("undisturbed", options.undisturbed_minutes * 60)
+    for _ in range(options.stretches):
+        yield quiet
+        yield "kills", options.minutes * 60 / options.stretches
+    yield quiet
+
+
+def _ticks(seconds: float, period_s: float) -> Iterator[float]:
+    """Seconds since the first tick, one every `period_s`, for `seconds`."""
+    start = time.monotonic()
+    number = 0
+    while (now := time.monotonic() - start) < seconds:
+        yield now
+        number += 1
+        time.sleep(max(0.0, start + number * period_s - time.monotonic()))
+
+
+def _killed_since(kills: Sequence[float], stretch: dict[str, Any]) -> int:
+    return sum(kill >= stretch["begin_s"] for kill in kills)
+
+
+def _rate(rows: Sequence[dict[str, Any]], begin: float, stretch: dict[str, Any]) -> float:
+    """Gradient steps a second between the first and the last row of a stretch."""
+    mine = [r for r in rows if stretch["begin_s"] <= r["time_s"] - begin <= stretch["end_s"]]
+    if len(mine) < 2:
+        raise RuntimeError(
+            f"soak: a stretch has {len(mine)} rows of metrics, want 2 or more; make the stretches longer"
+        )
+    return (mine[-1]["num_updates"] - mine[0]["num_updates"]) / (mine[-1]["time_s"] - mine[0]["time_s"])
+
+
+def _count(kinds: Iterator[str]) -> dict[str, int]:
+    counts: dict[str, int] = {}
+    for kind in kinds:
+        counts[kind] = counts.get(kind, 0) + 1
+    return counts
+
+
+def _words(options: Soak) -> list[str]:
+    """The options that are not at their defaults, as words of the command line."""
+    default = Soak()
+    words = []
+    for name, value in asdict(options).items():
+        if name not in ("out", "flags") and value != getattr(default, name):
+            words += [f"--{name.replace('_', '-')}", f"{value:g}"]
+    return [*words, *(["--", *options.flags] if options.flags else [])]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command; returns the exit code: 0 nothing lost or left, 1 something was."""
+    options = tyro.cli(Soak, args=arguments, prog="python -m benchmarks.soak")
+    console = Console(stderr=True)
+    made = soak(options, console)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(json.dumps(made) + "\n")
+    for name, ratio in summary(made).items():
+        console.print(f"{name}: {ratio:.3f}")
+    console.print(
+        f"{len(made['kills'])} kills, {made['restarts']} restarts, left behind: {made['left_behind'] or 'nothing'}"
+    )
+    good = made["exit_code"] == 128 + signal.SIGTERM and not made["left_behind"] and not made["sequence_errors"]
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,122 @@
+"""docs/RELIABILITY.md from the committed record of the soak: its table, between markers, and its plot.
+
+    python -m benchmarks.soak_report
+
+Imports benchmarks.{record,report,soak}; matplotlib only to draw.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from benchmarks import record
+from benchmarks.report import between
+from benchmarks.soak import DIRECTORY, SCHEMA, summary
+from gvz.errors import ConfigError
+
+PAGE = record.ROOT / "docs" / "RELIABILITY.md"
+PLOT = record.ROOT / "docs" / "images" / "reliability_soak.png"
+_GROWS = {
+    "learner_bytes": "resident memory of the learner",
+    "all_bytes": "memory of all processes (proportional set size)",
+    "learner_descriptors": "file descriptors of the learner",
+    "processes": "processes",
+    "shared_memory_files": "files in /dev/shm",
+    "shared_memory_bytes": "bytes in /dev/shm",
+}
+
+
+def read(file: Path = DIRECTORY / "soak.json") -> dict[str, Any]:
+    """The record.
+
+    Raises:
+        ConfigError: it is not there, or of another schema.
+    """
+    try:
+        made = json.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{file}: no record of a soak ({error}); `make soak` makes one") from error
+    if not isinstance(made, dict) or made.get("schema") != SCHEMA:
+        raise ConfigError(f"{file}: want a record of schema {SCHEMA}; `make soak` makes one")
+    return made
+
+
+def table(made: dict[str, Any]) -> str:
+    """What was done, what it cost, what grew, what was lost."""
+    ratios, machine = summary(made), made["machine"]
+    minutes = sum(s["end_s"] - s["begin_s"] for s in made["stretches"] if s["kind"] == "kills") / 60
+    rates = {
+        kind: ", ".join(f"{s['updates_per_s']:.2f}" for s in made["stretches"] if s["kind"] == kind)
+        for kind in ("undisturbed", "kills")
+    }
+    lines = [
+        f"*{made['date']} UTC, commit {made['commit']}, `{made['command']}`; {machine['cpu']}, {machine['cores']} cores.*",
+        "",
+        "| | |",
+        "|---|---|",
+        f"| actors killed (SIGKILL) | {len(made['kills'])} in {minutes:.0f} minutes |",
+        f"| restarts counted by the run | {made['restarts']} |",
+        f"| gradient steps | {made['updates']:,} |",
+        f"| records lost, repeated or torn | {made['sequence_errors']} |",
+        f"| damaged rows in the records | {made['damaged_rows']} |",
+        f"| gradient steps/s, undisturbed stretches | {rates['undisturbed']} |",
+        f"| gradient steps/s, stretches with kills | {rates['kills']} |",
+        f"| with kills / undisturbed | {ratios['updates_per_s']:.3f} |",
+        *(f"| {text}, last fifth / first fifth | {ratios[name]:.3f} |" for name, text in _GROWS.items()),
+        f"| exit code after SIGTERM | {made['exit_code']} |",
+        f"| left behind | {', '.join(made['left_behind']) or 'nothing'} |",
+        "",
+        f"![memory, descriptors, shared memory, processes and gradient steps/s over the soak](images/{PLOT.name})",
+    ]
+    return "\n".join(lines)
+
+
+def draw(made: dict[str, Any], out: Path) -> None:
+    """A panel for each thing that must stay flat, the kills as ticks, and the rates of the stretches."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    minutes = [s / 60 for s in made["samples"]["time_s"]]
+    panels = {
+        "memory, GB": {"learner": ("learner_bytes", 1e9), "all processes": ("all_bytes", 1e9)},
+        "descriptors, processes, files": {
+            "learner's descriptors": ("learner_descriptors", 1),
+            "processes": ("processes", 1),
+            "files in /dev/shm": ("shared_memory_files", 1),
+        },
+    }
+    figure, all_axes = plt.subplots(3, 1, figsize=(9.0, 7.0), sharex=True, layout="constrained")
+    for axes, (label, curves) in zip(all_axes, panels.items(), strict=False):
+        for name, (column, unit) in curves.items():
+            axes.plot(minutes, [value / unit for value in made["samples"][column]], label=name, linewidth=1)
+        axes.set(ylabel=label, ylim=(0, None))
+        axes.legend(loc="lower right", fontsize=8)
+    for stretch in made["stretches"]:
+        colour = "C3" if stretch["kind"] == "kills" else "C2"
+        ends = [stretch["begin_s"] / 60, stretch["end_s"] / 60]
+        all_axes[2].plot(ends, [stretch["updates_per_s"]] * 2, color=colour, linewidth=3)
+    all_axes[2].vlines([kill / 60 for kill in made["kills"]], 0, 0.05, transform=all_axes[2].get_xaxis_transform())
+    all_axes[2].set(xlabel="minutes (ticks: kills)", ylabel="gradient steps/s\ngreen: undisturbed", ylim=(0, None))
+    figure.savefig(out, dpi=110, metadata={"Software": None})
+    plt.close(figure)
+
+
+def main() -> int:
+    """Writes page and plot; returns the exit code."""
+    try:
+        made = read()
+        PAGE.write_text(between(PAGE.read_text(), PAGE, "soak", table(made), "python -m benchmarks.soak_report"))
+    except ConfigError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    draw(made, PLOT)
+    for file in (PAGE, PLOT):
+        print(file.relative_to(record.ROOT))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
