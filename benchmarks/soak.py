@@ -1,7 +1,7 @@
 """The soak: the main job for an hour at full speed while its actors are killed one after the other.
 
     python -m benchmarks.soak                      # 60 minutes of kills, a kill every 20 s; record, page and plot
-    python -m benchmarks.soak --minutes 2          # shorter: nothing is written but to --out
+    python -m benchmarks.soak --minutes 6 --stretches 1 --out /tmp/soak.json
 
 The run is the real command. Stretches with kills take turns with short ones without, so that the price of the kills is
 a ratio within one run on one machine. Memory, descriptors, shared memory and processes are sampled all the time; at the

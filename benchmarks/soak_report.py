@@ -51,7 +51,8 @@ def table(made: dict[str, Any]) -> str:
         for kind in ("undisturbed", "kills")
     }
     lines = [
-        f"*{made['date']} UTC, commit {made['commit']}, `{made['command']}`; {machine['cpu']}, {machine['cores']} cores.*",
+        f"*{made['date']} UTC, commit {made['commit']}, `{made['command']}`; "
+        f"{machine['cpu']}, {machine['cores']} cores.*",
         "",
         "| | |",
         "|---|---|",
