@@ -57,11 +57,6 @@ class Finding:
     """what to do about it, if anything"""
 
 
-def examine() -> list[Finding]:
-    """Runs all checks, in the order of what depends on what."""
-    return [check() for check in CHECKS]
-
-
 def check_python() -> Finding:
     """The interpreter."""
     found = f"{platform.python_version()} at {sys.executable}"
@@ -201,6 +196,7 @@ CHECKS: tuple[Callable[[], Finding], ...] = (
     *(check_system, check_python, check_packages, check_cores, check_memory, check_shared_memory),
     *(check_temporary_directory, check_cache, check_leftovers, check_engine, check_devices, check_video),
 )
+"""in the order of what depends on what"""
 
 
 def _try(name: str, code: str, remedy: str) -> Finding:

@@ -1,6 +1,7 @@
 """The run directory: its paths, its lock, its records. Reports read records, never checkpoints.
 
-    config.json  checkpoints/  metrics.jsonl  episodes.jsonl  faults.jsonl  tensorboard/  work/ (logs of the actors)
+    config.json  checkpoints/  metrics.jsonl  episodes.jsonl  faults.jsonl  starts.jsonl  tensorboard/
+    work/ (logs of the actors)
 
 The directory is private to its user. Records are JSON lines, flushed row by row; their lengths stand in every
 checkpoint, so that a resumed run drops (into `discarded/`) what a killed one wrote after its last checkpoint.
@@ -24,6 +25,8 @@ RECORDS_SCHEMA = 1
 """Stands in every row as `schema`; raised by one when a row's meaning changes."""
 
 RECORD_FILES = ("metrics.jsonl", "episodes.jsonl", "faults.jsonl")
+START_RECORDS = "starts.jsonl"
+"""A row for every start of the run: machine, versions, commit. Never cut back."""
 
 
 class RunDir:

@@ -20,13 +20,13 @@ import numpy as np
 
 from actors.inline import InlinePool
 from actors.pool import STOP_TIMEOUT_S, ActorPool
-from gvz import bill, janitor
+from gvz import bill, janitor, machine
 from gvz.assemble import Parts, Pool, assemble
 from gvz.cache import xla_cache_directory
 from gvz.config import RunConfig
 from gvz.errors import WaitTimeoutError, WorkerError
 from gvz.progress import Progress, Status
-from gvz.rundir import RunDir
+from gvz.rundir import START_RECORDS, RunDir
 from gvz.stop import StopRequest
 from gvz.telemetry import Rates, Telemetry
 from gvz.transport.messages import EpisodeStats, Fault, ParamsHeader
@@ -359,6 +359,8 @@ def train(config: RunConfig, run: RunDir) -> int:
             progress.say(f"run in {run.path} goes on from update {restored.num_updates}")
             run.truncate_records(restored.host["records"])
         run.write_config(config)
+        started_from = 0 if restored is None else restored.num_updates
+        run.append(START_RECORDS, {"num_updates": started_from, "time_s": time.time(), **machine.describe()})
         trainer = Trainer(config, run, parts, progress, restored)
         del restored
         with contextlib.closing(trainer):

@@ -26,14 +26,13 @@ def layout_hash(params: Params) -> int:
     return int.from_bytes(hashlib.blake2b(repr(layout).encode(), digest_size=8).digest(), "little")
 
 
-def export_policy(agent: Agent, template: Params, batch_size: int, *, explore: bool = True) -> bytes:
+def export_policy(agent: Agent, template: Params, batch_size: int) -> bytes:
     """Serializes the acting function for a CPU.
 
     Args:
         agent: whose acting function.
         template: parameters (values do not matter) or their ShapeDtypeStructs.
         batch_size: games acted on in one call.
-        explore: True acts with noise and epsilon, False greedily with both ignored.
 
     Returns:
         Bytes for `jax.export.deserialize`; `.call` takes (the parameters' leaves as a list, obs u8[B, H, W, C],
@@ -44,8 +43,6 @@ def export_policy(agent: Agent, template: Params, batch_size: int, *, explore: b
 
     def policy(leaves: list[Array], obs: Array, task: Array, key_data: Array, epsilon: Array) -> Array:
         params = jax.tree.unflatten(treedef, leaves)
-        if not explore:
-            return agent.evaluate(params, obs, task).action.astype(jnp.int32)
         key = jax.random.wrap_key_data(key_data, impl="threefry2x32")
         return agent.act(params, key, obs, task, epsilon)
 

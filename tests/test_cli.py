@@ -1,8 +1,10 @@
 """The gvz command: quick to start, resumable, one clear message for bad input."""
 
 import json
+import os
 import subprocess
 import sys
+from importlib.metadata import version
 
 import pytest
 
@@ -22,6 +24,34 @@ def test_help_loads_neither_jax_nor_vizdoom_nor_anything_heavy():
     assert done.stderr.strip() == "[]"
     for command in discover("gvz.commands"):
         assert f"• {command} " in done.stdout
+
+
+def test_a_reader_that_has_enough_is_no_error():
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "gvz.cli", "tasks"]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, timeout=120, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_help_of_a_command_says_all_that_the_overview_leaves_out(capsys):
+    told = []
+    for arguments in (["--help"], ["evaluate", "--help"]):
+        with pytest.raises(SystemExit, match=r"^(0|None)$"):
+            cli.main(arguments)
+        told.append(capsys.readouterr().out)
+    overview, evaluate = told
+    assert "Play evaluation episodes and append a row" in " ".join(overview.split())
+    assert "Episode n of a task has the same seed" not in overview
+    assert "Episode n of a task has the same seed" in evaluate
+    assert "RUN_DIR" in evaluate
+    assert "None" not in evaluate.replace("(default: None)", "")
+
+
+def test_it_says_its_version(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"gvizdoom {version('gvizdoom')}\n"
 
 
 def test_tasks_lists_all_named_tasks(capsys):

@@ -1,19 +1,35 @@
-"""The Python examples in the README and in docs/ run as they stand."""
+"""The Python examples in the README and in docs/ run as they stand; commands there have the flags they are given."""
 
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from gvz import cli, launch
+
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("**/*.md"))]
+RECORDS = sorted((ROOT / "results").glob("*/README.md"))
 EXAMPLES = [
     pytest.param(block, id=f"{page.name}-{number}")
     for page in PAGES
     for number, block in enumerate(re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL))
 ]
+
+
+def command_lines(page: Path) -> list[list[str]]:
+    """The lines of the page's shell blocks as words, without comments, redirections, and variables set before them."""
+    lines = []
+    for block in re.findall(r"```bash\n(.*?)```", page.read_text(), flags=re.DOTALL):
+        for line in block.replace("\\\n", " ").splitlines():
+            words = shlex.split(line.partition(" > ")[0], comments=True)
+            while words and re.fullmatch(r"[A-Z_]+=.*", words[0]):
+                del words[0]
+            lines.append(words)
+    return [words for words in lines if words]
 
 
 @pytest.mark.engine
@@ -24,6 +40,20 @@ def test_an_example_runs(example, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert not list(tmp_path.glob("_vizdoom*"))
+
+
+@pytest.mark.parametrize("page", [*PAGES, *RECORDS], ids=lambda page: f"{page.parent.name}/{page.name}")
+def test_commands_have_the_flags_they_are_given(page):
+    """Parsed, not run."""
+    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
+    for words in command_lines(page):
+        if words[0] == "make":
+            assert words[1] in targets
+        train = 2 if words[:2] == ["gvz", "train"] else 3 if words[:3] == ["python", "-m", "gvz.launch"] else None
+        if train is not None and "--help" not in words:
+            launch.parse(words[train:])
+        elif train is None and words[0] == "gvz":
+            cli.parse(words[1:])
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -21,6 +21,7 @@ TIER_3 = (
     "gvz.experiments",
     "gvz.gallery",
     "gvz.launch",
+    "gvz.machine",
     "gvz.progress",
     "gvz.reports",
     "gvz.rundir",

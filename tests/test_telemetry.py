@@ -1,18 +1,19 @@
 """What a real run writes about itself is documented, and the same everywhere. (Weights & Biases: tests/interop.)"""
 
+import json
 import re
-import struct
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from tensorboardX.proto.event_pb2 import Event
 
+from gvz import machine
 from gvz.config import load_config
 from gvz.errors import ConfigError
 from gvz.rundir import RunDir, read_records
 from gvz.telemetry import Telemetry
+from tests.tensorboard_events import read_events
 
 METRICS_PAGE = Path(__file__).parent.parent / "docs" / "reference" / "metrics.md"
 TASKS = ("defend_the_center/default", "defend_the_center/gore")
@@ -39,16 +40,11 @@ def scalars_of(row: dict) -> dict[str, float]:
 
 
 def tensorboard_scalars(directory: Path) -> dict[int, dict[str, float]]:
-    """Gradient steps -> scalars, from the event file: length u64, its checksum u32, the event, its checksum u32."""
+    """Gradient steps -> scalars."""
     found: dict[int, dict[str, float]] = {}
-    (file,) = directory.glob("events*")
-    data, at = file.read_bytes(), 0
-    while at < len(data):
-        (length,) = struct.unpack_from("<Q", data, at)
-        event = Event.FromString(data[at + 12 : at + 12 + length])
+    for event in read_events(directory):
         for value in event.summary.value:
             found.setdefault(event.step, {})[value.tag] = value.simple_value
-        at += 16 + length
     return found
 
 
@@ -72,6 +68,18 @@ def test_tensorboard_has_the_scalars_of_the_records(run_dir):
     assert list(events) == [row["num_updates"] for row in rows] == [10, 20]
     for row in rows:
         assert events[row["num_updates"]] == pytest.approx(scalars_of(row), rel=1e-6, nan_ok=True)
+
+
+@pytest.mark.engine
+@pytest.mark.e2e
+@pytest.mark.timeout(600)
+def test_a_run_says_on_what_it_was_started(run_dir):
+    ([row], problems) = read_records(run_dir / "starts.jsonl")
+    assert problems == []
+    assert row["num_updates"] == 0
+    told = {name: value for name, value in row.items() if name not in ("schema", "num_updates", "time_s")}
+    assert told == {**json.loads(json.dumps(machine.describe())), "commit": told["commit"]}
+    assert told["commit"] is None or re.fullmatch(r"[0-9a-f]{12}(\+changes)?", told["commit"])
 
 
 @pytest.mark.engine

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 from dataclasses import dataclass
 
 
@@ -23,7 +24,8 @@ class Doctor:
 
         if self.clean:
             for line in janitor.clean_dead_instances():
-                print(f"removed {line}" if not line.startswith("left alone") else line)
+                done = line if line.startswith("left alone") else f"removed {line}"
+                print(done, file=sys.stderr if self.json else sys.stdout)
         bad = 0
         for check in doctor.CHECKS:
             finding = check()

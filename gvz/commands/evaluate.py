@@ -3,6 +3,7 @@ once it runs.
 """
 
 import dataclasses
+import json
 import os
 import signal
 import sys
@@ -38,7 +39,9 @@ class Evaluate:
               gvz evaluate --player random --scenario seek_and_kill
     """
 
-    run_dirs: tyro.conf.Positional[tuple[Path, ...]] = ()
+    run_dirs: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[RUN_DIR ...]", help_behavior_hint="")
+    ] = ()
     """run directories: their policies play greedily, noise off; by default the test tasks of their scenario"""
     player: SimplePlayer | None = None
     """random: uniformly random buttons; idle: presses nothing; scripted: the scenario's simple script"""
@@ -57,6 +60,8 @@ class Evaluate:
     """rules of the tasks (a run keeps the rules it was trained by)"""
     workers: int | None = None
     """processes; default one per CPU core"""
+    json: bool = False
+    """print the scores as JSON, an object a line, instead of a table"""
 
     def run(self) -> int:
         """Plays what the record files do not hold yet, with a progress bar, and prints the scores."""
@@ -113,12 +118,18 @@ class Evaluate:
         return found
 
     def _print_scores(self, entrant: "Entrant", tasks: Sequence[Task], rows: "Sequence[Row]") -> None:
-        from gvz.evaluation.table import score_lines
+        from gvz.evaluation.table import score_lines, score_row, scores
 
+        player = entrant.identity["player"]
         for base_seed in self.seeds:
             chosen = [row for row in rows if row.get("base_seed", 0) == base_seed]
-            print(entrant.identity["player"] + (f", base seed {base_seed}" if base_seed else ""))
-            print("\n".join(score_lines(chosen, entrant.identity, tasks, self.episodes)))
+            found = scores(chosen, entrant.identity, tasks, self.episodes)
+            if self.json:
+                for one in found:
+                    print(json.dumps({"player": player, "base_seed": base_seed, **score_row(one)}))
+            else:
+                print(player + (f", base seed {base_seed}" if base_seed else ""))
+                print("\n".join(score_lines(found)))
 
 
 COMMAND = Evaluate

@@ -1,5 +1,7 @@
 """`gvz experiment list | plan | run | status`: the experiments of gvz/experiments. Imports them once it runs."""
 
+import dataclasses
+import json
 import os
 import sys
 from collections import Counter
@@ -28,12 +30,20 @@ DEFAULT_RESULTS = Path("runs/experiments")
 class List:
     """List the experiments: what they ask, how many runs they have."""
 
+    json: bool = False
+    """one JSON object a line instead of text"""
+
     def run(self) -> int:
         """Prints them."""
         from gvz.experiments.base import experiments
 
         for experiment in experiments().values():
             runs = experiment.runs()
+            if self.json:
+                names = ("name", "title", "question", "source", "configs", "scenarios", "trainings", "seeds")
+                row = {name: getattr(experiment, name) for name in names}
+                print(json.dumps({**row, "runs": len(runs), "total_updates": experiment.total_updates}))
+                continue
             print(f"{experiment.name}: {experiment.question}")
             print(f"    {experiment.source}")
             grid = (experiment.configs, experiment.scenarios, experiment.trainings, map(str, experiment.seeds))
@@ -46,7 +56,9 @@ class List:
 class Ask:
     """What is asked for."""
 
-    names: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="NAME ...")] = ()
+    names: Annotated[
+        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="NAME ...", help_behavior_hint="")
+    ] = ()
     """experiments; gvz experiment list shows them"""
     results: Path = DEFAULT_RESULTS
     """results directory: runs/ players/ logs/ plan.json"""
@@ -82,6 +94,8 @@ class PlanCommand:
     ask: Annotated[Ask, tyro.conf.arg(name="")] = Ask()
     measure: bool = False
     """measure the rates again"""
+    json: bool = False
+    """one JSON object a line for each run of the shard, instead of tables"""
 
     def run(self) -> int:
         """Measures what is not known yet, then prints."""
@@ -98,6 +112,11 @@ class PlanCommand:
         evaluations = plan.evaluations()
         costs = {run.id: run_cost(run, evaluations[run.id], plan.scale, rates[run.config]) for run in plan.runs()}
         mine = shard(plan.runs(), index, count)
+        if self.json:
+            for run in mine:
+                names = [e.name for e in plan.experiments() if run in e.runs()]
+                print(json.dumps({"run": run.id, "experiments": names, **dataclasses.asdict(costs[run.id])}))
+            return 0
         rows = [(run.id, costs[run.id]) for run in mine]
         _print_costs([*rows, (f"{len(mine)} runs", sum((cost for _, cost in rows), Cost()))])
         print()
@@ -146,6 +165,8 @@ class Status:
     """results directory"""
     shard: str = "1/1"
     """i/n: only the jobs of this shard"""
+    json: bool = False
+    """one JSON object a line for each job, instead of text"""
 
     def run(self) -> int:
         """Reads logs and records."""
@@ -160,11 +181,15 @@ class Status:
             outlook = job.outlook()
             state = progress.job_state(self.results, job.id, done=outlook.next is None, begun=outlook.begun)
             states[state] += 1
+            log = progress.log_file(self.results, job.id)
+            if self.json:
+                print(json.dumps({"job": job.id, "state": state, "progress": outlook.text, "log": str(log)}))
+                continue
             print(f"{state:8} {job.id}: {outlook.text}")
             if state == "failed":
-                log = progress.log_file(self.results, job.id)
                 print("\n".join([f"{'':8}     {log}", *(f"{'':8}     {line}" for line in progress.last_words(log))]))
-        print(f"{', '.join(plan.names)}, scale {plan.scale:g}: {', '.join(f'{n} {s}' for s, n in states.items())}")
+        if not self.json:
+            print(f"{', '.join(plan.names)}, scale {plan.scale:g}: {', '.join(f'{n} {s}' for s, n in states.items())}")
         return 1 if states["failed"] else 0
 
 

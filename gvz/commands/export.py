@@ -5,7 +5,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -25,7 +25,9 @@ class Export:
     Example: gvz export runs/rainbow_4task/seed_* --format parquet --out tables
     """
 
-    run_dirs: tyro.conf.Positional[tuple[Path, ...]]
+    run_dirs: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN_DIR ...", help_behavior_hint="")
+    ]
     """run directories of the trainer"""
     format: Literal["csv", "parquet"] = "csv"
     """csv, or parquet, which keeps the types"""

@@ -39,16 +39,20 @@ class Record:
     cast: Annotated[Cast, tyro.conf.arg(name="")] = UNCAST
     seconds: float | None = None
     """of game time, from the episode's start; default all of it (.gif, .webp: at most 20)"""
+    tensorboard: bool = False
+    """show the .gif in TensorBoard, too, among the run's images"""
 
     def run(self) -> int:
         """Plays and writes; says how the episode ended."""
         from gvz.env import TICS_PER_SECOND
         from gvz.evaluation.performance import perform
         from gvz.evaluation.play import Episode
-        from gvz.evaluation.video import check_video_file, write_video
+        from gvz.evaluation.video import add_to_tensorboard, check_video_file, write_video
 
         if self.seconds is not None and self.seconds <= 0:
             raise ConfigError(f"--seconds: got {self.seconds:g}, want more than 0")
+        if self.tensorboard and (self.out.suffix != ".gif" or self.cast.run_dir is None):
+            raise ConfigError("--tensorboard: want a run directory and an --out that ends with .gif, which it can show")
         check_video_file(self.out)
         entrant, task = self.cast.resolve()
         panel, every_tic = make_panel(entrant, task), self.out.suffix == ".mp4"
@@ -76,6 +80,9 @@ class Record:
         except KeyboardInterrupt:
             print("interrupted; nothing was written", file=sys.stderr)
             return EXIT_INTERRUPTED
+        if self.tensorboard and self.cast.run_dir is not None:
+            events = self.cast.run_dir / "tensorboard" / "episodes"
+            add_to_tensorboard(self.out, events, f"episode/{task.id}", entrant.identity["num_updates"])
         [last] = shown
         how = "died" if last.terminated else "reached the time-out" if last.truncated else "was cut off"
         print(f"{self.out}: {entrant.identity['player']} {how} at tic {last.frames}, score {last.score:g}")

@@ -3,6 +3,7 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -16,7 +17,9 @@ class Report:
     Example: gvz report results/quick --out report
     """
 
-    results: tyro.conf.Positional[tuple[Path, ...]]
+    results: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RESULTS ...", help_behavior_hint="")
+    ]
     """results of `gvz experiment run`, run directories, or record files of `gvz evaluate`; any number of them"""
     out: Path = Path("report")
     """directory to write to"""

@@ -4,7 +4,7 @@ what plays once it is asked for.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 class Cast:
     """A player, a task, an episode."""
 
-    run_dir: tyro.conf.Positional[Path | None] = None
+    run_dir: Annotated[
+        tyro.conf.Positional[Path | None],
+        tyro.conf.arg(metavar="[RUN_DIR]", help_behavior_hint=""),
+    ] = None
     """a run directory: its policy plays greedily, noise off"""
     player: SimplePlayer | None = None
     """instead: random, idle, or the scenario's simple script"""

@@ -16,7 +16,7 @@ import polars as pl
 
 from gvz.errors import ConfigError, TaskError
 from gvz.evaluation.metrics import normalize
-from gvz.rundir import RECORD_FILES, read_records
+from gvz.rundir import RECORD_FILES, START_RECORDS, read_records
 from gvz.specs import Profile
 from gvz.tasks import Task, parse_task
 
@@ -130,7 +130,7 @@ def evaluation_files(paths: Iterable[Path | str]) -> list[Path]:
 
 
 def _may_be_evaluation(file: Path) -> bool:
-    training = {name.removesuffix(".jsonl") for name in RECORD_FILES}
+    training = {name.removesuffix(".jsonl") for name in (*RECORD_FILES, START_RECORDS)}
     return (
         file.name.endswith(SUFFIXES)
         and file.name.partition(".")[0] not in training

@@ -1,4 +1,7 @@
-"""Pictures to a video file: H.264 in MP4 by PyAV, animated GIF and WebP by Pillow. Imports pillow; av to write MP4."""
+"""Pictures to a video file: H.264 in MP4 by PyAV, animated GIF and WebP by Pillow; a GIF to TensorBoard.
+
+Imports pillow; av to write MP4, tensorboardX to write events.
+"""
 
 import importlib.util
 from collections.abc import Iterable, Iterator
@@ -49,6 +52,26 @@ def write_video(file: Path, pictures: Iterable[Image.Image], rate: Fraction) -> 
         writing.replace(file)
     finally:
         writing.unlink(missing_ok=True)
+
+
+def add_to_tensorboard(gif: Path, directory: Path, tag: str, step: int) -> None:
+    """Adds a .gif to the events of a directory as an image; TensorBoard shows it moving.
+
+    Args:
+        gif: that was written.
+        directory: of events of its own: TensorBoard reads no further in a file once there is a newer one beside it.
+        tag: names the image.
+        step: gradient step.
+    """
+    from tensorboardX import FileWriter
+    from tensorboardX.proto.summary_pb2 import Summary
+
+    with Image.open(gif) as animation:
+        width, height = animation.size
+    image = Summary.Image(width=width, height=height, colorspace=3, encoded_image_string=gif.read_bytes())
+    events = FileWriter(str(directory))
+    events.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
+    events.close()
 
 
 def _write_mp4(file: Path, pictures: Iterable[Image.Image], rate: Fraction) -> None:

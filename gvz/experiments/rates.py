@@ -1,6 +1,6 @@
 """How fast this machine trains and evaluates: measured by really doing it for a short while, and remembered.
 
-Imports gvz.{cache,config,experiments,rundir}.
+Imports gvz.{cache,config,experiments,machine,rundir}.
 """
 
 import dataclasses
@@ -21,6 +21,7 @@ from gvz.experiments.base import TrainingRun
 from gvz.experiments.jobs import Command, RunJob, RunningJob, Slot
 from gvz.experiments.plan import Evaluation
 from gvz.experiments.scale import CHECK_BELOW, CHECK_SETTINGS
+from gvz.machine import cpu_model
 from gvz.rundir import read_records
 
 MEASURE_S = 20.0
@@ -140,5 +141,4 @@ def _steps_played(file: Path) -> int:
 
 def _machine() -> list[str]:
     """What the rates of this machine depend on."""
-    cpu = next((line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")), "")
-    return [platform.node(), cpu.rpartition(":")[2].strip()]
+    return [platform.node(), cpu_model()]

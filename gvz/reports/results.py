@@ -41,6 +41,8 @@ class Run:
     """rates by gradient steps"""
     training_episodes: pl.DataFrame
     """task, score and gradient steps of every finished training episode"""
+    starts: tuple[dict[str, Any], ...]
+    """rows of starts.jsonl: the machine, versions and commit of each start; none in a run of an older version"""
 
     @property
     def name(self) -> str:
@@ -135,6 +137,7 @@ def _read_run(file: Path, results: Path) -> tuple[Run | None, list[str]]:
     """The run, if it can be told, and what is wrong with it."""
     metrics, problems = _read_columns(file.parent, "metrics", _METRICS)
     episodes, more = _read_columns(file.parent, "episodes", _TRAINING_EPISODES)
+    starts, unread = _read_rows(file.parent, "starts")
     try:
         saved = json.loads(file.read_text())
         run = Run(
@@ -144,11 +147,12 @@ def _read_run(file: Path, results: Path) -> tuple[Run | None, list[str]]:
             tasks=tuple(map(str, saved["resolved"]["tasks"])),
             metrics=metrics,
             training_episodes=episodes.filter(~pl.col("cut")),
+            starts=tuple(starts),
         )
         _ = run.name, run.seed, run.total_updates, run.scenario
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
         return None, [f"{file}: not a configuration of ours ({type(error).__name__}: {error}); the run is left out"]
-    return run, [*problems, *more]
+    return run, [*problems, *more, *unread]
 
 
 def _run_id(directory: Path, results: Path) -> str:
@@ -209,13 +213,18 @@ _TRAINING_EPISODES = {
 
 
 def _read_columns(directory: Path, name: str, columns: dict[str, pl.DataType]) -> tuple[pl.DataFrame, list[str]]:
-    """These columns of a run's record file, compressed or not; rows without `num_updates` are left out."""
+    """These columns of a run's record file; rows without `num_updates` are left out."""
+    rows, problems = _read_rows(directory, name)
+    data = {c: pl.Series([row.get(c) for row in rows], dtype=t, strict=False) for c, t in columns.items()}
+    return pl.DataFrame(data).drop_nulls("num_updates"), problems
+
+
+def _read_rows(directory: Path, name: str) -> tuple[list[dict[str, Any]], list[str]]:
+    """The rows of a run's record file, compressed or not, and what is wrong with it; none if there is no such file."""
     for file in (directory / f"{name}.jsonl", directory / f"{name}.jsonl.gz"):
         if file.exists():
-            rows, problems = read_records(file)
-            data = {c: pl.Series([row.get(c) for row in rows], dtype=t, strict=False) for c, t in columns.items()}
-            return pl.DataFrame(data).drop_nulls("num_updates"), problems
-    return pl.DataFrame(schema=columns), []
+            return read_records(file)
+    return [], []
 
 
 def training_time_s(metrics: pl.DataFrame) -> float:

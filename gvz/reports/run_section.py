@@ -11,7 +11,7 @@ from typing import Any
 import polars as pl
 
 from gvz.evaluation.frame import evaluation_files
-from gvz.reports.document import Block, Link, Section, Table, missing, words
+from gvz.reports.document import Block, Link, Section, Table, count, missing, words
 from gvz.reports.results import Results, Run, training_time_s
 
 _VIDEOS = (".mp4", ".gif", ".webp", ".webm")
@@ -21,9 +21,10 @@ def run_sections(results: Results, out: Path) -> list[Section]:
     """What there is to say of the runs; nothing without any."""
     sections = []
     if results.runs:
-        sections.append(
-            Section(id="runs", title="Time and throughput", blocks=(Block(tables=(_rates(results.runs),)),))
-        )
+        tables = [_rates(results.runs)]
+        if any(run.starts for run in results.runs):
+            tables.append(_machines(results.runs))
+        sections.append(Section(id="runs", title="Time and throughput", blocks=(Block(tables=tuple(tables)),)))
         sections.append(
             Section(id="configuration", title="Configuration", blocks=(Block(tables=(_configurations(results),)),))
         )
@@ -57,6 +58,36 @@ def _rates(runs: Sequence[Run]) -> Table:
             *("updates/s", "decisions/s", "frames/s"),
         ),
         rows=tuple(rows),
+    )
+
+
+def _machines(runs: Sequence[Run]) -> Table:
+    """Every machine with its software as a row; a run that was resumed elsewhere counts on both."""
+    trained: dict[tuple[str, ...], dict[str, None]] = {}
+    for run in runs:
+        for cells in dict.fromkeys(map(_machine, run.starts)) or [("-",) * 6]:
+            trained.setdefault(cells, {})[run.id] = None
+    return Table(
+        id="machines",
+        caption="What the runs were trained on and with; `+changes`: the checkout differed from the commit.",
+        columns=("runs", "processor", "cores", "memory", "devices", "commit", "versions"),
+        rows=tuple(
+            (words(", ".join(names) if len(names) <= 3 else count(len(names), "run")), *map(words, cells))
+            for cells, names in trained.items()
+        ),
+    )
+
+
+def _machine(start: dict[str, Any]) -> tuple[str, ...]:
+    """The cells of a row of starts.jsonl."""
+    memory_bytes, versions = start.get("memory_bytes"), start.get("versions") or {}
+    return (
+        f"{start.get('cpu', '-')}, {start.get('system', '-')}",
+        str(start.get("cores", "-")),
+        "-" if memory_bytes is None else f"{memory_bytes / 2**30:.0f} GiB",
+        ", ".join(start.get("devices") or ["-"]),
+        str(start.get("commit") or "-"),
+        ", ".join(f"{name} {number}" for name, number in versions.items()),
     )
 
 

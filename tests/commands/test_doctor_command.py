@@ -39,8 +39,8 @@ def test_clean_removes_what_a_dead_run_left(capsys, monkeypatch, tmp_path):
     assert cli.main(["doctor"]) == 0
     assert f"1: {segment.name}" in capsys.readouterr().out
     assert segment.exists()
-    assert cli.main(["doctor", "--clean"]) == 0
-    out = capsys.readouterr().out
-    assert f"removed shared memory {segment.name}" in out
-    assert "none" in out
+    assert cli.main(["doctor", "--clean", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert f"removed shared memory {segment.name}" in err
+    assert json.loads(out)["found"] == "none"
     assert not segment.exists()

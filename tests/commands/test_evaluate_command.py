@@ -1,5 +1,6 @@
 """gvz evaluate, as it is called: bad input, several checkpoints, interruption and going on."""
 
+import json
 import signal
 import subprocess
 import sys
@@ -77,6 +78,14 @@ def test_all_checkpoints_meet_the_same_episodes_and_none_twice(small_run, capsys
     assert cli.main([*command, "--episodes", "1"]) == 0
     assert read_rows(small_run / "evaluation.jsonl") == rows
     assert capsys.readouterr().out == out
+    assert cli.main([*command, "--episodes", "1", "--json"]) == 0
+    scores = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [(score["player"], score["base_seed"]) for score in scores] == [
+        *(("small/seed_7@10", 0), ("small/seed_7@10", 4), ("small/seed_7@20", 0), ("small/seed_7@20", 4))
+    ]
+    assert [score["score"] for score in scores] == [
+        first[updates, seed]["score"] for updates, seed in ((10, 0), (10, 4), (20, 0), (20, 4))
+    ]
 
 
 @pytest.mark.engine

@@ -32,6 +32,9 @@ def test_list_names_every_experiment_with_its_question(capsys):
     for experiment in experiments().values():
         assert f"{experiment.name}: {experiment.question}" in out
         assert f"{len(experiment.runs())} runs of {experiment.total_updates:,} gradient steps" in out
+    assert main(["experiment", "list", "--json"]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert {row["name"]: row["runs"] for row in rows} == {e.name: len(e.runs()) for e in experiments().values()}
 
 
 @pytest.mark.usefixtures("known_rates")
@@ -48,6 +51,12 @@ def test_plan_prints_runs_steps_episodes_and_hours_and_counts_shared_runs_once(c
     seeds = [cells[0] for cells in lines if cells and cells[0].startswith("rainbow_4task/")]
     assert len(seeds) == 5  # of nine runs, every other one
     assert lines[-1][:3] == ["rainbow_4task:", "10.00", "updates/s,"]
+    assert main([*arguments, "--scenario", "defend_the_center", "--json"]) == 0
+    rows = {row["run"]: row for row in map(json.loads, capsys.readouterr().out.splitlines())}
+    assert len(rows) == 5
+    row = rows["rainbow_4task/defend_the_center/train4/seed_1111"]
+    assert row["experiments"] == ["rainbow_evaluation", "training_set_size"]
+    assert (row["updates"], row["episodes"], round(row["hours"], 2)) == (200_000, 36_000, 8.38)
 
 
 def test_status_tells_done_failed_and_waiting_apart(tmp_path, capsys):
@@ -76,6 +85,13 @@ def test_status_tells_done_failed_and_waiting_apart(tmp_path, capsys):
     assert "waiting  players/random: 0/6 episodes" in out
     assert "algorithm_comparison, scale 0.001: 1 done, 1 failed, 1 waiting" in out
     assert main(["experiment", "status", "--results", str(tmp_path), "--shard", "1/2"]) == 0
+    capsys.readouterr()
+    assert main(["experiment", "status", "--results", str(tmp_path), "--json"]) == 1
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [(row["job"], row["state"]) for row in rows] == [
+        *((dqn.id, "done"), (rainbow.id, "failed"), ("players/random", "waiting"))
+    ]
+    assert rows[1]["log"] == str(log)
 
 
 @pytest.mark.parametrize(

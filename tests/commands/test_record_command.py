@@ -11,6 +11,7 @@ from PIL import Image
 
 from gvz import cli
 from gvz.evaluation.record import read_rows
+from tests.tensorboard_events import read_events
 
 
 @pytest.mark.parametrize(
@@ -29,6 +30,8 @@ from gvz.evaluation.record import read_rows
         ("{run} --out v.webp --checkpoint all", "--checkpoint: got all, want one of 10, 20"),
         ("{run} --out v.webp --task seek_and_kill/blue", "whose buttons are others"),
         ("{file} --out v.webp", "is not a run directory"),
+        ("{run} --out v.webp --tensorboard", "--tensorboard: want a run directory and an --out that ends with .gif"),
+        ("--player idle --task seek_and_kill/blue --out v.gif --tensorboard", "--tensorboard: want a run directory"),
     ],
 )
 def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, tmp_path, small_run, monkeypatch):
@@ -65,6 +68,20 @@ def test_an_animation_shows_every_decision_of_the_seconds_asked_for(tmp_path, ca
     assert capsys.readouterr().out.endswith("random was cut off at tic 35, score 0\n")
     with Image.open(video) as animation:
         assert animation.n_frames == 1 + 9  # the start, and the decisions of tics 1, 5, .. 33
+
+
+@pytest.mark.engine
+def test_tensorboard_gets_the_animation_at_the_policys_gradient_step(small_run, tmp_path):
+    video = tmp_path / "video.gif"
+    arguments = f"record {small_run} --checkpoint 10 --seconds 1 --out {video} --tensorboard"
+    assert cli.main(arguments.split()) == 0
+    events = read_events(small_run / "tensorboard" / "episodes")
+    [(step, value)] = [(event.step, value) for event in events for value in event.summary.value]
+    assert (step, value.tag) == (10, "episode/defend_the_center/default")
+    assert value.image.encoded_image_string == video.read_bytes()
+    with Image.open(video) as animation:
+        assert animation.n_frames == 1 + 9
+        assert animation.size == (value.image.width, value.image.height)
 
 
 @pytest.mark.engine

@@ -67,7 +67,7 @@ def test_an_episode_found_twice_is_there_once(tmp_path):
 
 def test_records_of_training_and_discarded_ones_are_left_alone(tmp_path):
     (tmp_path / "discarded").mkdir()
-    for name in ("episodes.jsonl", "metrics.jsonl.gz", "faults.jsonl", "discarded/evaluation.jsonl"):
+    for name in ("episodes.jsonl", "starts.jsonl", "metrics.jsonl.gz", "faults.jsonl", "discarded/evaluation.jsonl"):
         (tmp_path / name).write_text("not read")
     frame, problems = collect_evaluations([tmp_path])
     assert frame.is_empty()

@@ -24,22 +24,20 @@ def agent_and_params():
     return agent, jax.jit(agent.init)(jax.random.key(0))
 
 
-@pytest.mark.parametrize("explore", [True, False])
-def test_exported_function_acts_as_the_agent_does(agent_and_params, explore: bool):
+def test_exported_function_acts_as_the_agent_does(agent_and_params):
     agent, params = agent_and_params
-    serialized = export_policy(agent, jax.eval_shape(lambda: params), B, explore=explore)
+    serialized = export_policy(agent, jax.eval_shape(lambda: params), B)
     assert isinstance(serialized, bytes)
     exported = jax.export.deserialize(bytearray(serialized))
     assert exported.platforms == ("cpu",)
-    call, act, evaluate = jax.jit(exported.call), jax.jit(agent.act), jax.jit(agent.evaluate)
+    call, act = jax.jit(exported.call), jax.jit(agent.act)
     task, leaves = np.array([0, 1, 1, 0], np.int32), jax.tree.leaves(params)
     for i in range(5):
         obs = np.random.default_rng(i).integers(0, 256, (B, *SPEC.obs_shape), dtype=np.uint8)
         key = jax.random.key(i)
         action = call(leaves, obs, task, np.asarray(jax.random.key_data(key)), np.float32(0.25))
-        wanted = act(params, key, obs, task, jnp.float32(0.25)) if explore else evaluate(params, obs, task).action
         assert action.dtype == jnp.int32
-        np.testing.assert_array_equal(action, wanted)
+        np.testing.assert_array_equal(action, act(params, key, obs, task, jnp.float32(0.25)))
 
 
 def test_flat_parameters_are_the_leaves_in_tree_order(agent_and_params):

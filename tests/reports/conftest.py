@@ -76,6 +76,21 @@ def write_training(results: Path, run: TrainingRun, *, until: int | None = None)
             for task in run.tasks
         ],
     )
+    write_rows(
+        directory / "starts.jsonl",
+        [
+            {
+                "num_updates": 0,
+                "cpu": "Some CPU",
+                "system": "Linux x86_64",
+                "cores": 2,
+                "memory_bytes": 8 * 2**30,
+                "devices": ["cpu: cpu"],
+                "versions": {"python": "3.11.2", "jax": "0.7.0"},
+                "commit": "0123456789ab" if run.seed == 1111 else None,
+            }
+        ],
+    )
     (directory / "config.json").write_text(json.dumps(config_to_dict(config)))
     return directory
 

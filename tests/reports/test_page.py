@@ -1,5 +1,6 @@
 """The report of all four experiments: complete, self-contained, linked to its records, and plain about its limits."""
 
+import csv
 import re
 
 import pytest
@@ -49,6 +50,14 @@ def test_tables_of_all_experiments_are_files_too(report_of_all):
         assert "thesis" in (report_of_all / "tables" / f"{name}.csv").read_text()
         assert r"\textit{thesis}" in (report_of_all / "tables" / f"{name}.tex").read_text()
     assert "LevDoom" in (report_of_all / "tables" / "algorithm_comparison.csv").read_text()
+
+
+def test_runs_are_listed_with_the_machine_and_software_they_were_trained_on(report_of_all):
+    head, *machines = csv.reader((report_of_all / "tables" / "machines.csv").read_text().splitlines())
+    assert head == ["runs", "processor", "cores", "memory", "devices", "commit", "versions"]
+    [(runs, *told)] = machines  # one seed at this scale, all on one machine
+    assert re.fullmatch(r"\d+ runs", runs)
+    assert told == [*("Some CPU, Linux x86_64", "2", "8 GiB", "cpu: cpu", "0123456789ab", "python 3.11.2, jax 0.7.0")]
 
 
 def test_the_head_says_what_the_numbers_cannot_show(report_of_all):
