@@ -165,9 +165,7 @@ class ActorLoop:
         """Reports the episode, whose last record is written, and starts the next."""
         crashed = bool(game.info.get("engine_crash", False))
         if crashed:
-            where = f"lane {game.lane}, task {self._spec.tasks[game.task]}, episode {game.episode}, seed {game.seed}"
-            message = f"{where}: the engine died at decision {len(game.actions)}; a new one is started"
-            self._emit(Fault(actor=self._spec.actor, lane=game.lane, kind="engine_crash", message=message))
+            self._report_crash(game, f"at decision {len(game.actions)}")
         self._emit(
             EpisodeStats(
                 lane=game.lane,
@@ -188,11 +186,20 @@ class ActorLoop:
         game.episode += 1
         self._reset(game)
 
+    def _report_crash(self, game: Game, when: str) -> None:
+        where = f"lane {game.lane}, task {self._spec.tasks[game.task]}, episode {game.episode}, seed {game.seed}"
+        message = f"{where}: the engine died {when}; a new one is started"
+        error = str(game.info.get("engine_error", ""))
+        fault = Fault(actor=self._spec.actor, lane=game.lane, kind="engine_crash", message=message, traceback=error)
+        self._emit(fault)
+
     def _reset(self, game: Game) -> None:
         """Starts episode `game.episode`."""
         self._ring.beat(WriterState.RESETTING)
         game.seed = derive_seed(self._spec.seed, game.task, game.lane, game.episode)
         game.frame, game.info = game.env.reset(options={"episode_seed": game.seed})
+        if game.info.get("engine_crash", False):
+            self._report_crash(game, "before the first decision")
         if list(game.frame.shape) != self._spec.frame_shape or game.frame.dtype != np.uint8:
             raise ConfigError(
                 f"{self._spec.env_entry_point}({self._spec.tasks[game.task]!r}): got a frame "

@@ -210,8 +210,11 @@ class ActorPool:
         episodes.
 
         Raises:
-            WorkerError: an actor failed more often than its budget allows.
+            WorkerError: an actor failed more often than its budget allows. What it said last came with the poll before.
         """
+        for actor in self._actors:
+            if actor.failure is not None:
+                raise actor.failure
         now = time.monotonic()
         # our own sleep is not the actors' silence: a learner that compiled for a minute has not watched for a minute
         watched_s = min(now - self._polled_at, self._config.actors.heartbeat_timeout_s / 4)

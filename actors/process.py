@@ -12,10 +12,13 @@ import sys
 from pathlib import Path
 
 from gvz.cache import xla_cache_directory
+from gvz.errors import WaitTimeoutError
 from gvz.transport.channel import Channel
 from gvz.transport.messages import ActorSpec, Message, Stop
 
 LOG_TAIL_BYTES = 4000
+_KILL_TIMEOUT_S = 30.0
+"""the kernel takes milliseconds over a SIGKILL, unless the process hangs in a driver or in a dead file system"""
 
 _ENVIRONMENT = {
     "JAX_PLATFORMS": "cpu",
@@ -40,9 +43,9 @@ class ActorProcess:
     def __init__(self, spec: ActorSpec):
         work_dir = Path(spec.work_dir)
         work_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
-        self.log_path = work_dir / f"actor_{spec.actor}.log"
+        self._who = f"actor {spec.actor}"
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        with theirs, self.log_path.open("ab") as log:
+        with theirs, log_path(spec).open("ab") as log:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "actors.worker", str(theirs.fileno()), str(os.getpid())],
                 stdin=subprocess.DEVNULL,
@@ -54,7 +57,7 @@ class ActorProcess:
                 start_new_session=True,
             )
         self.pid = self._process.pid
-        self._channel = Channel(ours, peer=f"actor {spec.actor} (pid {self.pid})")
+        self._channel = Channel(ours, peer=f"{self._who} (pid {self.pid})")
         try:
             self._channel.send(spec)
         except BaseException:
@@ -89,14 +92,28 @@ class ActorProcess:
         return True
 
     def end(self, *, grace_s: float) -> None:
-        """Ends it: SIGTERM, and after `grace_s` SIGKILL. Its engines die with it. Can be repeated."""
+        """Ends it: SIGTERM, and after `grace_s` SIGKILL. Its engines die with it. Can be repeated.
+
+        Raises:
+            WaitTimeoutError: it is still there.
+        """
+        self._channel.close()
         self._process.terminate()
         if not self.wait(grace_s):
             self._process.kill()
-            self._process.wait()
-        self._channel.close()
+            if not self.wait(_KILL_TIMEOUT_S):
+                raise WaitTimeoutError(
+                    f"learner: waited {_KILL_TIMEOUT_S:.0f} s for {self._who} (pid {self.pid}) to end after SIGKILL; "
+                    "it hangs in the kernel, which `ps -o pid,stat,wchan` shows"
+                )
 
-    def log_tail(self) -> str:
-        """The end of the log."""
-        data = self.log_path.read_bytes()[-LOG_TAIL_BYTES:]
-        return data.decode(errors="replace").strip()
+
+def log_path(spec: ActorSpec) -> Path:
+    """Where the output of this actor's processes is kept."""
+    return Path(spec.work_dir) / f"actor_{spec.actor}.log"
+
+
+def read_log_tail(path: Path) -> str:
+    """The end of a log; of one that is gone, nothing."""
+    data = path.read_bytes()[-LOG_TAIL_BYTES:] if path.exists() else b""
+    return data.decode(errors="replace").strip()

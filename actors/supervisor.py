@@ -9,7 +9,7 @@ from collections import deque
 import numpy as np
 
 from actors.config import ActorsConfig
-from actors.process import ActorProcess
+from actors.process import ActorProcess, log_path, read_log_tail
 from gvz import janitor
 from gvz.errors import TransportError, WorkerError
 from gvz.transport.messages import ActorSpec, Fault, Message, Ready
@@ -31,6 +31,7 @@ class SupervisedActor:
         next_episodes: per game, one more than the largest episode number seen.
         ready: its present process has started all its games.
         restarts: processes that were replaced.
+        failure: why no process will follow the last one; None while all is well.
     """
 
     def __init__(self, spec: ActorSpec, limits: ActorsConfig):
@@ -39,6 +40,7 @@ class SupervisedActor:
         self.process: ActorProcess | None = None
         self.next_episodes = list(spec.first_episodes)
         self.restarts = 0
+        self.failure: WorkerError | None = None
         self._spec = spec
         self._limits = limits
         self._start_at = 0.0
@@ -67,15 +69,11 @@ class SupervisedActor:
             watched_s: time since the last look that counts as silence if there was no sign of life.
 
         Returns:
-            What the process said, and a Fault if it was replaced.
-
-        Raises:
-            WorkerError: it failed more often than its budget allows.
+            What the process said, and a Fault if it has ended. If it failed more often than its budget allows, that
+            is a fatal one, and `failure` is set.
         """
         if self.process is None:
-            if now >= self._start_at:
-                self.start()
-            return []
+            return self._start_again(now) if now >= self._start_at and self.failure is None else []
         exit_text = self.process.exit_text()  # first: what it said before its end is then all there
         messages: list[Message] = []
         try:
@@ -105,6 +103,13 @@ class SupervisedActor:
         """As `note`, from what is still in the ring."""
         self.note(self.ring.peek(self.ring.capacity).steps)
 
+    def _start_again(self, now: float) -> list[Message]:
+        try:
+            self.start()
+        except OSError as error:  # no room for another process, or it did not take its spec
+            return [self._replace(now, "died", f"could not be started ({error})")]
+        return []
+
     def _is_stuck(self, watched_s: float) -> bool:
         heartbeat_ns = self.ring.writer_status().heartbeat_ns
         moved = self.ready and heartbeat_ns != self._heartbeat_ns
@@ -124,22 +129,23 @@ class SupervisedActor:
 
     def _replace(self, now: float, kind: str, what: str) -> Fault:
         """Ends what is left of the process and plans the next, if the budget allows."""
-        assert self.process is not None
-        stable = self._ready_at is not None and now - self._ready_at > _STABLE_S
+        stable = self.ready and self._ready_at is not None and now - self._ready_at > _STABLE_S
         process, self.process = self.process, None
-        process.end(grace_s=0.0)
-        log_tail = process.log_tail()
+        if process is not None:
+            process.end(grace_s=0.0)
+        log_tail = read_log_tail(log_path(self._spec))
         janitor.clean_dead_instances()
         actor, limits = self._spec.actor, self._limits
         self._ended_at.append(now)
         while now - self._ended_at[0] > limits.restart_window_s:
             self._ended_at.popleft()
         if len(self._ended_at) > limits.max_restarts:
-            raise WorkerError(
+            message = (
                 f"actor {actor} {what}; that was end {len(self._ended_at)} within {limits.restart_window_s:.0f} s, "
-                f"and actors.max_restarts allows {limits.max_restarts} restarts. The end of {process.log_path}:\n"
-                f"{log_tail}"
+                f"and actors.max_restarts allows {limits.max_restarts} restarts."
             )
+            self.failure = WorkerError(f"{message} The end of {log_path(self._spec)}:\n{log_tail}")
+            return Fault(actor=actor, lane=None, kind="gave_up", message=message, traceback=log_tail, fatal=True)
         self._failed_starts = 0 if stable else self._failed_starts + 1
         backoff_s = min(_FIRST_BACKOFF_S * 2**self._failed_starts, _LONGEST_BACKOFF_S)
         self._start_at = now + backoff_s

@@ -5,7 +5,6 @@ learner, `Stop`. Everything that goes wrong becomes a `Fault` message and a non-
 """
 
 import contextlib
-import ctypes
 import faulthandler
 import os
 import signal
@@ -15,6 +14,7 @@ import time
 import traceback
 
 from actors.loop import ActorLoop
+from gvz import janitor
 from gvz.errors import EngineError, WaitTimeoutError
 from gvz.transport.broadcast import BroadcastReader
 from gvz.transport.channel import Channel
@@ -27,16 +27,6 @@ PARAMS_TIMEOUT_S = 600.0
 """likewise for the first version of the parameters"""
 MAX_PARAMS_SHARE = 0.05
 """share of an actor's time that may go into taking parameters (27 MB: 20 ms), however often they are published"""
-_PR_SET_PDEATHSIG = 1
-
-
-def die_with_parent(parent_pid: int) -> None:
-    """Asks the kernel to kill this process when the thread that started it ends; exits if that has happened."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL) != 0:
-        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
-    if os.getppid() != parent_pid:
-        sys.exit(1)
 
 
 class Worker:
@@ -101,7 +91,7 @@ class Worker:
 def main() -> int:
     """Entry point of the process; returns its exit code."""
     descriptor, parent_pid = int(sys.argv[1]), int(sys.argv[2])
-    die_with_parent(parent_pid)
+    janitor.die_with_parent(parent_pid)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the learner's to decide about
     signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
     faulthandler.enable()

@@ -214,7 +214,10 @@ def watch(one: Watched) -> None:
 
 def _watch() -> None:
     while True:
+        before_s = time.monotonic()
         time.sleep(_WATCH_PERIOD_S)
+        if time.monotonic() - before_s > 4 * _WATCH_PERIOD_S:
+            continue  # this process was stopped, so nobody took the engine's answer: it may be there by the next look
         with _watched_lock:
             watched = list(_watched)
         for one in watched:

@@ -49,7 +49,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
       the last observation is given once more and the reward is 0.
     - Info, each step: score, normalized_score (percent of upper_bound), upper_bound, reward_components, variables
       (what the agent may see), kills (the engine's count, infighting included), player_kills, episode_frames,
-      episode_seed, engine_crash; with the last one solved_episode (a survival scenario's time-out was reached).
+      episode_seed, engine_crash (of `reset`: the engine had died and is replaced); with the last one solved_episode
+      (a survival scenario's time-out was reached).
     - Seeds: `reset(seed=n)` seeds the sequence of episodes; each draws its own, `info["episode_seed"]`, and
       `reset(options={"episode_seed": m})` plays that episode again, alone.
     """
@@ -155,7 +156,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             raise ValueError(f"reset: episode_seed {self._episode_seed}, want 0..{_EPISODE_SEEDS - 1}")
         if self._recycle_episodes and self._engine_episodes >= self._recycle_episodes:
             self._stop_engine()
-        engine = self._begin()
+        engine, crash = self._begin()
         self._engine_episodes += 1
         self._screen = engine.screen
         self._start_tic = engine.tic()
@@ -164,7 +165,10 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         self._playing = True
         if self.render_mode == "human":
             self._show(tics=0)
-        return self._observe(engine), self._info(dict.fromkeys(self._rewarder.weights, 0.0), False, False)
+        info = self._info(dict.fromkeys(self._rewarder.weights, 0.0), False, False)
+        if crash is not None:
+            info |= {"engine_crash": True, "engine_error": str(crash)}
+        return self._observe(engine), info
 
     def step(self, action: int | np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Holds the action's buttons for `frame_skip` tics, or what is left until the time-out.
@@ -221,8 +225,9 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             self._window = None
         self._playing = False
 
-    def _begin(self) -> Engine:
-        """Starts the episode, on a new engine if there is none or the old one has died."""
+    def _begin(self) -> tuple[Engine, EngineError | None]:
+        """Starts the episode, on a new engine if there is none or the old one has died; how it died."""
+        crash = None
         while True:
             if self._engine is None:
                 self._engine = Engine(self._engine_config)
@@ -230,6 +235,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
                 self._engine.new_episode(self._episode_seed)
                 magic = self._engine.variable(BOOKKEEPING["MAP_MAGIC"])
             except EngineError as error:
+                crash = error
                 self._note_crash(error)
                 continue
             if magic != self._compiled.map_magic:  # where a file has no such map, ViZDoom plays another one
@@ -238,7 +244,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
                     f"{self.task.id}: {self._compiled.wad_path} runs a map with magic number {magic:.0f}, "
                     f"want {self._compiled.map_magic}"
                 )
-            return self._engine
+            return self._engine, crash
 
     def _read(self, engine: Engine) -> None:
         """Keeps what the game says after a decision."""

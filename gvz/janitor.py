@@ -9,6 +9,7 @@ Every step can be repeated and any number of janitors may run at once: names are
 """
 
 import contextlib
+import ctypes
 import hashlib
 import json
 import os
@@ -16,6 +17,7 @@ import re
 import shutil
 import signal
 import stat
+import sys
 import tempfile
 from pathlib import Path
 from typing import Literal
@@ -31,6 +33,9 @@ ENGINE_DIR_PREFIX = "gvz-engine-"
 INSTANCE_FILE = "instance"
 """in an engine's private directory: "pid start id" of its engine, written by `engine_wrapper.py`"""
 _ENGINE_SHM_PREFIXES = ("ViZDoomSM", "ViZDoomMQCtr", "ViZDoomMQDoom")
+_PR_SET_PDEATHSIG = 1
+_UNREADABLE = (OSError, ValueError, KeyError, TypeError, RecursionError)
+"""what reading a damaged or forged record ends in"""
 
 
 def runtime_dir() -> Path:
@@ -96,7 +101,7 @@ def clean_dead_instances() -> list[str]:
                 path.unlink(missing_ok=True)
         except FileNotFoundError:
             continue  # its owner, or another janitor, was faster
-        except (ValueError, KeyError, TypeError) as error:
+        except _UNREADABLE as error:
             done.append(f"left alone: unreadable record {path} ({error})")
     return done
 
@@ -105,7 +110,7 @@ def dead_instances() -> list[str]:
     """What `clean_dead_instances` would remove: private directories of engines and names in /dev/shm."""
     found: list[str] = []
     for path in _records():
-        with contextlib.suppress(FileNotFoundError, ValueError, KeyError, TypeError):
+        with contextlib.suppress(*_UNREADABLE):
             dead = _read_dead(path)
             if dead is not None:
                 found.append(dead[1])
@@ -119,9 +124,11 @@ def _records() -> list[Path]:
 def _read_dead(path: Path) -> tuple[str, str] | None:
     """Kind and name of a record whose owner is gone; None if it lives, or belongs to another machine."""
     content = json.loads(path.read_text())
-    kind, name = content["kind"], content["name"]
+    kind, name, pid, start = (content[key] for key in ("kind", "name", "owner_pid", "owner_start"))
     _check_name(kind, name)
-    if content["machine"] != _machine() or process_start(content["owner_pid"]) == content["owner_start"]:
+    if type(pid) is not int or type(start) is not int:
+        raise ValueError(f"got owner {pid!r} of start {start!r}, want two numbers")
+    if content["machine"] != _machine() or process_start(pid) == start:
         return None
     return kind, name
 
@@ -155,6 +162,15 @@ def read_instance(directory: Path) -> tuple[int, int, str] | None:
     if match is None:
         raise ValueError(f"{directory / INSTANCE_FILE}: got {text!r}, want process id, start time, instance id")
     return int(match[1]), int(match[2]), match[3]
+
+
+def die_with_parent(parent_pid: int) -> None:
+    """Has the kernel kill this process when the thread that started it ends; exits if that has happened already."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL) != 0:
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
+    if os.getppid() != parent_pid:
+        sys.exit(1)
 
 
 def process_start(pid: int) -> int | None:

@@ -5,6 +5,7 @@ after that, so `--help` and errors are quick.
 """
 
 import dataclasses
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ import tyro
 from gvz.config import RunConfig, load_config
 from gvz.errors import GvzError
 from gvz.rundir import RunDir, move_aside
+from gvz.stop import StopRequest
 
 DEFAULT_CONFIG = "rainbow_4task.py"
 
@@ -71,23 +73,26 @@ def resumed_config(run: RunDir, config: RunConfig) -> RunConfig:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns the exit code: 0 done, 1 failed, 2 bad input, 130 and 143 stopped and saved."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    try:
-        launch = parse(arguments)
-        directory = launch.run.resolved_run_dir
-        if launch.fresh and (moved := move_aside(directory)) is not None:
-            print(f"moved the old run to {moved}", file=sys.stderr)
-        with RunDir(Path(directory)) as run:
-            config = resumed_config(run, launch.run)
-            run.check_resumable(config)
-            from gvz.train import train  # imports jax: only once the input is known to be good
+    with StopRequest(at_once=True) as stop:  # until the trainer has something to save
+        try:
+            launch = parse(arguments)
+            directory = launch.run.resolved_run_dir
+            if launch.fresh and (moved := move_aside(directory)) is not None:
+                print(f"moved the old run to {moved}", file=sys.stderr)
+            with RunDir(Path(directory)) as run:
+                config = resumed_config(run, launch.run)
+                run.check_resumable(config)
+                from gvz.train import train  # imports jax: only once the input is known to be good
 
-            return train(config, run)
-    except GvzError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:  # a second signal while the run was being set up or taken down
-        print("stopped at once", file=sys.stderr)
-        return 130
+                return train(config, run, stop)
+        except GvzError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return error.exit_code
+        except KeyboardInterrupt:
+            print("stopped at once", file=sys.stderr)
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(stop.exit_code)  # the interpreter's own end would wait for a thread that writes a checkpoint
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ trusted. `python -m gvz.probe` is the sub-process.
 """
 
 import contextlib
+import os
 import re
 import resource
 import subprocess
@@ -21,7 +22,9 @@ from gvz.engine_process import log_tail, one_of
 from gvz.errors import EngineError, WadError
 from gvz.wad.lumps import read_wad
 
-_FAULTS = re.compile(r"unknown|tried to register|script error|no map|not found|execution could not continue", re.I)
+_FAULTS = re.compile(
+    r"unknown|tried to register|script error|runaway script|no map|not found|execution could not continue", re.I
+)
 """what ZDoom prints, and then goes on as if nothing was wrong"""
 _MEMORY_BYTES = 4 * 2**30
 _TICS = 70
@@ -50,7 +53,7 @@ def probe_wad(wad: Path, map_name: str = "MAP01", timeout_s: float = 60.0) -> st
         raise EngineError(f"{wad}: no map {map_name}, only {', '.join(lumps[:8])}; the engine would play another one")
     with tempfile.TemporaryDirectory(prefix="gvz-probe-") as directory:
         log = Path(directory) / "engine.log"
-        command = [sys.executable, "-m", "gvz.probe", str(wad), map_name, str(log), str(timeout_s)]
+        command = [sys.executable, "-m", "gvz.probe", str(os.getpid()), str(wad), map_name, str(log), str(timeout_s)]
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
         except subprocess.TimeoutExpired as error:
@@ -83,7 +86,8 @@ def ensure_loads(wad: Path, map_name: str = "MAP01", timeout_s: float = 60.0) ->
                 marker.touch()
 
 
-def _main(wad: str, map_name: str, log: str, timeout_s: float) -> None:
+def _main(parent_pid: int, wad: str, map_name: str, log: str, timeout_s: float) -> None:
+    janitor.die_with_parent(parent_pid)
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_CPU, (int(timeout_s) + 1, int(timeout_s) + 1))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -101,4 +105,4 @@ def _main(wad: str, map_name: str, log: str, timeout_s: float) -> None:
 
 
 if __name__ == "__main__":
-    _main(sys.argv[1], sys.argv[2], sys.argv[3], float(sys.argv[4]))
+    _main(int(sys.argv[1]), sys.argv[2], sys.argv[3], sys.argv[4], float(sys.argv[5]))

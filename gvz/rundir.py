@@ -9,20 +9,28 @@ checkpoint, so that a resumed run drops (into `discarded/`) what a killed one wr
 
 import fcntl
 import gzip
+import io
 import json
 import os
 import shutil
 import time
 import zlib
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any
+from typing import Any
 
 from gvz.config import RunConfig, config_from_dict, config_to_dict, differences
 from gvz.errors import ConfigError, GvzError, ResumeError
 
 RECORDS_SCHEMA = 1
 """Stands in every row as `schema`; raised by one when a row's meaning changes."""
+
+MAX_LINE_LENGTH = 2**20
+MAX_LINES = 2**22
+"""far beyond any record of ours; a small compressed file could hold more than fits into memory"""
+MAX_WAITING_BYTES = 64 * 2**20
+"""rows kept in memory while the disk is full: hours of a run"""
 
 RECORD_FILES = ("metrics.jsonl", "episodes.jsonl", "faults.jsonl")
 START_RECORDS = "starts.jsonl"
@@ -41,7 +49,7 @@ class RunDir:
         self.path = path
         try:
             path.mkdir(parents=True, exist_ok=True, mode=0o700)
-            self._lock = (path / "lock").open("a+")
+            self._lock = os.fdopen(os.open(path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600), "a+")
         except OSError as error:
             raise ResumeError(f"run directory {path}: {error.strerror}; choose another with --run-dir") from error
         try:
@@ -54,7 +62,10 @@ class RunDir:
         self.checkpoints = path / "checkpoints"
         self.tensorboard = path / "tensorboard"
         self.work = path / "work"
-        self._files: dict[str, IO[str]] = {}
+        self._files: dict[str, io.FileIO] = {}
+        self._waiting: dict[str, bytearray] = {}
+        # what orbax, TensorBoard, actors and engines make while it is open is this user's alone, too
+        self._umask = os.umask(0o077)
 
     def saved_config(self) -> RunConfig | None:
         """The configuration of the run that lives here, or None in an empty directory.
@@ -67,7 +78,7 @@ class RunDir:
             return None
         try:
             return config_from_dict(json.loads(file.read_text()))
-        except (ValueError, OSError) as error:
+        except (ValueError, OSError, RecursionError) as error:
             raise ResumeError(f"{file} cannot be read: {error}; start anew with --fresh or --run-dir") from error
 
     def check_resumable(self, config: RunConfig) -> None:
@@ -91,16 +102,37 @@ class RunDir:
         temporary.replace(self.path / "config.json")
 
     def append(self, name: str, row: dict[str, Any]) -> None:
-        """Adds a row to a record file and flushes it."""
-        file = self._files.get(name)
-        if file is None:
-            file = self._files[name] = (self.path / name).open("a")
-        file.write(json.dumps({"schema": RECORDS_SCHEMA, **row}) + "\n")
-        file.flush()
+        """Adds a row to a record file. On a full disk rows wait in memory, and are written with the next one.
+
+        Raises:
+            GvzError: too many rows wait.
+        """
+        waiting = self._waiting.setdefault(name, bytearray())
+        waiting += json.dumps({"schema": RECORDS_SCHEMA, **row}).encode() + b"\n"
+        try:
+            self._write(name)
+        except OSError as error:
+            if len(waiting) > MAX_WAITING_BYTES:
+                raise self._unwritten(name, error) from error
+
+    def _write(self, name: str) -> None:
+        """Writes what waits; what the disk took, if only a part of a row, does not wait any more."""
+        if name not in self._files:
+            self._files[name] = (self.path / name).open("ab", buffering=0)
+        waiting = self._waiting[name]
+        while waiting:
+            del waiting[: self._files[name].write(waiting)]
+
+    def _unwritten(self, name: str, error: OSError) -> GvzError:
+        return GvzError(
+            f"{self.path / name}: {len(self._waiting[name])} bytes of records cannot be written: {error.strerror}; "
+            "make room and give the same command: the run goes on from its newest checkpoint"
+        )
 
     def record_lengths(self) -> dict[str, int]:
-        """Bytes of each record file now: what a checkpoint vouches for."""
-        return {n: (self.path / n).stat().st_size if (self.path / n).exists() else 0 for n in RECORD_FILES}
+        """Bytes of each record file now, with the rows that wait: what a checkpoint vouches for."""
+        sizes = {n: (self.path / n).stat().st_size if (self.path / n).exists() else 0 for n in RECORD_FILES}
+        return {n: size + len(self._waiting.get(n, b"")) for n, size in sizes.items()}
 
     def truncate_records(self, lengths: dict[str, int]) -> int:
         """Cuts the records to the lengths a checkpoint vouches for, keeping the rest in `discarded/`.
@@ -123,12 +155,27 @@ class RunDir:
         return moved
 
     def close(self) -> None:
-        """Closes the record files and releases the lock. Idempotent."""
+        """Closes the record files and releases the lock. Idempotent.
+
+        Raises:
+            GvzError: rows waited for room on the disk, and there is none yet.
+        """
+        lost: list[GvzError] = []
+        for name in self._waiting:
+            try:
+                self._write(name)
+            except OSError as error:
+                lost.append(self._unwritten(name, error))
         for file in self._files.values():
             file.close()
         self._files.clear()
+        self._waiting.clear()
         shutil.rmtree(self.work / "engines", ignore_errors=True)
+        if not self._lock.closed:
+            os.umask(self._umask)
         self._lock.close()
+        if lost:
+            raise lost[0]
 
     def __enter__(self) -> "RunDir":
         return self
@@ -172,7 +219,13 @@ def read_records(file: Path) -> tuple[list[dict[str, Any]], list[str]]:
     problems: list[str] = []
     try:
         with gzip.open(file, "rt", errors="replace") if file.suffix == ".gz" else file.open(errors="replace") as stream:
-            for number, line in enumerate(stream, 1):
+            for number, line in enumerate(iter(partial(stream.readline, MAX_LINE_LENGTH), ""), 1):
+                if len(line) == MAX_LINE_LENGTH or number > MAX_LINES:
+                    problems.append(
+                        f"{file}, line {number}: not read on; want lines shorter than {MAX_LINE_LENGTH} characters, "
+                        f"and at most {MAX_LINES} of them"
+                    )
+                    break
                 try:
                     row = json.loads(line)
                 except (ValueError, RecursionError):

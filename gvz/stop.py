@@ -9,10 +9,12 @@ class StopRequest:
 
     Attributes:
         signal: number of the first signal caught, or None.
+        at_once: the first signal ends things too, by KeyboardInterrupt: there is nothing yet that could be saved.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, at_once: bool = False) -> None:
         self.signal: int | None = None
+        self.at_once = at_once
         self._before: dict[int, object] = {}
 
     def __enter__(self) -> "StopRequest":
@@ -26,9 +28,11 @@ class StopRequest:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         del frame
-        if self.signal is not None:
+        again = self.signal is not None
+        if not again:
+            self.signal = number
+        if again or self.at_once:
             raise KeyboardInterrupt
-        self.signal = number
 
     @property
     def requested(self) -> bool:

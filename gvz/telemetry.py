@@ -5,15 +5,19 @@ docs/reference/metrics.md. Episode rows carry no wall-clock time, so that two sy
 same bytes. Imports gvz.{errors,progress,rundir}, gvz.transport, tensorboardX; wandb where it is asked for.
 """
 
+import contextlib
 import json
 import os
 import time
 import uuid
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tensorboardX import SummaryWriter
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]  # made at run time
+from tensorboardX.summary import scalar
 
 from gvz.errors import ConfigError
 from gvz.progress import TaskStatus
@@ -72,8 +76,9 @@ class Telemetry:
         self._run, self._tasks, self._upper_bound = run, tasks, upper_bound
         self._recent: list[deque[float]] = [deque(maxlen=RECENT_EPISODES) for _ in tasks]
         self._episodes = [0] * len(tasks)
-        self._events = SummaryWriter(str(run.tensorboard), purge_step=num_updates) if tensorboard else None
+        self._events = start_events(run.tensorboard, num_updates) if tensorboard else None
         self._wandb = start_wandb(run) if wandb else None
+        self._num_updates = num_updates
 
     def episode(self, stats: EpisodeStats, *, num_updates: int, env_steps: int) -> None:
         """Records a finished episode."""
@@ -120,12 +125,25 @@ class Telemetry:
     def scalars(self, num_updates: int, values: Mapping[str, float]) -> None:
         """Records a row of scalars at a gradient step."""
         row = {**values, **{f"task/{t.task}/score": t.score for t in self.task_statuses() if t.episodes}}
+        self._num_updates = num_updates
         self._run.append("metrics.jsonl", {"num_updates": num_updates, "time_s": time.time(), **row})
         if self._events is not None:
-            for name, value in row.items():
-                self._events.add_scalar(name, value, num_updates)
+            with self._until_the_disk_is_full(num_updates):
+                for name, value in row.items():
+                    event = Event(step=num_updates, wall_time=time.time(), summary=scalar(name, value))
+                    self._events.write_event(event)
         if self._wandb is not None:
             self._wandb.log({"num_updates": num_updates, **row})
+
+    @contextlib.contextmanager
+    def _until_the_disk_is_full(self, num_updates: int) -> Iterator[None]:
+        """Events cannot go on after a gap. The records, which hold the same, can."""
+        try:
+            yield
+        except OSError as error:
+            self._events = None
+            message = f"TensorBoard's events end at update {num_updates} ({error}); metrics.jsonl has the same scalars"
+            self.fault(Fault(actor=-1, lane=None, kind="tensorboard", message=message), num_updates=num_updates)
 
     def task_statuses(self) -> tuple[TaskStatus, ...]:
         """Recent play of each task."""
@@ -151,10 +169,25 @@ class Telemetry:
     def close(self) -> None:
         """Flushes the events. Can be repeated."""
         if self._events is not None:
-            self._events.close()
+            with self._until_the_disk_is_full(self._num_updates):
+                self._events.close()
+            self._events = None
         if self._wandb is not None:
             self._wandb.finish()
             self._wandb = None
+
+
+def start_events(directory: Path, num_updates: int) -> EventsWriter:
+    """A file of TensorBoard events, in which those of a killed run from `num_updates` on are taken back.
+
+    Written by the caller, as its buffer fills. (tensorboardX's own `SummaryWriter` writes in a thread which ends at
+    the first error, and its queue then blocks whoever logs, for ever.)
+    """
+    directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+    events = EventsWriter(str(directory / "events"))
+    events.write_event(Event(step=num_updates, file_version="brain.Event:2"))
+    events.write_event(Event(step=num_updates, session_log=SessionLog(status=SessionLog.START)))
+    return events
 
 
 def start_wandb(run: RunDir) -> "wandb.Run":

@@ -6,9 +6,8 @@ here waits for the device between log periods except a publication, which copies
 
 import contextlib
 import dataclasses
-import os
-import sys
 import time
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -21,17 +20,19 @@ import numpy as np
 from actors.inline import InlinePool
 from actors.pool import STOP_TIMEOUT_S, ActorPool
 from gvz import bill, janitor, machine
+from gvz.alarms import Expected, alarms
 from gvz.assemble import Parts, Pool, assemble
 from gvz.cache import xla_cache_directory
 from gvz.config import RunConfig
-from gvz.errors import WaitTimeoutError, WorkerError
+from gvz.errors import CheckpointError, WaitTimeoutError, WorkerError
 from gvz.progress import Progress, Status
 from gvz.rundir import START_RECORDS, RunDir
 from gvz.stop import StopRequest
 from gvz.telemetry import Rates, Telemetry
 from gvz.transport.messages import EpisodeStats, Fault, ParamsHeader
+from gvz.watchdog import Watchdog
 from learner import replay, train_step
-from learner.checkpoint import Checkpointer, Restored, restore_newest
+from learner.checkpoint import Checkpointer, Restored, checkpoint_steps, restore_newest
 from learner.ingest import Ingest
 from learner.limiter import RateLimiter
 from learner.metrics import TaskKpis
@@ -43,6 +44,10 @@ DRAIN_WAIT_S = 0.02
 """longest wait for a record before the loop looks after its actors again"""
 NO_RECORDS_TIMEOUT_S = 900.0
 """a run whose actors deliver nothing for so long is stopped; a stuck actor is replaced long before"""
+LONGEST_ROUND_S = 1800.0
+"""a learner that is at one round for so long (it compiles in one, too) is stuck in the device, and ended"""
+SAVE_RETRY_S, LONGEST_SAVE_RETRY_S = 60.0, 3600.0
+"""a failed checkpoint is tried again after so long, twice as long each time, or at the next period"""
 STATUS_PERIOD_S = 0.5
 """seconds between looks at the counters for the live panel"""
 
@@ -103,8 +108,11 @@ class Trainer:
             self._kpis.restore({name: np.asarray(values) for name, values in host["kpis"].items()})
             self._telemetry.restore(host["telemetry"])
         self._checkpointer = Checkpointer(run.path, keep=config.checkpoint.keep)
+        self._failed_saves, self._retry_save_s = 0, 0.0
+        self._expected, self._warned = _expected(config, parts), set[str]()
         self._metrics: dict[str, float] = {}
-        self._rates, self._last_record_s, self._last_status_s = Rates(), time.monotonic(), 0.0
+        self._rates, self._collected_s, self._last_status_s = Rates(), time.monotonic(), 0.0
+        self._without_records_s = 0.0
         self._last_rates: dict[str, float] = {}
         pool = InlinePool if config.mode == "sync" else ActorPool
         self._pool: Pool = pool(parts.pool_config, None if host is None else host["pool"])
@@ -116,29 +124,35 @@ class Trainer:
         Raises:
             WorkerError, WaitTimeoutError: the actors failed for good; a checkpoint is written first.
             NonFiniteError: the learner's numbers went wrong; the checkpoints before it stand.
+            CheckpointError: the last checkpoint could not be written.
         """
         try:
-            while self._counts.updates < self._config.learner.total_updates and not stop.requested:
-                self._collect()
-                self._supervise()
-                self._learn()
-                self._broadcast()
-                self._record()
-                self._save()
+            with Watchdog("the learner", LONGEST_ROUND_S) as watchdog:
+                while self._counts.updates < self._config.learner.total_updates and not stop.requested:
+                    watchdog.beat()
+                    self._collect()
+                    self._supervise()
+                    self._learn()
+                    self._broadcast()
+                    self._record()
+                    self._save()
         except (WorkerError, WaitTimeoutError):
-            self._save(force=True)
+            with contextlib.suppress(CheckpointError, WaitTimeoutError):  # it is reported; this is the worse news
+                self._save_last()
             raise
         self._progress.say("stopping: writing a checkpoint" if stop.requested else "done: writing the last checkpoint")
-        self._save(force=True)
+        self._save_last()
 
     def close(self, *, abandon_save: bool = False) -> None:
         """Ends every actor, waits for the checkpoint (or abandons both), closes the records. Can be repeated."""
         if abandon_save:
             self._checkpointer.abandon()
         self._pool.close(grace_s=0.0 if abandon_save else STOP_TIMEOUT_S)
-        self._checkpointer.wait()
-        self._report_save()
-        self._telemetry.close()
+        try:
+            self._checkpointer.wait()
+            self._report_save()
+        finally:
+            self._telemetry.close()
 
     # ------------------------------------------------------------------------------------- the arrows
 
@@ -153,12 +167,12 @@ class Trainer:
         steps = self._ingest.take_env_steps()
         self._limiter.insert(steps)
         self._counts.env_steps += steps
-        now = time.monotonic()
-        if blocks or ready_to_learn:
-            self._last_record_s = now
-        elif now - self._last_record_s > NO_RECORDS_TIMEOUT_S:
+        # a round's length at most: the time in which this process was stopped is not the actors' silence
+        waited_s, self._collected_s = min(time.monotonic() - self._collected_s, 1.0), time.monotonic()
+        self._without_records_s = 0.0 if blocks or ready_to_learn else self._without_records_s + waited_s
+        if self._without_records_s > NO_RECORDS_TIMEOUT_S:
             raise WaitTimeoutError(
-                f"learner waited {now - self._last_record_s:.0f} s for the actors' next step record; their logs are in "
+                f"learner waited {self._without_records_s:.0f} s for the actors' next step record; their logs are in "
                 f"{self._run.work}, what was done about them in faults.jsonl"
             )
 
@@ -230,28 +244,70 @@ class Trainer:
         row = self._measure()
         if logging:
             learner = {f"learner/{name}": value for name, value in self._metrics.items()}
-            self._telemetry.scalars(counts.updates, {**row, **learner, **self._replay_shares()})
+            scalars = {**row, **learner, **self._replay_shares()}
+            self._telemetry.scalars(counts.updates, scalars)
+            self._warn(scalars)
         self._progress.show(self._status(row))
 
-    def _save(self, *, force: bool = False) -> None:
-        """Whole state -> checkpoint, every period and at the end; a failed one is reported and tried again."""
-        counts = self._counts
-        if self._checkpointer.busy and not force:
+    def _warn(self, scalars: Mapping[str, float]) -> None:
+        """Says what should make a person look, each thing once."""
+        for condition, text in alarms(scalars, self._telemetry.task_statuses(), self._expected).items():
+            if condition not in self._warned:
+                self._warned.add(condition)
+                self._progress.say(f"warning: {text}")
+                self._telemetry.fault(_own_fault("warning", text), num_updates=self._counts.updates)
+
+    def _save(self) -> None:
+        """Whole state -> checkpoint, every period; a failed one is reported and tried again."""
+        if self._checkpointer.busy:
             return
         self._report_save()
-        period = self._config.checkpoint.period_updates
+        counts, period = self._counts, self._config.checkpoint.period_updates
         due = counts.updates // period > counts.saved_updates // period  # at its multiples, also after an interruption
-        if not (due or (force and counts.updates > counts.saved_updates)):
-            return
-        counts.saved_updates = counts.updates
-        arrays = {"learner": self._state, "replay": self._replay, "acting": self._acting}
-        self._checkpointer.save(counts.updates, arrays, self._state.params, self._host_state())
+        if due or (self._failed_saves and time.monotonic() > self._retry_save_s):
+            self._begin_save()
 
-    def _report_save(self) -> None:
-        for failure in self._checkpointer.failures():
-            self._progress.say(f"checkpoint failed, the next period tries again: {failure}")
-            fault = Fault(actor=-1, lane=None, kind="checkpoint", message=failure)
-            self._telemetry.fault(fault, num_updates=self._counts.updates)
+    def _save_last(self) -> None:
+        """The last checkpoint, waited for; if it fails it is tried once more.
+
+        Raises:
+            CheckpointError: it failed again. WaitTimeoutError: the disk does not answer.
+            NonFiniteError: the learner's numbers went wrong since they were last read.
+        """
+        failure = ""
+        for attempt in range(3):
+            if attempt > 0:
+                self._begin_save()
+            self._checkpointer.wait()
+            failure = self._report_save()
+            if self._counts.saved_updates == self._counts.updates and not self._failed_saves:
+                return
+        newest = max(checkpoint_steps(self._run.checkpoints), default=0)
+        raise CheckpointError(
+            f"the last checkpoint, at update {self._counts.updates}, could not be written: {failure}. The newest one "
+            f"is of update {newest}; mend this and give the same command to go on from there"
+        )
+
+    def _begin_save(self) -> None:
+        train_step.check_finite(self._state, self._run.path)
+        self._counts.saved_updates = self._counts.updates
+        arrays = {"learner": self._state, "replay": self._replay, "acting": self._acting}
+        self._checkpointer.save(self._counts.updates, arrays, self._state.params, self._host_state())
+
+    def _report_save(self) -> str:
+        """Notes how a save ended, if one did; returns why it failed."""
+        failure = self._checkpointer.outcome()
+        if failure is None:
+            return ""
+        if not failure:
+            self._failed_saves = 0
+            return ""
+        wait_s = min(SAVE_RETRY_S * 2**self._failed_saves, LONGEST_SAVE_RETRY_S)
+        self._failed_saves += 1
+        self._retry_save_s = time.monotonic() + wait_s
+        self._progress.say(f"checkpoint failed, tried again within {wait_s:.0f} s: {failure}")
+        self._telemetry.fault(_own_fault("checkpoint", failure), num_updates=self._counts.updates)
+        return failure
 
     def _host_state(self) -> dict[str, Any]:
         """What a checkpoint holds beside arrays, msgpack types."""
@@ -321,6 +377,24 @@ class Trainer:
         )
 
 
+def _own_fault(kind: str, message: str) -> Fault:
+    """Of the learner itself, not of an actor."""
+    return Fault(actor=-1, lane=None, kind=kind, message=message)
+
+
+def _expected(config: RunConfig, parts: Parts) -> Expected:
+    tasks, spec, agent = parts.pool_config.tasks, parts.agent.spec, config.agent
+    played = Counter(tasks[lane % len(tasks)] for lane in range(config.num_lanes))
+    return Expected(
+        games={task: played[task] for task in tasks},
+        timeout_steps=-(-config.resolved_scenario().timeout_frames(config.env.profile) // config.env.frame_skip),
+        num_slots=parts.replay_spec.num_slots,
+        v_min=spec.v_min if agent.v_min is None else agent.v_min,
+        v_max=spec.v_max if agent.v_max is None else agent.v_max,
+        distributional=agent.distributional,
+    )
+
+
 def _template(config: RunConfig, parts: Parts) -> dict[str, Any]:
     """Shapes and dtypes of a checkpoint's arrays."""
     spec = parts.replay_spec
@@ -333,16 +407,22 @@ def _template(config: RunConfig, parts: Parts) -> dict[str, Any]:
     }
 
 
-def train(config: RunConfig, run: RunDir) -> int:
+def train(config: RunConfig, run: RunDir, stop: StopRequest) -> int:
     """Trains, resuming if the run directory holds a checkpoint.
+
+    Args:
+        config: of the run.
+        run: where it is kept.
+        stop: entered; from when there is a trainer on, the first signal no longer ends things at once.
 
     Returns: 0 when all updates are done; 130 or 143 when a signal stopped the run, which is then saved.
 
     Raises:
         ResourceError: the machine is too small. GvzError: what a user can do something about.
+        KeyboardInterrupt: a second signal, or a first one before the trainer was there; nothing is left running.
     """
     jax.config.update("jax_compilation_cache_dir", str(xla_cache_directory()))
-    with StopRequest() as stop, Progress() as progress:
+    with Progress() as progress:
         for line in janitor.clean_dead_instances():
             progress.say(f"removed what a dead run left: {line}")
         parts = assemble(config, run.work)
@@ -361,6 +441,7 @@ def train(config: RunConfig, run: RunDir) -> int:
         run.write_config(config)
         started_from = 0 if restored is None else restored.num_updates
         run.append(START_RECORDS, {"num_updates": started_from, "time_s": time.time(), **machine.describe()})
+        stop.at_once = False
         trainer = Trainer(config, run, parts, progress, restored)
         del restored
         with contextlib.closing(trainer):
@@ -368,7 +449,5 @@ def train(config: RunConfig, run: RunDir) -> int:
                 trainer.run(stop)
             except KeyboardInterrupt:
                 trainer.close(abandon_save=True)
-                run.close()
-                sys.stderr.flush()
-                os._exit(stop.exit_code)  # a second signal: at once, though a checkpoint's thread may be writing
+                raise
         return stop.exit_code if stop.requested else 0

@@ -23,10 +23,13 @@ import msgpack
 import numpy as np
 import orbax.checkpoint as ocp
 
-from gvz.errors import CheckpointError
+from gvz.errors import CheckpointError, WaitTimeoutError
 
 CHECKPOINT_SCHEMA = 1
 """Raised by one whenever the arrays' or the host state's meaning changes."""
+
+WRITE_TIMEOUT_S = 1800.0
+"""a checkpoint that is not written by then never will be: orbax gives up its own part after 600 s"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -113,8 +116,9 @@ def verify(directory: Path) -> dict[str, Any]:
     """
     try:
         manifest = json.loads((directory / "manifest.json").read_text())
-        schema, listed = manifest["schema"], manifest["files"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        schema, _ = manifest["schema"], manifest["leaves"].keys()
+        listed = {name: (size, digest) for name, (size, digest) in manifest["files"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{directory}: no readable manifest.json ({type(error).__name__}): not whole") from error
     if schema != CHECKPOINT_SCHEMA:
         raise CheckpointError(f"{directory}: schema {schema!r}, want {CHECKPOINT_SCHEMA}")
@@ -122,10 +126,14 @@ def verify(directory: Path) -> dict[str, Any]:
     if present.keys() != listed.keys():
         raise CheckpointError(f"{directory}: files missing or unknown: {sorted(present.keys() ^ listed.keys())[:3]}")
     for name, (size, digest) in listed.items():
-        if present[name].stat().st_size != size:
-            raise CheckpointError(f"{directory}/{name}: {present[name].stat().st_size} bytes, want {size}: cut short")
-        if _digest(present[name]) != digest:
-            raise CheckpointError(f"{directory}/{name}: contents do not match the manifest: damaged")
+        try:
+            found_size = present[name].stat().st_size
+            if found_size != size:
+                raise CheckpointError(f"{directory}/{name}: {found_size} bytes, want {size}: cut short")
+            if _digest(present[name]) != digest:
+                raise CheckpointError(f"{directory}/{name}: contents do not match the manifest: damaged")
+        except OSError as error:
+            raise CheckpointError(f"{directory}/{name}: cannot be read: {error.strerror}") from error
     return manifest
 
 
@@ -156,13 +164,15 @@ def read(directory: Path, template: Any) -> tuple[Any, dict[str, Any]]:
         host = msgpack.unpackb((directory / "host.msgpack").read_bytes())
     except Exception as error:  # as for writing
         raise CheckpointError(f"{directory} cannot be read: {type(error).__name__}: {error}") from error
+    if _leaf_specs(flat) != _leaf_specs(empty) or not isinstance(host, dict):
+        raise CheckpointError(f"{directory}: its arrays or its host state are not what the manifest says: damaged")
     arrays = jax.tree.unflatten(jax.tree.structure(plain), [flat[f"{i:03d}"] for i in range(len(leaves))])
     return jax.tree.map(lambda t, x: jax.random.wrap_key_data(x) if _is_key(t) else x, template, arrays), host
 
 
 def checkpoint_steps(directory: Path) -> list[int]:
     """Gradient steps of the checkpoints in `directory`, ascending, valid or not."""
-    return sorted(int(p.name) for p in directory.glob("*") if p.is_dir() and p.name.isdigit())
+    return sorted(int(p.name) for p in directory.glob("*") if p.is_dir() and p.name.isdecimal())
 
 
 def restore_newest(directory: Path, template: Any) -> Restored | None:
@@ -196,7 +206,7 @@ class Checkpointer:
         """
         self._checkpoints, self._policies, self._keep = run_path / "checkpoints", run_path / "policies", keep
         self._thread: threading.Thread | None = None
-        self._failures: list[str] = []
+        self._outcome: str | None = None
         for folder in (self._checkpoints, self._policies):
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         self._remove_unfinished()
@@ -209,7 +219,10 @@ class Checkpointer:
     def save(self, num_updates: int, arrays: Any, params: Any, host: dict[str, Any]) -> None:
         """Snapshots `arrays` now and writes them in the background, `params` beside them for evaluation.
 
-        Waits for an earlier save first. A failure is kept for `failures`, never raised here.
+        Waits for an earlier save first. How it ended is kept for `outcome`; a failure is never raised here.
+
+        Raises:
+            WaitTimeoutError: the earlier save does not end.
         """
         self.wait()
         arrays, params = snapshot(arrays), snapshot(params)
@@ -218,23 +231,35 @@ class Checkpointer:
             try:
                 write(self._policies / str(num_updates), params, {"num_updates": num_updates})
                 write(self._checkpoints / str(num_updates), arrays, host)
-                for step in checkpoint_steps(self._checkpoints)[: -self._keep]:
+                # what is newer was damaged when the run went on from an older one: it takes no place among the kept
+                steps = [step for step in checkpoint_steps(self._checkpoints) if step <= num_updates]
+                for step in steps[: -self._keep]:
                     shutil.rmtree(self._checkpoints / str(step), ignore_errors=True)
+                self._outcome = ""
             except CheckpointError as error:
-                self._failures.append(str(error))
+                self._outcome = str(error)
 
-        self._thread = threading.Thread(target=work, name=f"checkpoint-{num_updates}", daemon=True)
+        self._thread = threading.Thread(target=work, name=f"checkpoint {num_updates}", daemon=True)
         self._thread.start()
 
-    def failures(self) -> list[str]:
-        """Messages of saves that failed since the last call."""
-        failed, self._failures = self._failures, []
-        return failed
+    def outcome(self) -> str | None:
+        """How the last save ended, told once: why it failed, or "" if it is written. None: nothing new has ended."""
+        outcome, self._outcome = self._outcome, None
+        return outcome
 
-    def wait(self) -> None:
-        """Waits until nothing is being written."""
+    def wait(self, timeout_s: float = WRITE_TIMEOUT_S) -> None:
+        """Waits until nothing is being written.
+
+        Raises:
+            WaitTimeoutError: it takes longer than `timeout_s`.
+        """
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(timeout_s)
+            if self._thread.is_alive():
+                raise WaitTimeoutError(
+                    f"the learner waited {timeout_s:g} s for {self._thread.name} to be written to {self._checkpoints}; "
+                    "the disk does not answer, or is too slow for checkpoints of this size"
+                )
             self._thread = None
 
     def abandon(self) -> None:

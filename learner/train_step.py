@@ -160,9 +160,8 @@ def read_metrics(
     Raises:
         NonFiniteError: a loss or gradient was NaN or infinite since the last read; the batch is saved.
     """
-    sums, non_finite = jax.device_get((state.metrics, state.non_finite.num_skipped))
-    if non_finite > 0:
-        raise _save_non_finite(jax.device_get(state.non_finite), diagnostics_dir)
+    check_finite(state, diagnostics_dir)
+    sums = jax.device_get(state.metrics)
     n = max(int(sums.num_updates), 1)
     metrics = {
         "loss": float(sums.loss) / n,
@@ -183,6 +182,12 @@ def read_metrics(
             metrics[f"priority/{name}"] = float(sums.task_priority[i]) / samples
             metrics[f"td_error/{name}"] = float(sums.task_td_error[i]) / samples
     return metrics, replace(state, metrics=_no_metrics(len(task_names)))
+
+
+def check_finite(state: LearnerState, diagnostics_dir: Path) -> None:
+    """Raises NonFiniteError as `read_metrics` does. Waits for the device."""
+    if jax.device_get(state.non_finite.num_skipped) > 0:
+        raise _save_non_finite(jax.device_get(state.non_finite), diagnostics_dir)
 
 
 def _update(

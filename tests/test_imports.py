@@ -11,6 +11,7 @@ ROOT = Path(__file__).parent.parent
 TIER_0 = ("gvz", "gvz.errors", "gvz.janitor", "gvz.specs", "gvz.registry", "gvz.cache", "gvz.transport")
 TIER_3 = (
     "configs",
+    "gvz.alarms",
     "gvz.assemble",
     "gvz.bill",
     "gvz.cli",
@@ -29,6 +30,7 @@ TIER_3 = (
     "gvz.stop",
     "gvz.telemetry",
     "gvz.train",
+    "gvz.watchdog",
 )
 BENCHMARK_MUST_NOT = ("jax", "flax", "optax", "chex", "orbax", "actors", "learner")
 OURS = ("gvz", "actors", "learner", "configs")

@@ -1,11 +1,13 @@
 """The run directory: locked, private, never overwritten; its records survive a cut."""
 
 import dataclasses
+import gzip
 import json
 import stat
 
 import pytest
 
+from gvz import rundir
 from gvz.config import load_config
 from gvz.errors import ConfigError, GvzError, ResumeError
 from gvz.rundir import RunDir, move_aside, read_records
@@ -66,9 +68,10 @@ def test_total_updates_may_not_shrink(tmp_path):
 
 def test_a_damaged_config_is_named(tmp_path):
     with RunDir(tmp_path) as run:
-        (tmp_path / "config.json").write_text('{"schema": 1, "config": {"nam')
-        with pytest.raises(ResumeError, match=r"config.json cannot be read"):
-            run.saved_config()
+        for text in ('{"schema": 1, "config": {"nam', "[" * 100_000, '{"schema": 1, "config": {}}'):
+            (tmp_path / "config.json").write_text(text)
+            with pytest.raises(ResumeError, match=r"config.json cannot be read"):
+                run.saved_config()
 
 
 def test_records_are_cut_to_what_a_checkpoint_vouches_for(tmp_path):
@@ -94,6 +97,22 @@ def test_everything_readable_of_a_damaged_record_is_read(tmp_path):
         "schema 'list', want 1",
         "not JSON (half-written?)",
     ]
+
+
+def test_a_small_file_that_unpacks_to_a_huge_line_is_not_read_on(tmp_path):
+    file = tmp_path / "episodes.jsonl.gz"
+    file.write_bytes(gzip.compress(b'{"schema": 1}\n' + b" " * 50_000_000))
+    assert file.stat().st_size < 100_000
+    rows, (problem,) = read_records(file)
+    assert rows == [{"schema": 1}]
+    assert "line 2: not read on; want lines shorter than 1048576 characters, and at most 4194304 of them" in problem
+
+
+def test_more_lines_than_any_run_writes_are_not_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(rundir, "MAX_LINES", 2)
+    (tmp_path / "episodes.jsonl").write_text('{"schema": 1}\n' * 5)
+    rows, problems = read_records(tmp_path / "episodes.jsonl")
+    assert (len(rows), len(problems)) == (2, 1)
 
 
 def test_a_missing_record_file_is_an_error(tmp_path):

@@ -11,14 +11,15 @@ import ctypes
 import hashlib
 import multiprocessing
 import os
+import queue
 import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from gvz.errors import EngineError, GvzError
+from gvz.errors import EngineError, GvzError, WaitTimeoutError
 from gvz.evaluation.players import Player
 from gvz.specs import EnvConfig
 
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 
+EPISODE_TIMEOUT_S = 900.0
+"""an episode takes seconds; a machine on which none ends for so long has a worker that hangs"""
 MAX_ATTEMPTS = 3
 """times an episode is begun anew when its engine died"""
 
@@ -113,6 +116,7 @@ def play(jobs: Iterable[tuple[Entrant, Episode]], *, num_workers: int) -> Iterat
 
     Raises:
         GvzError: a worker died.
+        WaitTimeoutError: no worker finished an episode for EPISODE_TIMEOUT_S; they are killed.
     """
     ordered = sorted(jobs, key=lambda job: (repr(job[0].env), job[1].task, id(job[0]), job[1][1:]))
     if num_workers == 0:
@@ -128,7 +132,19 @@ def play(jobs: Iterable[tuple[Entrant, Episode]], *, num_workers: int) -> Iterat
     )
     try:
         futures = {executor.submit(_play, job[0], id(job[0]), job[1]): job[0] for job in ordered}
-        for future in as_completed(futures):
+        finished: queue.SimpleQueue[Future[Row]] = queue.SimpleQueue()
+        for future in futures:
+            future.add_done_callback(finished.put)
+        for number_done in range(len(futures)):
+            try:
+                future = finished.get(timeout=EPISODE_TIMEOUT_S)
+            except queue.Empty:
+                for worker in multiprocessing.active_children():
+                    worker.kill()  # else the end of the pool would wait for it
+                raise WaitTimeoutError(
+                    f"evaluation: waited {EPISODE_TIMEOUT_S:g} s for one of {num_workers} workers to end an episode; "
+                    f"{len(futures) - number_done} are left, and can be played by the same command"
+                ) from None
             yield futures[future], future.result()
     except BrokenProcessPool as error:
         raise GvzError("evaluation: a worker process died; what it had not finished can be played again") from error

@@ -16,7 +16,7 @@ import pytest
 from fake_env import FRAME_SHAPE, config
 
 from actors import worker
-from actors.process import ActorProcess
+from actors.process import ActorProcess, log_path, read_log_tail
 from actors.worker import Worker
 from gvz.errors import WaitTimeoutError
 from gvz.transport.broadcast import BroadcastWriter
@@ -116,7 +116,7 @@ def test_told_to_stop_it_ends_well(spec: ActorSpec, ring: RingReader):
         assert process.wait(30)
         assert process.exit_text() == "exited with code 0"
         assert ring.writer_status().state == WriterState.STOPPED
-        assert process.log_tail() == ""
+        assert read_log_tail(log_path(spec)) == ""
     finally:
         process.end(grace_s=0.0)
 

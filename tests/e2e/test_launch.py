@@ -1,97 +1,17 @@
 """The real command on real Doom: trains, is interrupted, killed and resumed, and leaves nothing behind."""
 
-import contextlib
-import json
 import os
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import orbax.checkpoint as ocp
-import psutil
 import pytest
+from command import alive, arrays_of, descendants, finish, launch, num_updates, rows, wait_until
 
-from gvz.rundir import read_records
 from learner.checkpoint import checkpoint_steps, verify
 
-pytestmark = [pytest.mark.e2e, pytest.mark.engine, pytest.mark.timeout(600)]
-
-SMALL = (
-    "--config rainbow_4task.py --actors.num-actors 2 --actors.games-per-actor 2 --env.frame-height 36 "
-    "--env.frame-width 44 --env.grayscale --agent.conv-channels 8 8 --agent.conv-kernels 8 4 --agent.conv-strides 4 2 "
-    "--agent.hidden-units 32 --replay.capacity 4000 --learner.warmup-steps 300 --learner.batch-size 8 "
-    "--log.period-updates 20 --checkpoint.period-updates 100 --learner.target-period-updates 50"
-).split()
-
-
-def launch(run: Path, *extra: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "gvz.launch", *SMALL, "--run-dir", str(run), *extra],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-
-
-def finish(process: subprocess.Popen[str], timeout_s: float = 240) -> tuple[int, str]:
-    _, err = process.communicate(timeout=timeout_s)
-    return process.returncode, err
-
-
-def rows(run: Path, name: str) -> list[dict]:
-    found, problems = read_records(run / name)
-    assert problems == []
-    return found
-
-
-def wait_until(condition: Callable[[], bool], what: str, timeout_s: float = 180) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, f"waited {timeout_s} s for {what}"
-        time.sleep(0.05)
-
-
-def num_updates(run: Path) -> int:
-    file = run / "metrics.jsonl"
-    lines = file.read_text().splitlines() if file.exists() else []
-    return json.loads(lines[-1])["num_updates"] if lines else 0
-
-
-def descendants(process: subprocess.Popen[str]) -> list[psutil.Process]:
-    return psutil.Process(process.pid).children(recursive=True)
-
-
-def alive(processes: list[psutil.Process]) -> list[psutil.Process]:
-    return [p for p in processes if p.is_running() and p.status() != psutil.STATUS_ZOMBIE]
-
-
-def orphans() -> set[str]:
-    """Segments and queues of ours, or of engines, that no living process has mapped."""
-    mapped = ""
-    for process in psutil.process_iter():
-        with contextlib.suppress(OSError):
-            mapped += Path(f"/proc/{process.pid}/maps").read_text()
-    names = (p.name for p in Path("/dev/shm").iterdir() if p.name.startswith(("ViZDoom", "gvz-")))
-    return {name for name in names if f"/dev/shm/{name}" not in mapped}
-
-
-def arrays_of(checkpoint: Path) -> dict[str, np.ndarray]:
-    with ocp.StandardCheckpointer() as checkpointer:
-        return checkpointer.restore((checkpoint / "arrays").absolute())
-
-
-@pytest.fixture(autouse=True)
-def nothing_left():
-    """No segment and no stray engine file of ours remains after the test."""
-    before, files = orphans(), set(Path.cwd().glob("_vizdoom*"))
-    yield
-    wait_until(lambda: orphans() <= before, "shared memory to be removed", 15)
-    assert set(Path.cwd().glob("_vizdoom*")) <= files
+pytestmark = [pytest.mark.e2e, pytest.mark.engine, pytest.mark.timeout(600), pytest.mark.usefixtures("nothing_left")]
 
 
 def test_a_run_trains_to_its_end_and_goes_on_when_asked_for_more(tmp_path):
@@ -157,6 +77,20 @@ def test_a_second_signal_ends_at_once_and_clean(tmp_path):
     code, err = finish(process, 30)
     assert code == 130, err
     assert not alive(children)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_while_jax_is_imported_ends_at_once(tmp_path, number, code):
+    process = launch(tmp_path / "run")
+    maps = Path(f"/proc/{process.pid}/maps")
+    wait_until(lambda: "jaxlib" in maps.read_text(), "the import of jax")
+    start = time.monotonic()
+    process.send_signal(number)
+    got, err = finish(process, 60)
+    assert got == code, err
+    assert err.splitlines()[-1] == "stopped at once"
+    assert "Traceback" not in err
+    assert time.monotonic() - start < 30  # on a loaded machine; it takes a quarter of a second
 
 
 def test_a_killed_run_goes_on_from_its_checkpoint_without_a_burst(tmp_path):

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -39,7 +40,7 @@ def save(run: Path, step: int, keep: int = 2) -> None:
     saver = checkpoint.Checkpointer(run, keep=keep)
     saver.save(step, example(step), example(step)["params"], {"num_updates": step, "note": "é"})
     saver.wait()
-    assert saver.failures() == []
+    assert saver.outcome() == ""
 
 
 def test_what_is_written_is_read_back_exactly(tmp_path):
@@ -90,7 +91,34 @@ def largest(directory: Path) -> Path:
     return max((p for p in (directory / "arrays").rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
 
 
+def rewritten(**changes: object) -> Callable[[Path], object]:
+    """f(checkpoint): changes keys of its manifest."""
+
+    def rewrite(directory: Path) -> None:
+        file = directory / "manifest.json"
+        file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
+
+    return rewrite
+
+
+def forged(name: str, data: bytes) -> Callable[[Path], object]:
+    """f(checkpoint): replaces a file, and makes the manifest fit."""
+
+    def forge(directory: Path) -> None:
+        (directory / name).write_bytes(data)
+        listed = json.loads((directory / "manifest.json").read_text())["files"]
+        rewritten(files={**listed, name: [len(data), checkpoint._digest(directory / name)]})(directory)
+
+    return forge
+
+
 DAMAGES = {
+    "files in no map": (rewritten(files=[]), "no readable manifest"),
+    "leaves in no map": (rewritten(leaves=[["a", "b"]]), "no readable manifest"),
+    "a size without a hash": (rewritten(files={"host.msgpack": 3}), "no readable manifest"),
+    "manifest nested deeply": (lambda d: (d / "manifest.json").write_text("[" * 100_000), "no readable manifest"),
+    "host state that is no map": (forged("host.msgpack", b"\x93\x01\x02\x03"), "are not what the manifest says"),
+    "host state that is no msgpack": (forged("host.msgpack", b"\xc1"), "cannot be read"),
     "flipped bit": (lambda d: flip(largest(d)), "do not match the manifest"),
     "cut file": (lambda d: os.truncate(largest(d), 10), "cut short"),
     "missing file": (lambda d: largest(d).unlink(), "missing or unknown"),
@@ -145,9 +173,8 @@ def test_a_failed_save_is_reported_and_leaves_the_old_checkpoint(tmp_path):
     (tmp_path / "policies").write_text("a file where a directory should be")
     saver.save(2, example(2), example(2)["params"], {})
     saver.wait()
-    (failure,) = saver.failures()
-    assert "policies/2 could not be written" in failure
-    assert saver.failures() == []
+    assert "policies/2 could not be written" in (saver.outcome() or "")
+    assert saver.outcome() is None
     assert checkpoint.checkpoint_steps(tmp_path / "checkpoints") == [1]
 
 

@@ -1,0 +1,110 @@
+"""The real command as a process, and what can be seen of it: records, processes, shared memory, checkpoints."""
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orbax.checkpoint as ocp
+import psutil
+
+from gvz.rundir import read_records
+
+SMALL = (
+    "--config rainbow_4task.py --actors.num-actors 2 --actors.games-per-actor 2 --env.frame-height 36 "
+    "--env.frame-width 44 --env.grayscale --agent.conv-channels 8 8 --agent.conv-kernels 8 4 --agent.conv-strides 4 2 "
+    "--agent.hidden-units 32 --replay.capacity 4000 --learner.warmup-steps 300 --learner.batch-size 8 "
+    "--log.period-updates 20 --checkpoint.period-updates 100 --learner.target-period-updates 50"
+).split()
+
+
+def launch(run: Path, *extra: str, environment: Mapping[str, str] | None = None) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "gvz.launch", *SMALL, "--run-dir", str(run), *extra],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **(environment or {})},
+        start_new_session=True,
+    )
+
+
+def finish(process: subprocess.Popen[str], timeout_s: float = 240) -> tuple[int, str]:
+    """Exit code and standard error."""
+    _, err = process.communicate(timeout=timeout_s)
+    return process.returncode, err
+
+
+def rows(run: Path, name: str) -> list[dict[str, Any]]:
+    """The rows of a record file, which must all be readable."""
+    found, problems = read_records(run / name)
+    assert problems == []
+    return found
+
+
+def faults(run: Path) -> list[dict[str, Any]]:
+    """The rows of faults.jsonl while a run goes on, without one that is being written."""
+    file = run / "faults.jsonl"
+    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+
+
+def wait_until(condition: Callable[[], bool], what: str, timeout_s: float = 180) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, f"waited {timeout_s} s for {what}"
+        time.sleep(0.05)
+
+
+def num_updates(run: Path) -> int:
+    file = run / "metrics.jsonl"
+    lines = file.read_text().splitlines() if file.exists() else []
+    return json.loads(lines[-1])["num_updates"] if lines else 0
+
+
+def descendants(process: subprocess.Popen[str]) -> list[psutil.Process]:
+    return psutil.Process(process.pid).children(recursive=True)
+
+
+def actors(process: subprocess.Popen[str]) -> list[psutil.Process]:
+    """The run's actor processes."""
+    return [p for p in psutil.Process(process.pid).children() if "actors.worker" in arguments(p)]
+
+
+def engines(process: psutil.Process | subprocess.Popen[str]) -> list[psutil.Process]:
+    """The engines of an actor or of a whole run, those too that are still starting."""
+    return [p for p in psutil.Process(process.pid).children(recursive=True) if "+viz_instance_id" in arguments(p)]
+
+
+def arguments(process: psutil.Process) -> list[str]:
+    try:
+        return process.cmdline()
+    except psutil.Error:  # it has just ended
+        return []
+
+
+def alive(processes: list[psutil.Process]) -> list[psutil.Process]:
+    return [p for p in processes if p.is_running() and p.status() != psutil.STATUS_ZOMBIE]
+
+
+def orphans() -> set[str]:
+    """Segments and queues of ours, or of engines, that no living process has mapped."""
+    mapped = ""
+    for process in psutil.process_iter():
+        with contextlib.suppress(OSError):
+            mapped += Path(f"/proc/{process.pid}/maps").read_text()
+    names = (p.name for p in Path("/dev/shm").iterdir() if p.name.startswith(("ViZDoom", "gvz-")))
+    return {name for name in names if f"/dev/shm/{name}" not in mapped}
+
+
+def arrays_of(checkpoint: Path) -> dict[str, np.ndarray]:
+    """The arrays of a checkpoint by their place in its tree, as "['replay'].action"."""
+    leaves = list(json.loads((checkpoint / "manifest.json").read_text())["leaves"])
+    with ocp.StandardCheckpointer() as checkpointer:
+        stored = checkpointer.restore((checkpoint / "arrays").absolute())
+    return {leaves[int(number)]: array for number, array in stored.items()}

@@ -1,0 +1,278 @@
+"""Faults in a run of the real command with real engines: noticed, mended within a budget, and nothing lost."""
+
+import json
+import signal
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from command import (
+    actors,
+    alive,
+    arguments,
+    arrays_of,
+    descendants,
+    engines,
+    faults,
+    finish,
+    launch,
+    num_updates,
+    rows,
+    wait_until,
+)
+from streams import check_streams
+
+from gvz import cli, doctor, janitor
+from learner.checkpoint import checkpoint_steps, verify
+
+pytestmark = [pytest.mark.e2e, pytest.mark.engine, pytest.mark.timeout(900), pytest.mark.usefixtures("nothing_left")]
+
+HERE = Path(__file__).parent
+SYNC = "--mode sync --actors.num-actors 1 --actors.games-per-actor 4".split()
+
+
+def mischief(rules: dict[str, dict]) -> dict[str, str]:
+    """The environment of a run whose games do what tests/e2e/mischief/sitecustomize.py says."""
+    return {"PYTHONPATH": str(HERE / "mischief"), "MISCHIEF": json.dumps(rules)}
+
+
+def number_of(actor: psutil.Process) -> int:
+    """Which actor of the run a process is: its output goes to work/actor_N.log."""
+    return int(Path(f"/proc/{actor.pid}/fd/1").readlink().stem.removeprefix("actor_"))
+
+
+def actor(run, number: int) -> psutil.Process:
+    """The present process of an actor, once it has started both its games."""
+    found: list[psutil.Process] = []
+
+    def there() -> bool:
+        found[:] = [p for p in actors(run) if number_of(p) == number and len(engines(p)) == 2]
+        return bool(found)
+
+    wait_until(there, f"actor {number} with two engines")
+    return found[0]
+
+
+def await_fault(run_dir: Path, since: int, kind: str, number: int) -> dict:
+    """The row of faults.jsonl that tells of it, among those after the first `since`."""
+
+    def found() -> list[dict]:
+        return [row for row in faults(run_dir)[since:] if (row["kind"], row["actor"]) == (kind, number)]
+
+    wait_until(lambda: bool(found()), f"a fault {kind} of actor {number}; so far {faults(run_dir)}")
+    return found()[0]
+
+
+def test_a_run_goes_through_every_fault_of_its_actors_and_engines_and_loses_nothing(tmp_path):
+    run, slow = tmp_path / "run", tmp_path / "slow"
+    slow.touch()  # until it is taken away the games last long enough for all this
+    rules = {
+        "*": {"sleep_s": 0.1, "while": str(slow)},
+        "gore": {"raise_at": 30, "once": str(tmp_path / "raised")},
+    }
+    flags = "--learner.total-updates 600 --replay.capacity 12000 --actors.heartbeat-timeout-s 15".split()
+    process = launch(run, *flags, environment=mischief(rules))
+    seconds = {}
+
+    told = await_fault(run, 0, "exception", 0)
+    assert told["message"] == "RuntimeError: this step was meant to fail"
+    assert "sitecustomize.py" in told["traceback"]
+    assert "exited with code 1; restart 1 of 20" in await_fault(run, 0, "died", 0)["message"]
+
+    before, start = len(faults(run)), time.monotonic()
+    actor(process, 1).kill()
+    assert "actor 1 was ended by SIGKILL; restart 1 of 20" in await_fault(run, before, "died", 1)["message"]
+    seconds["actor killed"] = time.monotonic() - start
+
+    before, start = len(faults(run)), time.monotonic()
+    engines(actor(process, 0))[0].kill()
+    assert "a new one is started" in await_fault(run, before, "engine_crash", 0)["message"]
+    seconds["engine killed"] = time.monotonic() - start
+
+    stopped_actor, stopped_engine = actor(process, 1), engines(actor(process, 0))[0]
+    wait_until(lambda: num_updates(run) >= 20, "training")
+    before, start = len(faults(run)), time.monotonic()
+    stopped_actor.suspend()
+    stopped_engine.suspend()
+    assert "no answer within 10 s, killed" in await_fault(run, before, "engine_crash", 0)["traceback"]
+    seconds["engine stopped"] = time.monotonic() - start
+    assert "actor 1 gave no sign of life for 15." in await_fault(run, before, "stuck", 1)["message"]
+    seconds["actor stopped"] = time.monotonic() - start
+
+    before, start = len(faults(run)), time.monotonic()
+    starting: list[psutil.Process] = []
+    while not starting:  # of the actor that is being replaced
+        assert time.monotonic() - start < 120
+        starting = [engine for p in actors(process) if number_of(p) == 1 for engine in engines(p)]
+    starting[0].send_signal(signal.SIGSEGV)
+    actor(process, 1)
+    seconds["engine at its start"] = time.monotonic() - start
+    at_start = [(row["kind"], row["actor"]) for row in faults(run)[before:]]
+
+    slow.unlink()
+    code, err = finish(process)
+    assert code == 0, err
+    print(*(f"{what}: {s:.1f} s" for what, s in seconds.items()), at_start, sep="\n")
+    assert max(seconds.values()) < 120
+    wanted = Counter({("exception", 0): 1, ("died", 0): 1, ("died", 1): 1, ("engine_crash", 0): 2, ("stuck", 1): 1})
+    assert Counter((row["kind"], row["actor"]) for row in rows(run, "faults.jsonl")) - Counter(at_start) == wanted
+    assert set(at_start) <= {("died", 1), ("exception", 1), ("engine_start", 1)}
+
+    streams = check_streams(run, num_lanes=4, num_tasks=4)
+    assert rows(run, "metrics.jsonl")[-1]["num_updates"] == 600
+    cut = [row for row in streams.rows if row["cut"]]
+    assert [row["lane"] // 2 for row in cut] == [0, 0], "an episode whose engine died is recorded as cut"
+    assert all(row["truncated"] and not row["terminated"] for row in cut)
+    ends = Counter(row["actor"] for row in rows(run, "faults.jsonl") if row["kind"] in ("died", "stuck"))
+    for lane, missing in enumerate(streams.unrecorded):
+        assert missing <= ends[lane // 2], "only the episodes of an actor that died have no row"
+    for row in rows(run, "metrics.jsonl"):
+        assert abs(row["actors/env_steps"] - 300 - 4 * row["num_updates"]) <= 256 + 64
+
+
+def test_a_spent_budget_ends_the_run_with_a_checkpoint_and_the_stack_of_the_stuck_actor(tmp_path):
+    run = tmp_path / "run"
+    flags = "--learner.total-updates 1000000 --actors.heartbeat-timeout-s 5 --actors.max-restarts 1".split()
+    process = launch(run, *flags, environment=mischief({"gore": {"hang_at": 30}}))
+    actor(process, 1)
+    children = descendants(process)
+    code, err = finish(process)
+    assert code == 1
+    message = err[err.rindex("error: actor 0 ") :]
+    assert "gave no sign of life for 5." in message
+    assert "that was end 2 within 600 s, and actors.max_restarts allows 1 restarts. The end of " in message
+    assert f"The end of {run / 'work' / 'actor_0.log'}:\n" in message
+    assert 'sitecustomize.py", line' in message, "where it hangs, by faulthandler"
+    assert not alive(children)
+    assert [row["kind"] for row in rows(run, "faults.jsonl")] == ["stuck", "gave_up"]
+    assert all("sitecustomize.py" in row["traceback"] for row in rows(run, "faults.jsonl"))
+    saved = checkpoint_steps(run / "checkpoints")[-1]
+    assert saved > 0
+    verify(run / "checkpoints" / str(saved))
+
+
+def test_a_killed_launcher_takes_everything_along_and_the_doctor_cleans_up_after_dead_runs_only(
+    tmp_path, monkeypatch, capsys
+):
+    dead = launch(tmp_path / "dead", "--learner.total-updates", "1000000")
+    wait_until(lambda: num_updates(tmp_path / "dead") >= 20, "training")
+    living = launch(tmp_path / "living", "--learner.total-updates", "1000000")
+    wait_until(lambda: bool(engines(living)), "the first engine of the second run")
+    for engine in engines(dead)[:2]:
+        engine.suspend()
+    children = descendants(dead)
+    assert len(children) == 6
+    kill_and_wait(dead, children)
+
+    monkeypatch.setattr(doctor, "CHECKS", (doctor.check_leftovers,))
+    before = set(janitor.runtime_dir().glob("*.json"))
+    assert cli.main(["doctor", "--clean"]) == 0
+    out = capsys.readouterr().out
+    assert out.count("removed directory") == 4
+    assert out.count("removed shared memory gvz-") == 3  # two rings and the parameters
+    assert out.count("removed shared memory ViZDoom") == 12
+    left = [json.loads(file.read_text()) for file in janitor.runtime_dir().glob("*.json")]
+    assert left
+    assert {record["owner_pid"] for record in left} <= {living.pid, *(p.pid for p in descendants(living))}
+    assert len(before) > len(left)
+    wait_until(lambda: num_updates(tmp_path / "living") >= 20, "the second run to train on")
+    kill_and_wait(living, descendants(living))
+    janitor.clean_dead_instances()
+
+
+def kill_and_wait(process, children: list[psutil.Process]) -> None:
+    process.kill()
+    finish(process)
+    start = time.monotonic()
+    wait_until(lambda: not alive(children), "actors and engines to end", 10)
+    print(f"{len(children)} processes were gone after {time.monotonic() - start:.2f} s")
+
+
+@pytest.mark.parametrize("moment", ["actors.worker", "gvz.probe", "+viz_instance_id"])
+def test_a_launcher_killed_while_it_starts_leaves_nothing(tmp_path, moment):
+    cache = {"GVZ_CACHE_DIR": str(tmp_path / "cache")} if moment == "gvz.probe" else {}
+    process = launch(tmp_path / "run", environment=cache)
+    wait_until(lambda: any(moment in arguments(p) for p in descendants(process)), moment)
+    kill_and_wait(process, descendants(process))
+    janitor.clean_dead_instances()
+    assert janitor.dead_instances() == []
+
+
+def check_stalls(tmp_path: Path, pause_s: float) -> None:
+    run = tmp_path / "run"
+    rules = {"default": {"sleep_s": 0.3}, "fast_enemies": {"endless": True}}
+    process = launch(run, "--learner.total-updates", "500", environment=mischief(rules))
+    wait_until(lambda: num_updates(run) >= 100, "update 100")
+    process.send_signal(signal.SIGSTOP)
+    time.sleep(pause_s)
+    process.send_signal(signal.SIGCONT)
+    code, err = finish(process)
+    assert code == 0, err
+    metrics = rows(run, "metrics.jsonl")
+    for row in metrics:
+        assert abs(row["actors/env_steps"] - 300 - 4 * row["num_updates"]) <= 256 + 64
+    assert metrics[-1]["num_updates"] == 500
+    assert metrics[-1]["actors/restarts"] == 0
+    assert max(row["actors/wait_share"] for row in metrics) > 0.2, "the actors waited for the learner, and said so"
+    warning = "defend_the_center/fast_enemies has ended no episode in "
+    (fault,) = rows(run, "faults.jsonl")
+    assert fault["kind"] == "warning"
+    assert fault["message"].startswith(warning)
+    assert f"warning: {warning}" in err
+    assert check_streams(run, num_lanes=4, num_tasks=4).unrecorded == [0, 0, 0, 0]
+
+
+def test_stalls_lose_nothing_and_restart_nobody(tmp_path):
+    """The learner stops for 10 s, one actor is a hundred times slower than the other, one game never ends."""
+    check_stalls(tmp_path, 10.0)
+
+
+@pytest.mark.slow
+def test_stalls_of_half_a_minute_lose_nothing_and_restart_nobody(tmp_path):
+    check_stalls(tmp_path, 30.0)
+
+
+def test_a_checkpoint_that_cannot_be_written_is_reported_tried_again_and_at_last_an_error(tmp_path):
+    run = tmp_path / "run"
+    for step in (100, 300):  # a file where a directory should be: stops root too, as permissions would not
+        (run / "policies" / str(step)).parent.mkdir(parents=True, exist_ok=True)
+        (run / "policies" / str(step)).touch()
+    code, err = finish(launch(run, *SYNC, "--learner.total-updates", "300"))
+    assert code == 1, err
+    assert "checkpoint failed, tried again within 60 s: " in err
+    assert "error: the last checkpoint, at update 300, could not be written: " in err
+    assert f"{run / 'policies' / '300'} could not be written: NotADirectoryError" in err
+    assert "The newest one is of update 200; mend this and give the same command to go on from there" in err
+    assert checkpoint_steps(run / "checkpoints") == [200]
+    kinds = Counter((row["kind"], row["num_updates"]) for row in rows(run, "faults.jsonl"))
+    assert kinds.keys() == {("checkpoint", 100), ("checkpoint", 300)}
+    assert kinds["checkpoint", 300] >= 2, "the last one is tried again at once"
+
+    (run / "policies" / "300").unlink()
+    code, err = finish(launch(run, *SYNC, "--learner.total-updates", "300"))
+    assert code == 0, err
+    assert "goes on from update 200" in err
+    assert checkpoint_steps(run / "checkpoints") == [200, 300]
+
+
+def test_numbers_that_go_wrong_end_the_run_and_are_in_no_checkpoint(tmp_path):
+    run = tmp_path / "run"
+    agent = ("--agent.name", str(HERE / "fused_agent.py"))
+    code, err = finish(launch(run, *SYNC, *agent, "--log.period-updates", "10000", "--learner.total-updates", "300"))
+    assert code == 1, err
+    message = err[err.rindex("error: ") :]
+    assert "8 of 8 losses are NaN or infinite" in message
+    (batch,) = run.glob("nonfinite_batch_*.npz")
+    assert str(batch) in message
+    update = int(batch.stem.rpartition("_")[2])
+    assert 120 < update < 140
+    assert checkpoint_steps(run / "checkpoints") == checkpoint_steps(run / "policies") == [100]
+    for folder in ("checkpoints", "policies"):
+        verify(run / folder / "100")
+        arrays = arrays_of(run / folder / "100")
+        assert not [name for name, array in arrays.items() if array.dtype.kind == "f" and np.isnan(array).any()]
+    with np.load(batch) as saved:
+        assert np.isnan(saved["loss"]).all()
