@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 from gvz.errors import ConfigError
 
+MAX_LANES = 2**16
+"""games of a run: a step record numbers them with 16 bits"""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ActorsConfig:
@@ -28,10 +31,14 @@ class ActorsConfig:
     """a game's engine is restarted after so many episodes (0: never); ViZDoom has leaked memory over hours"""
 
     def __post_init__(self) -> None:
-        for name, low in (("num_actors", 1), ("games_per_actor", 1), ("ring_capacity", 8)):
+        for name, low, high in (
+            ("num_actors", 1, MAX_LANES),
+            ("games_per_actor", 1, MAX_LANES),
+            ("ring_capacity", 8, 2**20),
+        ):
             value = getattr(self, name)
-            if value is not None and value < low:
-                raise ConfigError(f"actors.{name}: got {value}, want at least {low}")
+            if value is not None and not low <= value <= high:
+                raise ConfigError(f"actors.{name}: got {value}, want {low}..{high}")
         for name in ("start_timeout_s", "heartbeat_timeout_s", "restart_window_s"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"actors.{name}: got {getattr(self, name)}, want more than 0 seconds")

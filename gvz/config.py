@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from actors.config import ActorsConfig
+from actors.config import MAX_LANES, ActorsConfig
 from gvz.errors import ConfigError
 from gvz.scenarios.base import Scenario, Split
 from gvz.specs import EnvConfig
@@ -108,6 +108,11 @@ class RunConfig:
                 f"replay.num_newest: got {self.replay.num_newest}, more than learner.batch_size "
                 f"{self.learner.batch_size}"
             )
+        if self.num_lanes > MAX_LANES:
+            raise ConfigError(
+                f"actors.num_actors, games_per_actor: got {self.num_actors} times {self.games_per_actor} games, want "
+                f"at most {MAX_LANES}"
+            )
         smallest = self.num_lanes * 4 * (self.agent.stack_size + self.agent.n_steps)
         if self.replay.capacity < smallest:
             raise ConfigError(
@@ -198,13 +203,16 @@ def find_config_file(text: str) -> Path:
         ConfigError: no such file; names the nearest.
     """
     path = Path(text)
-    if path.name != text:
-        if not path.is_file():
-            raise ConfigError(f"--config: no file {text!r} here ({Path.cwd()})")
-        return path
-    candidate = configs_directory() / (text if text.endswith(".py") else f"{text}.py")
-    if candidate.is_file():
-        return candidate
+    is_name = path.name == text
+    if is_name:
+        path = configs_directory() / (text if text.endswith(".py") else f"{text}.py")
+    try:
+        if path.is_file():
+            return path
+    except OSError as error:  # a name too long, a directory that may not be entered
+        raise ConfigError(f"--config: {text!r} cannot be read: {error.strerror}") from error
+    if not is_name:
+        raise ConfigError(f"--config: no file {text!r} here ({Path.cwd()})")
     names = sorted(p.stem for p in configs_directory().glob("*.py") if p.stem != "__init__")
     near = difflib.get_close_matches(Path(text).stem, names, n=1)
     hint = f"did you mean {near[0]!r}? " if near else ""
@@ -228,7 +236,12 @@ def load_config(text: str) -> RunConfig:
     config = namespace.get("CONFIG")
     if not isinstance(config, RunConfig):
         raise ConfigError(f"{path}: got {type(config).__name__} for CONFIG, want `CONFIG = RunConfig(...)`")
-    return config
+    try:
+        return _from_plain(
+            RunConfig, config_to_dict(config)["config"], "CONFIG"
+        )  # checks the types, which Python lets be
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
 
 
 # ------------------------------------------------------------------------------------------------------ JSON
@@ -264,17 +277,26 @@ def config_from_dict(saved: dict[str, Any]) -> RunConfig:
     if not isinstance(saved, dict) or saved.get("schema") != CONFIG_SCHEMA:
         raise ConfigError(f"saved configuration: want a map with schema {CONFIG_SCHEMA}")
     config = _from_plain(RunConfig, saved.get("config"), "config")
-    resolved = saved.get("resolved")
-    if not isinstance(resolved, dict) or set(resolved) != {"tasks", "num_actors", "games_per_actor"}:
-        raise ConfigError("saved configuration: resolved: want tasks, num_actors and games_per_actor")
+    resolved = _from_plain(_Resolved, saved.get("resolved"), "resolved")
+    if resolved.tasks != (tasks := tuple(task.id for task in config.resolved_tasks())):
+        raise ConfigError(f"resolved.tasks: got {list(resolved.tasks)}, but the configuration has {list(tasks)}")
     if config.mode == "sync":
         return config
-    return dataclasses.replace(
-        config,
-        actors=dataclasses.replace(
-            config.actors, num_actors=resolved["num_actors"], games_per_actor=resolved["games_per_actor"]
-        ),
-    )
+    numbers = {"num_actors": resolved.num_actors, "games_per_actor": resolved.games_per_actor}
+    return dataclasses.replace(config, actors=dataclasses.replace(config.actors, **numbers))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Resolved:
+    """What a run derived from its configuration and its machine."""
+
+    tasks: tuple[str, ...]
+    num_actors: int
+    games_per_actor: int
+
+
+_LARGEST_EXACT = 2**53
+"""integers up to this are floating-point numbers, too"""
 
 
 def _from_plain(kind: Any, value: Any, where: str) -> Any:
@@ -288,20 +310,23 @@ def _from_plain(kind: Any, value: Any, where: str) -> Any:
         if unknown:
             near = difflib.get_close_matches(unknown[0], hints, n=1)
             raise ConfigError(f"{where}.{unknown[0]}: unknown key" + (f", did you mean {near[0]}?" if near else ""))
+        needed = {f.name for f in dataclasses.fields(kind) if f.default is f.default_factory is dataclasses.MISSING}
+        if missing := sorted(needed - value.keys()):
+            raise ConfigError(f"{where}.{missing[0]}: missing")
         return kind(**{key: _from_plain(hints[key], item, f"{where}.{key}") for key, item in value.items()})
     if origin is tuple:
         if not isinstance(value, list):
             raise ConfigError(f"{where}: got {type(value).__name__}, want a list")
         return tuple(_from_plain(args[0], item, where) for item in value)
     if origin is Literal:
-        if value not in args:
+        if not any(type(value) is type(arg) and value == arg for arg in args):  # True and 1.0 equal 1, and are not it
             raise ConfigError(f"{where}: got {value!r}, want one of {list(args)}")
         return value
     if type(None) in args:  # an optional value
         return None if value is None else _from_plain(next(a for a in args if a is not type(None)), value, where)
     if kind is Path and isinstance(value, str):
         return Path(value)
-    if kind is float and type(value) is int:
+    if kind is float and type(value) is int and abs(value) <= _LARGEST_EXACT:
         return float(value)
     if type(value) is not kind:
         raise ConfigError(f"{where}: got {value!r}, want {getattr(kind, '__name__', kind)}")

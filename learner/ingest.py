@@ -106,6 +106,12 @@ class Ingest:
                     f"ingest: record {record['sequence']}: got {name} {record[name]}, want less than {limit}; actors "
                     "and learner were started with different runs"
                 )
+        if (wrong := np.flatnonzero(~np.isfinite(steps["reward"]))).size:
+            record = steps[wrong[0]]
+            raise TransportError(
+                f"ingest: record {record['sequence']} of lane {record['lane']}: got the reward {record['reward']}, "
+                "want a finite one"
+            )
         is_last = (steps["terminated"] | steps["truncated"]).tolist()
         for sequence, lane, first, last in zip(
             steps["sequence"].tolist(), steps["lane"].tolist(), steps["first"].tolist(), is_last, strict=True

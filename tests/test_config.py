@@ -55,6 +55,12 @@ def test_a_path_is_taken_as_a_path(tmp_path):
         ("1 / 0", "ZeroDivisionError: division by zero"),
         ("def (", "SyntaxError"),
         ("from gvz.config import RunConfig\nCONFIG = RunConfig(name='a b')", "name: got 'a b'"),
+        ("from gvz.config import RunConfig\nCONFIG = RunConfig(name='a', mode='asynch')", "CONFIG.mode: got 'asynch'"),
+        (
+            "from gvz.config import LearnerConfig, RunConfig\n"
+            "CONFIG = RunConfig(name='a', learner=LearnerConfig(batch_size=32.5))",
+            "CONFIG.learner.batch_size: got 32.5, want int",
+        ),
     ],
 )
 def test_a_broken_config_file_is_named(tmp_path, text, message):
@@ -163,6 +169,8 @@ def test_a_saved_configuration_with_an_unknown_key_is_refused():
         ("mode", "x", "config.mode: got 'x', want one of"),
         ("agent", 3, "config.agent: got int, want a map"),
         ("tasks", 3, "config.tasks: got int, want a list"),
+        ("training_set", 4.0, "config.training_set: got 4.0, want one of [1, 4, 8]"),
+        ("training_set", True, "config.training_set: got True, want one of"),
     ],
 )
 def test_a_saved_configuration_of_wrong_type_is_refused(key, value, message):
@@ -170,6 +178,40 @@ def test_a_saved_configuration_of_wrong_type_is_refused(key, value, message):
     saved["config"][key] = value
     with pytest.raises(ConfigError, match=re.escape(message)):
         config_from_dict(saved)
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "message"),
+    [
+        (("config", "name"), ..., "config.name: missing"),
+        (("resolved", "num_actors"), ..., "resolved.num_actors: missing"),
+        (("resolved", "num_actors"), "2", "resolved.num_actors: got '2', want int"),
+        (("resolved", "games_per_actor"), 10**30, f"actors.games_per_actor: got {10**30}, want 1..65536"),
+        (("resolved", "tasks"), ["seek_and_kill/red"], "resolved.tasks: got ['seek_and_kill/red'], but the configur"),
+        (("config", "learner", "learning_rate"), 10**400, "config.learner.learning_rate: got 1000"),
+    ],
+)
+def test_a_saved_configuration_that_is_damaged_is_refused(where, value, message):
+    saved = part = config_to_dict(load_config("rainbow_4task"))
+    for key in where[:-1]:
+        part = part[key]
+    if value is ...:
+        del part[where[-1]]
+    else:
+        part[where[-1]] = value
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        config_from_dict(saved)
+
+
+def test_more_games_than_a_record_can_number_are_refused():
+    flags = "--actors.num-actors 300 --actors.games-per-actor 300 --replay.capacity 100000000"
+    with pytest.raises(ConfigError, match="got 300 times 300 games, want at most 65536"):
+        parse(flags.split())
+
+
+def test_a_name_that_no_file_can_have_is_refused():
+    with pytest.raises(ConfigError, match=r"--config: 'a+' cannot be read: File name too long"):
+        find_config_file("a" * 300)
 
 
 def test_another_schema_is_refused():

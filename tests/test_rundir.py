@@ -1,9 +1,12 @@
 """The run directory: locked, private, never overwritten; its records survive a cut."""
 
+import contextlib
 import dataclasses
 import gzip
 import json
+import resource
 import stat
+from collections.abc import Iterator
 
 import pytest
 
@@ -138,3 +141,60 @@ def test_fresh_refuses_what_is_no_run_or_in_use(tmp_path):
         move_aside(tmp_path)
     with RunDir(tmp_path / "run"), pytest.raises(ResumeError, match="another running process"):
         move_aside(tmp_path / "run")
+
+
+@contextlib.contextmanager
+def full_disk(limit_bytes: int) -> Iterator[None]:
+    """No file of this process can grow beyond the limit: a write is cut there, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_rows_wait_for_room_on_a_full_disk_and_none_is_lost_or_torn(tmp_path):
+    wanted = [{"number": number, "text": "x" * 100} for number in range(100)]
+    with RunDir(tmp_path) as run:
+        for row in wanted[:10]:
+            run.append("metrics.jsonl", row)
+        whole = run.record_lengths()["metrics.jsonl"]
+        with full_disk(whole + 300):
+            for row in wanted[10:90]:
+                run.append("metrics.jsonl", row)
+            assert (tmp_path / "metrics.jsonl").stat().st_size == whole + 300, "the middle of a row"
+            assert run.record_lengths()["metrics.jsonl"] > 8 * whole, "what waits is counted"
+        for row in wanted[90:]:
+            run.append("metrics.jsonl", row)
+        assert run.record_lengths()["metrics.jsonl"] == (tmp_path / "metrics.jsonl").stat().st_size
+    rows, problems = read_records(tmp_path / "metrics.jsonl")
+    assert problems == []
+    assert rows == [{"schema": rundir.RECORDS_SCHEMA, **row} for row in wanted]
+
+
+def test_rows_that_wait_are_written_at_the_end_or_said_to_be_lost(tmp_path):
+    with RunDir(tmp_path / "late") as run:
+        with full_disk(0):
+            run.append("metrics.jsonl", {})
+        assert (tmp_path / "late" / "metrics.jsonl").stat().st_size == 0
+    assert len(read_records(tmp_path / "late" / "metrics.jsonl")[0]) == 1
+    run = RunDir(tmp_path / "lost")
+    with full_disk(0):
+        run.append("metrics.jsonl", {})
+        with pytest.raises(
+            GvzError, match=r"metrics.jsonl: 14 bytes of records cannot be written: File too large; mak"
+        ):
+            run.close()
+    run.close()
+    RunDir(tmp_path / "lost").close()
+
+
+def test_rows_do_not_wait_without_bound(tmp_path, monkeypatch):
+    monkeypatch.setattr(rundir, "MAX_WAITING_BYTES", 1000)
+    with RunDir(tmp_path) as run:
+        with full_disk(0):
+            for _ in range(71):
+                run.append("metrics.jsonl", {})
+            with pytest.raises(GvzError, match="1008 bytes of records cannot be written"):
+                run.append("metrics.jsonl", {})

@@ -63,6 +63,8 @@ DERIVED: dict[str, pl.DataType] = {
 
 REWARD_PREFIX = "reward/"
 """before the name of a reward component, one column each"""
+MAX_COMPONENTS = 64
+"""of a file: every name is a column, and a small file could have more cells than fit into memory"""
 
 _IDENTITY = ("run_dir", "player", "params", "profile", "action_set", "frame_skip", "task", "episode", "seed")
 """rows equal in these are one and the same episode"""
@@ -149,6 +151,11 @@ def _read_file(file: Path) -> tuple[pl.DataFrame, list[str]]:
     problems = _collapsed(problems)
     columns = {name: pl.Series(name, [row.get(name) for row in rows], dtype) for name, dtype in _FIELDS.items()}
     components = sorted({name for row in rows for name in row.get("reward_components", {})})
+    if len(components) > MAX_COMPONENTS:
+        problems.append(
+            f"{file}: got {len(components)} reward components, want at most {MAX_COMPONENTS}; none is shown"
+        )
+        components = []
     for name in components:
         values = [row.get("reward_components", {}).get(name) for row in rows]
         columns[REWARD_PREFIX + name] = pl.Series(values, dtype=pl.Float64)
@@ -175,12 +182,23 @@ def _what_is_wrong(row: dict[str, Any]) -> str | None:
         if value is None:
             if name in REQUIRED:
                 return f"no {name}, not a row of an evaluation"
-        elif type(value) not in _PYTHON_TYPES[dtype] or (isinstance(value, float) and not math.isfinite(value)):
+        elif type(value) not in _PYTHON_TYPES[dtype] or not _fits(value):
             return f"{name} is {value!r}, want {dtype}"
     components = row.get("reward_components", {})
-    if not isinstance(components, dict) or any(type(value) not in (int, float) for value in components.values()):
-        return f"reward_components is {components!r}, want name -> number"
+    if not isinstance(components, dict) or not all(_fits(n) and _is_number(v) for n, v in components.items()):
+        return f"reward_components is {components!r:.200}, want name -> number"
     return None
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and _fits(value)
+
+
+def _fits(value: str | float | bool) -> bool:
+    """Whether a value of JSON has a place in a column: a finite number of 64 bits, or text that is Unicode."""
+    if isinstance(value, str):
+        return not any("\ud800" <= letter <= "\udfff" for letter in value)  # halves of a pair
+    return -(2**63) <= value < 2**63 if isinstance(value, int) else math.isfinite(value)
 
 
 def _collapsed(problems: Sequence[str]) -> list[str]:
@@ -196,13 +214,15 @@ def _trained_on(directory: Path) -> tuple[list[str] | None, list[str]]:
     file = directory / "config.json"
     try:
         tasks = json.loads(file.read_text())["resolved"]["tasks"]
+        if not isinstance(tasks, list) or not all(isinstance(task, str) and _fits(task) for task in tasks):
+            raise ValueError("resolved.tasks: want a list of task ids")
     except FileNotFoundError:
         return None, []
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         return None, [
             f"its config.json cannot be read ({type(error).__name__}: {error}); what it was trained on is lost"
         ]
-    return [str(task) for task in tasks], []
+    return tasks, []
 
 
 def _task_columns(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:

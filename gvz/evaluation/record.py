@@ -15,6 +15,9 @@ from gvz.rundir import RECORDS_SCHEMA, read_records
 from gvz.specs import EnvConfig, SimplePlayer
 from gvz.tasks import Task, parse_task
 
+_ROW_BEGINS = b'{"schema": '
+_ANOTHER_FILE = "move the file aside or give another with --out"
+
 
 def row_identity(player: Mapping[str, Any], env: EnvConfig) -> dict[str, Any]:
     """What tells one evaluation's rows from another's in the same file: who played, and by which rules.
@@ -50,19 +53,27 @@ def rows_of(entrant: Entrant, rows: Iterable[Row]) -> dict[Episode, Row]:
 
 
 def read_rows(file: Path) -> list[Row]:
-    """The rows of a record file; none if there is no file yet. A half-written last line is cut off.
+    """The rows of a record file; none if there is no file yet. A half-written last row is cut off.
 
     Raises:
         ConfigError: a line that is damaged or of another schema.
     """
     if not file.exists():
         return []
-    whole = file.read_bytes().rpartition(b"\n")[0]
+    data = file.read_bytes()
+    end = data.rfind(b"\n") + 1
+    half = data[end:]
+    if not half.startswith(_ROW_BEGINS[: len(half)]):  # somebody's text: not a byte of it is ours to cut
+        raise ConfigError(f"{file}, last line: got {half[:20]!r}, no row of an evaluation; {_ANOTHER_FILE}")
     with file.open("r+b") as stream:
-        stream.truncate(len(whole) + 1 if whole else 0)
+        stream.truncate(end)
     rows, problems = read_records(file)
+    for number, row in enumerate(rows, 1):
+        episode = row.get("task"), row.get("episode"), row.get("base_seed", 0)
+        if tuple(map(type, episode)) != (str, int, int):
+            problems.append(f"{file}, row {number}: got task, episode and base seed {episode}: no row of an evaluation")
     if problems:
-        raise ConfigError(f"{problems[0]}; move the file aside or give another with --out")
+        raise ConfigError(f"{problems[0]}; {_ANOTHER_FILE}")
     return rows
 
 

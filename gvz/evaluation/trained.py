@@ -57,7 +57,7 @@ def read_run_config(run_dir: Path, agent_file: Path | None = None) -> RunConfig:
         config = config_from_dict(json.loads(file.read_text()))
     except OSError as error:
         raise ConfigError(f"{run_dir} is not a run directory ({file.name}: {error.strerror})") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{file} cannot be read: {error}") from error
     if not config.agent.name.endswith(".py"):
         return config
@@ -101,14 +101,14 @@ def find_checkpoints(run_dir: Path, wanted: Sequence[str]) -> list[int]:
         raise ConfigError(f"{directory} holds no policy yet; the first comes with the first checkpoint")
     chosen: set[int] = set()
     for text in wanted:
-        if last := re.fullmatch(r"last(\d+)", text):
+        if last := re.fullmatch(r"last(\d{1,9})", text):
             count = int(last[1])
             if not 1 <= count <= len(known):
                 raise ConfigError(f"--checkpoints: got {text}, but {directory} holds {len(known)} policies")
             chosen.update(known[-count:])
         elif text in ("newest", "all"):
             chosen.update(known if text == "all" else known[-1:])
-        elif text.isdecimal() and int(text) in known:
+        elif re.fullmatch(r"\d{1,18}", text) and int(text) in known:
             chosen.add(int(text))
         else:
             raise ConfigError(

@@ -146,7 +146,7 @@ def read_plan(results: Path) -> Plan | None:
             scale=saved["scale"],
             scenarios=None if scenarios is None else tuple(scenarios),
         )
-    except (ValueError, KeyError, TypeError, OSError) as error:
+    except (ValueError, KeyError, TypeError, OSError, RecursionError) as error:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(f"{file} cannot be read: {error!r}; move it aside to plan anew") from error
@@ -184,7 +184,7 @@ def parse_shard(text: str) -> tuple[int, int]:
     Raises:
         ConfigError: not of that form, or outside 1..n.
     """
-    match = re.fullmatch(r"(\d+)/(\d+)", text)
+    match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
     if match is None or not 1 <= int(match[1]) <= int(match[2]):
         raise ConfigError(f"--shard: got {text!r}, want i/n with i from 1 to n, for example 2/3")
     return int(match[1]), int(match[2])

@@ -99,7 +99,7 @@ def last_update(directory: Path) -> int:
     for line in reversed(tail(directory / "metrics.jsonl").splitlines()):
         try:
             return int(json.loads(line)["num_updates"])
-        except (ValueError, KeyError, TypeError):  # half-written
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):  # half-written, or no row of ours
             continue
     return 0
 
@@ -176,6 +176,6 @@ def _held_episodes(file: Path) -> dict[int, set[tuple[str, int]]]:
             row = json.loads(line)
             if row.get("base_seed", 0) == 0:  # the episodes that everybody meets
                 held.setdefault(row.get("num_updates", 0), set()).add((row["task"], row["episode"]))
-        except (ValueError, KeyError, AttributeError):  # half-written, or no row of ours
+        except (ValueError, KeyError, AttributeError, TypeError, RecursionError):  # half-written, or no row of ours
             continue
     return held

@@ -155,6 +155,10 @@ class BroadcastReader(_Board):
                     "words are damaged"
                 )
             if ticket % 2 == 0 and words[_TICKET] == ticket:
+                if not 0 <= epsilon <= 1:
+                    raise TransportError(
+                        f"broadcast {self.name}: got epsilon {epsilon}, want 0..1; its slot is damaged"
+                    )
                 self._seen = count
                 return params, header
             if time.monotonic() - start > _READ_TIMEOUT_S:

@@ -54,7 +54,8 @@ class Channel:
         Raises:
             TransportError: what arrived is not a message.
         """
-        while not self.closed and self._poll.poll(0):
+        # not more than the longest message at a time: a peer that never stops talking must not fill the memory
+        while not self.closed and len(self._buffer) < 4 + MAX_MESSAGE_BYTES and self._poll.poll(0):
             self._fill()
         messages: list[Message] = []
         while (message := self._take()) is not None:

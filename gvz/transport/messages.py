@@ -8,6 +8,7 @@ n-step returns and discounts are the replay's work.
 Control messages are msgpack maps with a `type`, never pickles: nothing that comes from a peer is ever executed.
 """
 
+import math
 import types
 import typing
 from dataclasses import asdict, dataclass, field
@@ -191,7 +192,10 @@ def decode(data: bytes) -> Message:
 
 
 def _fits(value: Any, kind: Any) -> bool:
-    """Whether an unpacked value is of an annotated type; an int passes for a float, a bool never for a number."""
+    """Whether an unpacked value is of an annotated type; an int passes for a float, a bool never for a number.
+
+    A float must be finite, an int must not be negative.
+    """
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if kind is Any:
         return True
@@ -201,7 +205,10 @@ def _fits(value: Any, kind: Any) -> bool:
         return type(value) is list and all(_fits(item, args[0]) for item in value)
     if origin is dict:
         return type(value) is dict and all(_fits(k, args[0]) and _fits(v, args[1]) for k, v in value.items())
-    return type(value) is kind or (kind is float and type(value) is int)
+    if kind is float:
+        return type(value) in (int, float) and math.isfinite(value)
+    # numbers of a message count something, or are the number of something
+    return type(value) is kind and (kind is not int or value >= 0)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -250,7 +250,7 @@ class RingWriter(_Ring):
             time.sleep(sleep_s)
             sleep_s = min(2 * sleep_s, _LONGEST_SLEEP_S)
             waited_ns = time.monotonic_ns() - start_ns
-            self._words[_WAITED_NS] = waited_before_ns + waited_ns
+            self._words[_WAITED_NS] = (waited_before_ns + waited_ns) % 2**64
             if waited_ns > timeout_s * 1e9:
                 raise WaitTimeoutError(
                     f"ring {self.name}: writer (pid {os.getpid()}) waited {waited_ns / 1e9:.1f} s for the learner to "

@@ -2,8 +2,10 @@
 
 import re
 
-_COMMENT_OR_STRING = re.compile(r'//[^\n]*|/\*.*?\*/|"(?:[^"\\\n]|\\.)*"', re.DOTALL)
-_ACTOR = re.compile(r"^\s*actor\s+(?P<name>[A-Za-z0-9_~.]+)", re.IGNORECASE | re.MULTILINE)
+# What is begun is always ended, at the latest by the end of the text: else each unclosed beginning would be searched
+# for its end again, in a time that grows with the square of their number. Likewise blank lines below.
+_COMMENT_OR_STRING = re.compile(r'//[^\n]*|/\*.*?(?:\*/|\Z)|"(?:[^"\\\n]|\\.)*"?', re.DOTALL)
+_ACTOR = re.compile(r"^[^\S\n]*actor\s+(?P<name>[A-Za-z0-9_~.]+)", re.IGNORECASE | re.MULTILINE)
 
 
 def declared_actors(decorate: str) -> list[str]:

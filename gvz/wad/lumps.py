@@ -5,6 +5,7 @@ behind its ENDMAP (where the engine does not look), opens files for writing, and
 Imports gvz.errors and the standard library.
 """
 
+import itertools
 import re
 import struct
 from collections.abc import Sequence
@@ -40,17 +41,22 @@ def read_wad(data: bytes) -> list[Lump]:
         raise WadError(
             f"WAD offset 4: got a directory of {count} lumps at {directory}, want one inside the {len(data)} bytes"
         )
-    lumps = [_read_lump(data, number, directory + number * ENTRY.size) for number in range(count)]
-    # Lumps that share bytes would let a small file name more data than fits into memory.
-    total = sum(len(lump.data) for lump in lumps)
-    if total > len(data):
-        raise WadError(f"WAD: got lumps of {total} bytes in a file of {len(data)}, want lumps that do not overlap")
+    lumps: list[Lump] = []
+    total = 0
+    for number in range(count):
+        lumps.append(_read_lump(data, number, directory + number * ENTRY.size))
+        total += len(lumps[-1].data)
+        # Lumps that share bytes would let a small file name more data than fits into memory.
+        if total > len(data):
+            raise WadError(
+                f"WAD: got {number + 1} lumps of {total} bytes in a file of {len(data)}, want lumps that do not overlap"
+            )
     return lumps
 
 
 def _read_lump(data: bytes, number: int, entry: int) -> Lump:
     offset, size, raw_name = ENTRY.unpack_from(data, entry)
-    name = raw_name.split(b"\0")[0].decode("latin-1").upper()
+    name = raw_name.split(b"\0")[0].decode("latin-1")
     if not _NAME.fullmatch(name):
         raise WadError(f"WAD offset {entry}: got the name {raw_name!r} of lump {number}, want 1 to 8 ASCII characters")
     if size < 0 or (size and not HEADER.size <= offset <= len(data) - size):
@@ -58,7 +64,7 @@ def _read_lump(data: bytes, number: int, entry: int) -> Lump:
             f"WAD offset {entry}: got lump {number} ({name}) of {size} bytes at {offset}, "
             f"want it inside the {len(data)} bytes"
         )
-    return Lump(name, data[offset : offset + size])
+    return Lump(name.upper(), data[offset : offset + size])
 
 
 def write_wad(lumps: Sequence[Lump]) -> bytes:
@@ -85,15 +91,19 @@ def read_maps(lumps: Sequence[Lump]) -> dict[str, dict[str, bytes]]:
         WadError: a map has no ENDMAP (the engine would refuse to start), or its name stands twice.
     """
     maps: dict[str, dict[str, bytes]] = {}
-    for i, lump in enumerate(lumps[:-1]):
-        if lumps[i + 1].name != "TEXTMAP":
-            continue
-        end = next((j for j in range(i, len(lumps)) if lumps[j].name == "ENDMAP"), None)
-        if end is None:
-            raise WadError(f"map {lump.name}: got the end of the WAD, want an ENDMAP lump")
-        if lump.name in maps:
-            raise WadError(f"map {lump.name}: got it twice, want it once")
-        maps[lump.name] = {other.name: other.data for other in lumps[i + 1 : end]}
+    name: str | None = None  # of the map that the next lumps belong to
+    for before, lump in itertools.pairwise(lumps):
+        if name is None and lump.name == "TEXTMAP":
+            name = before.name
+            if name in maps:
+                raise WadError(f"map {name}: got it twice, want it once")
+            maps[name] = {}
+        if lump.name == "ENDMAP":
+            name = None
+        if name is not None:
+            maps[name][lump.name] = lump.data
+    if name is not None:
+        raise WadError(f"map {name}: got the end of the WAD, want an ENDMAP lump")
     return maps
 
 

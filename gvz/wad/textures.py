@@ -1,6 +1,7 @@
 """Names of textures: what a WAD has, what a map uses. Imports gvz.errors, gvz.wad.lumps, gvz.wad.udmf."""
 
 import difflib
+import re
 import struct
 from collections.abc import Collection, Sequence
 
@@ -11,6 +12,7 @@ from gvz.wad.udmf import UdmfMap
 WALL_FIELDS = ("texturetop", "texturemiddle", "texturebottom")
 PLANE_FIELDS = ("texturefloor", "textureceiling")
 NO_TEXTURE = "-"
+_NAME = re.compile(r"[!-~]{1,8}")
 
 
 def wall_textures(lumps: Sequence[Lump]) -> frozenset[str]:
@@ -38,7 +40,11 @@ def _texture_names(lump: Lump) -> list[str]:
     for offset in struct.unpack_from(f"<{count}i", data, 4):
         if not 0 <= offset <= len(data) - 8:
             raise WadError(f"{lump.name}: got a texture at {offset}, want it inside the {len(data)} bytes")
-        names.append(data[offset : offset + 8].split(b"\0")[0].decode("latin-1").upper())
+        raw_name = data[offset : offset + 8]
+        name = raw_name.split(b"\0")[0].decode("latin-1")
+        if not _NAME.fullmatch(name):
+            raise WadError(f"{lump.name}: got the name {raw_name!r} at {offset}, want 1 to 8 ASCII characters")
+        names.append(name.upper())
     return names
 
 

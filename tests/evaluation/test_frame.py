@@ -98,6 +98,11 @@ def test_rows_of_another_schema_are_named_once_for_all(tmp_path):
         ({"score": float("nan")}, "row 2: score is nan, want Float64"),
         ({"episode": True}, "row 2: episode is True, want Int64"),
         ({"reward_components": {"kill": "x"}}, "row 2: reward_components is {'kill': 'x'}, want name -> number"),
+        ({"reward_components": [1]}, "row 2: reward_components is [1], want name -> number"),
+        ({"reward_components": {"\ud800": 1}}, "row 2: reward_components is {'\\ud800': 1}, want name -> number"),
+        ({"episode": 2**63}, f"row 2: episode is {2**63}, want Int64"),
+        ({"score": 10**400}, f"row 2: score is {10**400}, want Float64"),
+        ({"run": "\udfff"}, "row 2: run is '\\udfff', want String"),
     ],
 )
 def test_a_damaged_row_is_named_and_the_rest_is_read(tmp_path, fields, complaint):

@@ -76,6 +76,23 @@ def test_a_file_with_half_a_first_line_is_empty(tmp_path):
     assert path.read_bytes() == b""
 
 
+@pytest.mark.parametrize("text", ["precious, on one line", "two\nlines", '{"schema": 1, "task": "x"}\nhalf'])
+def test_a_last_line_that_is_no_row_of_ours_is_not_cut_off(tmp_path, text):
+    path = tmp_path / "notes.txt"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r"last line: got b'.*', no row of an evaluation; move the file aside"):
+        RecordFile(path)
+    assert path.read_text() == text
+
+
+@pytest.mark.parametrize("fields", [{}, {"task": [], "episode": 1}, {"task": "x", "episode": "1"}])
+def test_a_row_without_task_or_episode_is_refused(tmp_path, fields):
+    path = tmp_path / "evaluation.jsonl"
+    path.write_text(json.dumps({"schema": 1, **IDLE.identity, **fields}) + "\n")
+    with pytest.raises(ConfigError, match=r"row 1: got task, episode and base seed \(.*\): no row of an evaluation"):
+        RecordFile(path)
+
+
 @pytest.mark.parametrize("line", ["nonsense", json.dumps({"schema": 99})])
 def test_a_file_of_something_else_is_refused_and_left_alone(tmp_path, line):
     path = tmp_path / "evaluation.jsonl"

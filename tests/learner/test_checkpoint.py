@@ -1,10 +1,16 @@
 """Checkpoints: whole or not at all, and damage is named, never used."""
 
+import contextlib
 import dataclasses
+import itertools
 import json
 import os
+import re
+import resource
 import shutil
-from collections.abc import Callable
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jax
@@ -12,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gvz.errors import CheckpointError
+from gvz.errors import CheckpointError, WaitTimeoutError
 from learner import checkpoint
 from learner.agents.base import AgentSpec, make_agent
 from learner.config import AgentConfig
@@ -192,3 +198,132 @@ def test_a_snapshot_survives_donation_of_its_source():
     for _ in range(5):
         array = step(array)
     assert float(kept["x"].sum()) == 0.0
+
+
+def random_example(step: int, num_bytes: int = 300_000):
+    """Noise, which no compression makes smaller."""
+    noise = np.random.default_rng(step).integers(0, 256, num_bytes, dtype=np.uint8)
+    return {"noise": noise, "params": np.full(4, step, np.float32)}
+
+
+@contextlib.contextmanager
+def full_disk(limit_bytes: int) -> Iterator[None]:
+    """No file of this process can grow beyond the limit: a write fails as on a full disk, in the middle of a file."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk_is_reported_leaves_nothing_and_the_next_save_is_whole(tmp_path):
+    saver = checkpoint.Checkpointer(tmp_path, keep=2)
+    for step in (1, 2, 3):
+        arrays = random_example(step)
+        with full_disk(200_000) if step == 2 else contextlib.nullcontext():
+            saver.save(step, arrays, arrays["params"], {})
+            saver.wait()
+        if step == 2:
+            assert "checkpoints/2 could not be written" in (saver.outcome() or "")
+            assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == ["1"]
+        else:
+            assert saver.outcome() == ""
+    assert checkpoint.checkpoint_steps(tmp_path / "checkpoints") == [1, 3]
+    checkpoint.verify(tmp_path / "checkpoints" / "3")
+
+
+@pytest.mark.parametrize("folder", ["checkpoints", "policies"])
+def test_a_folder_that_cannot_be_written_to_is_reported(tmp_path, folder):
+    saver = checkpoint.Checkpointer(tmp_path, keep=2)
+    (tmp_path / folder).rename(tmp_path / "elsewhere")
+    (tmp_path / folder).touch()  # stops root too, as permissions would not
+    saver.save(1, example(), example()["params"], {})
+    saver.wait()
+    assert f"{folder}/1 could not be written: " in (saver.outcome() or "")
+    (tmp_path / folder).unlink()
+    (tmp_path / "elsewhere").rename(tmp_path / folder)
+    save(tmp_path, 1)
+    checkpoint.verify(tmp_path / folder / "1")
+
+
+def test_every_single_file_of_a_checkpoint_is_guarded(tmp_path):
+    checkpoint.write(tmp_path / "1", checkpoint.snapshot(example()), {"num_updates": 1})
+    files = [file for file in (tmp_path / "1").rglob("*") if file.is_file()]
+    assert len(files) > 5
+    for file in files:
+        whole = file.read_bytes()
+        for hurt in (whole[:-1], b"", bytes([whole[0] ^ 1]) + whole[1:], whole[:-1] + bytes([whole[-1] ^ 1])):
+            file.write_bytes(hurt)
+            with pytest.raises(CheckpointError, match=f"{re.escape(file.name)}|no readable manifest"):
+                checkpoint.verify(tmp_path / "1")
+        file.write_bytes(whole)
+    checkpoint.verify(tmp_path / "1")
+
+
+def test_no_changed_byte_of_a_manifest_is_accepted(tmp_path):
+    arrays = checkpoint.snapshot({"w": jnp.arange(6.0)})
+    checkpoint.write(tmp_path / "1", arrays, {})
+    file = tmp_path / "1" / "manifest.json"
+    whole = file.read_bytes()
+    for at in range(len(whole)):
+        file.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        with pytest.raises(CheckpointError):
+            checkpoint.read(tmp_path / "1", arrays)
+
+
+@pytest.mark.parametrize(("keep", "left"), [(1, [4, 9]), (2, [3, 4, 9]), (3, [2, 3, 4, 9]), (9, [1, 2, 3, 4, 9])])
+def test_a_damaged_newer_checkpoint_takes_no_place_among_the_kept(tmp_path, keep, left):
+    for step in (1, 2, 3, 9):
+        save(tmp_path, step, keep=9)
+    flip(largest(tmp_path / "checkpoints" / "9"))
+    save(tmp_path, 4, keep=keep)
+    assert checkpoint.checkpoint_steps(tmp_path / "checkpoints") == left
+    restored = checkpoint.restore_newest(tmp_path / "checkpoints", example())
+    assert restored is not None
+    assert restored.num_updates == 4
+
+
+def test_a_save_that_does_not_end_is_named(tmp_path):
+    saver = checkpoint.Checkpointer(tmp_path, keep=1)
+    arrays = random_example(1, 30_000_000)
+    saver.save(1, arrays, arrays["params"], {})
+    with pytest.raises(WaitTimeoutError, match=r"waited 0\.001 s for checkpoint 1 to be written to .*/checkpoints"):
+        saver.wait(0.001)
+    saver.wait()
+    assert saver.outcome() == ""
+
+
+WRITER = Path(__file__).with_name("checkpoint_writer.py")
+
+
+def kills(tmp_path: Path, count: int) -> list[dict]:
+    """What each life of a writer found that the one before left when it was killed at a random moment."""
+    with subprocess.Popen(
+        [sys.executable, str(WRITER), str(tmp_path), str(count)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        out, _ = process.communicate(timeout=280)
+    assert process.returncode == 0
+    return [json.loads(line) for line in out.splitlines()]
+
+
+def check_kills(found: list[dict], count: int) -> None:
+    assert len(found) == count + 1
+    assert found[0]["newest"] == 0
+    for before, after in itertools.pairwise(found):
+        assert after["damage"] == []
+        assert after["newest"] in (before["saved"], before["saved"] + 1), "what was reported written is there"
+        assert after["right"], "and it is what was written"
+    assert sum(life["unfinished"] for life in found) > count / 4, "kills in the middle of writing"
+    assert found[-1]["saved"] > count / 4
+
+
+def test_a_writer_killed_at_random_moments_always_leaves_its_newest_checkpoint_whole(tmp_path):
+    check_kills(kills(tmp_path, 30), 30)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_writer_killed_at_very_many_random_moments_leaves_its_newest_checkpoint_whole(tmp_path):
+    for part in range(10):
+        check_kills(kills(tmp_path / str(part), 30), 30)

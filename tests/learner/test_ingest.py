@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 import os
 from dataclasses import replace
 
@@ -150,6 +151,8 @@ def test_staleness_is_the_distribution_over_decisions():
     [
         ({"lane": 4}, "ingest: record 7: got lane 4, want less than 4; actors and learner were started with different"),
         ({"task": 3}, "ingest: record 7: got task 3, want less than 3; actors and learner were started with different"),
+        ({"reward": math.nan}, "ingest: record 7 of lane 0: got the reward nan, want a finite one"),
+        ({"reward": -math.inf}, "ingest: record 7 of lane 0: got the reward -inf, want a finite one"),
         ({"first": False}, "ingest: record 7 of lane 0 neither begins an episode nor continues one; records before it"),
         (
             {"params_version": 6},

@@ -1,5 +1,6 @@
 """The parameter queue: whole versions only, and a writer that never waits."""
 
+import math
 import secrets
 import signal
 import subprocess
@@ -119,6 +120,16 @@ def test_a_version_that_never_becomes_whole_is_named(
     words[0] += 1  # as if the writer were for ever at this slot
     monkeypatch.setattr(broadcast, "_READ_TIMEOUT_S", 0.05)
     with pytest.raises(WaitTimeoutError, match="reader waited 0 s for a whole version; the writer overtook every"):
+        reader.read()
+
+
+@pytest.mark.parametrize("epsilon", [-0.1, 1.5, math.nan])
+def test_an_epsilon_that_is_no_probability_is_found(
+    writer: BroadcastWriter, reader: BroadcastReader, name: str, epsilon: float
+):
+    publish(writer, 0)
+    np.memmap(Path("/dev/shm") / name, np.float64, "r+", HEADER_BYTES + 64, (8,))[3] = epsilon
+    with pytest.raises(TransportError, match=r"got epsilon (-0\.1|1\.5|nan), want 0\.\.1; its slot is damaged"):
         reader.read()
 
 

@@ -27,7 +27,7 @@ from gvz.transport.messages import (
 
 KINDS = {
     int: st.integers(0, 2**63 - 1),
-    float: st.floats(allow_nan=False),
+    float: st.floats(allow_nan=False, allow_infinity=False),
     str: st.text(max_size=20),
     bool: st.booleans(),
     bytes: st.binary(max_size=20),
@@ -59,6 +59,12 @@ def raw(**changes: Any) -> bytes:
     return msgpack.packb({k: v for k, v in {**good, **changes}.items() if v != "DROP"})  # pyright: ignore
 
 
+def episode(**changes: Any) -> bytes:
+    numbers = ("lane", "task", "episode", "seed", "length_frames", "length_steps", "params_version", "score", "reward")
+    good = {**dict.fromkeys(numbers, 1), "reward_components": {}, "terminated": True, "truncated": False}
+    return raw(**{"actor": "DROP", "pid": "DROP", "type": "episode", **good, **changes})
+
+
 @settings(max_examples=300, deadline=None)
 @given(message=ANY_MESSAGE)
 def test_what_was_said_is_heard(message: Message):
@@ -81,6 +87,10 @@ def test_what_was_said_is_heard(message: Message):
         (raw(pid=True), "'ready': got True for pid"),
         (raw(pid=None), "'ready': got None for pid"),
         (raw(pid=4.0), "'ready': got 4.0 for pid"),
+        (raw(pid=-4), "'ready': got -4 for pid"),
+        (episode(score=float("nan")), "'episode': got nan for score, want <class 'float'>"),
+        (episode(reward=float("-inf")), "'episode': got -inf for reward"),
+        (episode(reward_components={"kill": float("inf")}), "'episode': got {'kill': inf} for reward_components"),
     ],
 )
 def test_anything_else_is_refused_by_name(data: bytes, text: str):

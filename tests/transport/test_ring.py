@@ -264,6 +264,15 @@ def test_impossible_indices_are_found(published: int, consumed: int):
         reader.close()
 
 
+def test_a_damaged_count_of_waiting_does_not_end_the_writer(writer: RingWriter, reader: RingReader, name: str):
+    for number in range(CAPACITY):
+        write(writer, number)
+    words_of(name)[4] = 2**64 - 1
+    with pytest.raises(WaitTimeoutError, match="for the learner to read"):
+        writer.wait_for_space(1, timeout_s=0.01)
+    assert reader.writer_status().waited_for_space_s < 60  # counted on from there
+
+
 def test_an_unknown_writer_state_is_found(reader: RingReader, name: str):
     words_of(name)[2] = 77
     with pytest.raises(TransportError, match=r"got writer state 77, want 0\.\.5"):

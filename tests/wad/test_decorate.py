@@ -1,5 +1,9 @@
 """Names of actor classes in DECORATE text."""
 
+import time
+
+import pytest
+
 from gvz.wad.decorate import declared_actors
 
 TEXT = """
@@ -24,3 +28,15 @@ def test_actors_are_listed_in_order_without_comments_and_strings():
 def test_text_without_actors_declares_none():
     assert declared_actors("") == []
     assert declared_actors("actor") == []
+
+
+@pytest.mark.parametrize("piece", ["/*", '\\"', "\n", "\n ", "actor\n", '"\n', "actor /*"])
+def test_text_that_begins_much_and_ends_nothing_is_read_in_linear_time(piece: str):
+    start_s = time.thread_time()
+    assert declared_actors("actor A\n" + piece * 100_000)[0] == "A"
+    assert time.thread_time() - start_s < 2  # with searches for each end to the end of the text: minutes
+
+
+def test_what_is_not_ended_goes_on_to_the_end():
+    assert declared_actors("actor A\n/* actor\nactor B") == ["A"]
+    assert declared_actors('actor A\n"actor\nactor B') == ["A", "B"]

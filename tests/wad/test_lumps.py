@@ -53,9 +53,10 @@ def test_names_are_read_up_to_their_first_zero_and_in_upper_case():
         (HEADER.pack(b"PWAD", 1, 12) + ENTRY.pack(12, -1, b"A"), "WAD offset 12: got lump 0 (A) of -1 bytes at 12"),
         (HEADER.pack(b"PWAD", 1, 12) + ENTRY.pack(12, 0, b""), "WAD offset 12: got the name b'\\x00\\x00"),
         (HEADER.pack(b"PWAD", 1, 12) + ENTRY.pack(12, 0, b"\xff"), "of lump 0, want 1 to 8 ASCII characters"),
+        (HEADER.pack(b"PWAD", 1, 12) + ENTRY.pack(12, 0, b"\xdf"), "got the name b'\\xdf"),  # in upper case SS
         (
             HEADER.pack(b"PWAD", 4, 12) + ENTRY.pack(12, 60, b"A") * 4,
-            "WAD: got lumps of 240 bytes in a file of 76, want lumps that do not overlap",
+            "WAD: got 2 lumps of 120 bytes in a file of 76, want lumps that do not overlap",
         ),
     ],
 )  # fmt: skip
@@ -90,6 +91,20 @@ def test_a_map_that_stands_twice_is_refused():
     level = (("MAP01", b""), ("TEXTMAP", b""), ("ENDMAP", b""))
     with pytest.raises(WadError, match="map MAP01: got it twice, want it once"):
         read_maps(read_wad(wad(*level, *level)))
+
+
+def test_lumps_that_overlap_are_refused_before_they_fill_the_memory():
+    count, size = 60_000, 10**6  # 60 GB in a file of 2 MB
+    entries = ENTRY.pack(HEADER.size, size, b"A") * count
+    with pytest.raises(WadError, match="want lumps that do not overlap"):
+        read_wad(HEADER.pack(b"PWAD", count, HEADER.size + size) + bytes(size) + entries)
+
+
+def test_a_map_within_a_map_is_part_of_it():
+    lumps = wad(("MAP01", b""), ("TEXTMAP", b"t"), ("MAP02", b""), ("TEXTMAP", b"u"), ("ENDMAP", b""))
+    assert read_maps(read_wad(lumps)) == {"MAP01": {"TEXTMAP": b"u", "MAP02": b""}}
+    many = [Lump(name, b"") for number in range(20_000) for name in (f"M{number}", "TEXTMAP")]
+    assert len(read_maps([*many, Lump("ENDMAP", b"")])) == 1
 
 
 def test_a_map_wad_has_its_lumps_in_the_fixed_order():

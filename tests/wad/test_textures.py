@@ -43,6 +43,11 @@ def test_flats_are_the_lumps_between_their_markers():
         (struct.pack("<i", -2) + bytes(4), "TEXTURE1: got -2 textures in 8 bytes"),
         (struct.pack("<ii", 1, 4), "TEXTURE1: got a texture at 4, want it inside the 8 bytes"),
         (struct.pack("<iii", 1, -4, 0), "TEXTURE1: got a texture at -4, want it inside the 12 bytes"),
+        (
+            struct.pack("<ii8s", 1, 8, b"A\xff"),
+            r"TEXTURE1: got the name b'A\\xff.*' at 8, want 1 to 8 ASCII characters",
+        ),
+        (struct.pack("<ii8s", 1, 8, b""), "TEXTURE1: got the name b'.*' at 8, want 1 to 8 ASCII characters"),
     ],
 )
 def test_a_damaged_texture_lump_is_refused(data: bytes, message: str):

@@ -71,10 +71,9 @@ def _declare_function(unit: Unit, function: Function, number: int) -> None:
 
 
 def _check_started_scripts(unit: Unit) -> None:
-    numbers = {script.number for script in unit.scripts}
     for number, at in unit.started_scripts:
-        if number not in numbers:
-            raise error(at, f"got script {number}, which is not there, want one of {sorted(numbers)}")
+        if number not in unit.script_numbers:
+            raise error(at, f"got script {number}, which is not there, want one of {sorted(unit.script_numbers)}")
 
 
 def _emit_declaration(unit: Unit, declaration: Declaration) -> None:
@@ -126,8 +125,9 @@ def _emit_script(unit: Unit, script: Script) -> None:
     number = constant_number(unit, script.number, "script number")
     if not 1 <= number <= MAX_SCRIPT_NUMBER:
         raise error(script.at, f"script number: got {number}, want 1 to {MAX_SCRIPT_NUMBER}")
-    if any(number == other.number for other in unit.scripts):
+    if number in unit.script_numbers:
         raise error(script.at, f"got script {number} again, want another number")
+    unit.script_numbers.add(number)
     num_parameters = len(script.parameters)
     if num_parameters > MAX_SCRIPT_PARAMETERS:
         raise error(

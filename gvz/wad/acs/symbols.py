@@ -53,6 +53,7 @@ class Unit:
 
     code: Assembler = field(default_factory=Assembler)
     scripts: list[ScriptEntry] = field(default_factory=list)
+    script_numbers: set[int] = field(default_factory=set)
     functions: list[FunctionEntry] = field(default_factory=list)
     variables: list[MapVariableEntry] = field(default_factory=list)
     strings: dict[str, int] = field(default_factory=dict)
