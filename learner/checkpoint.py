@@ -28,6 +28,10 @@ from gvz.errors import CheckpointError, WaitTimeoutError
 CHECKPOINT_SCHEMA = 1
 """Raised by one whenever the arrays' or the host state's meaning changes."""
 
+BLOCK_BYTES = 2**24
+"""Larger arrays are stored in blocks of this size along their first axis: an array is encoded whole, beside a copy of
+it (300 MB in one piece took 19 s and 300 MB more, in blocks 3 s and 130 MB; the same loaded cores)."""
+
 WRITE_TIMEOUT_S = 1800.0
 """a checkpoint that is not written by then never will be: orbax gives up its own part after 600 s"""
 
@@ -72,6 +76,24 @@ def _files(directory: Path) -> list[Path]:
     return sorted(p for p in directory.rglob("*") if p.is_file() and p.name != "manifest.json")
 
 
+def _checkpointer() -> ocp.Checkpointer:
+    """Orbax, but for its copy of every array it is given: ours are snapshots."""
+    handler = ocp.type_handlers.NumpyHandler(deepcopy_host_arrays=False)
+    registry = ocp.type_handlers.create_type_handler_registry((np.ndarray, handler))
+    return ocp.Checkpointer(ocp.PyTreeCheckpointHandler(use_ocdbt=False, type_handler_registry=registry))
+
+
+def _blocks(leaves: list[np.ndarray]) -> dict[str, np.ndarray]:
+    """What is stored: views of the leaves, whole or in blocks of their first axis; an empty leaf has none."""
+    blocks = {}
+    for i, leaf in enumerate(leaves):
+        rows = max(1, BLOCK_BYTES // max(1, leaf[:1].nbytes)) if leaf.ndim else 1
+        starts = range(0, len(leaf), rows) if leaf.ndim and leaf.size else range(int(leaf.size))
+        for start in starts:
+            blocks[f"{i:03d}.{start}"] = leaf[start : start + rows] if leaf.ndim else leaf
+    return blocks
+
+
 def write(directory: Path, arrays: Any, host: dict[str, Any]) -> None:
     """Writes `arrays` (numpy leaves) and `host` (msgpack types) to `directory`, whole or not at all.
 
@@ -82,10 +104,8 @@ def write(directory: Path, arrays: Any, host: dict[str, Any]) -> None:
     try:
         shutil.rmtree(writing, ignore_errors=True)
         writing.mkdir(parents=True, mode=0o700)
-        flat = {f"{i:03d}": leaf for i, leaf in enumerate(jax.tree.leaves(arrays)) if leaf.size}
-        with ocp.StandardCheckpointer() as checkpointer:
-            checkpointer.save((writing / "arrays").absolute(), flat)
-            checkpointer.wait_until_finished()
+        with _checkpointer() as checkpointer:
+            checkpointer.save((writing / "arrays").absolute(), _blocks(jax.tree.leaves(arrays)))
         packed = msgpack.packb(host)
         assert packed is not None  # packb is typed for a stream too
         (writing / "host.msgpack").write_bytes(packed)
@@ -154,19 +174,19 @@ def read(directory: Path, template: Any) -> tuple[Any, dict[str, Any]]:
                 f"{directory}: leaf {path}: got {got.get(path, 'nothing')}, want {wanted.get(path, 'nothing')}; "
                 "it belongs to another configuration"
             )
-    leaves = jax.tree.leaves(plain)
-    # orbax refuses arrays without elements: they are left out, and made anew here
-    empty = {f"{i:03d}": np.empty(np.shape(leaf), leaf.dtype) for i, leaf in enumerate(leaves)}
+    leaves = [np.empty(np.shape(leaf), leaf.dtype) for leaf in jax.tree.leaves(plain)]
+    blocks = _blocks(leaves)
     try:
-        with ocp.StandardCheckpointer() as checkpointer:
-            stored = {name: leaf for name, leaf in empty.items() if leaf.size}
-            flat = empty | checkpointer.restore((directory / "arrays").absolute(), stored)
+        with _checkpointer() as checkpointer:
+            found = checkpointer.restore((directory / "arrays").absolute(), blocks)
         host = msgpack.unpackb((directory / "host.msgpack").read_bytes())
     except Exception as error:  # as for writing
         raise CheckpointError(f"{directory} cannot be read: {type(error).__name__}: {error}") from error
-    if _leaf_specs(flat) != _leaf_specs(empty) or not isinstance(host, dict):
+    if _leaf_specs(found) != _leaf_specs(blocks) or not isinstance(host, dict):
         raise CheckpointError(f"{directory}: its arrays or its host state are not what the manifest says: damaged")
-    arrays = jax.tree.unflatten(jax.tree.structure(plain), [flat[f"{i:03d}"] for i in range(len(leaves))])
+    for name, block in blocks.items():
+        block[...] = found.pop(name)
+    arrays = jax.tree.unflatten(jax.tree.structure(plain), leaves)
     return jax.tree.map(lambda t, x: jax.random.wrap_key_data(x) if _is_key(t) else x, template, arrays), host
 
 
