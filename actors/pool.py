@@ -25,7 +25,7 @@ STOP_TIMEOUT_S = 5.0
 _WAIT_SLEEP_S = 0.001
 _WORTHWHILE_SHARE = 1 / 8
 """of what the rings hold: with fewer records than that a drain rather waits, since it costs the same for one as for
-many (play at random on 2 cores: taking every record as it comes cost a third of the decisions/s)"""
+many (play at random on 2 cores: 12% more decisions/s than taking every record as it comes)"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -20,7 +20,7 @@ LOG_TAIL_BYTES = 4000
 _KILL_TIMEOUT_S = 30.0
 """the kernel takes milliseconds over a SIGKILL, unless the process hangs in a driver or in a dead file system"""
 
-_ENVIRONMENT = {
+ENVIRONMENT = {
     "JAX_PLATFORMS": "cpu",
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
     "NPROC": "1",  # size of XLA's own thread pools
@@ -34,7 +34,7 @@ _ENVIRONMENT = {
 def _environment() -> dict[str, str]:
     """Our own, with this process's import path and a cache of compiled acting functions (6 s less at a start)."""
     path = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path)
-    return {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(xla_cache_directory()), **_ENVIRONMENT, "PYTHONPATH": path}
+    return {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(xla_cache_directory()), **ENVIRONMENT, "PYTHONPATH": path}
 
 
 class ActorProcess:
