@@ -72,7 +72,12 @@ _IDENTITY = ("run_dir", "player", "params", "profile", "action_set", "frame_skip
 _NOT_RECORDS = {"discarded", "work", "checkpoints", "policies", "tensorboard"}
 """directories of a run that hold no records, or such as do not count"""
 
-_PYTHON_TYPES = {pl.String(): (str,), pl.Int64(): (int,), pl.Float64(): (int, float), pl.Boolean(): (bool,)}
+_PYTHON_TYPES: dict[pl.DataType, tuple[type, ...]] = {
+    pl.String(): (str,),
+    pl.Int64(): (int,),
+    pl.Float64(): (int, float),
+    pl.Boolean(): (bool,),
+}
 
 
 class RecordWarning(UserWarning):
@@ -182,22 +187,21 @@ def _what_is_wrong(row: dict[str, Any]) -> str | None:
         if value is None:
             if name in REQUIRED:
                 return f"no {name}, not a row of an evaluation"
-        elif type(value) not in _PYTHON_TYPES[dtype] or not _fits(value):
+        elif not fits(value, dtype):
             return f"{name} is {value!r}, want {dtype}"
     components = row.get("reward_components", {})
-    if not isinstance(components, dict) or not all(_fits(n) and _is_number(v) for n, v in components.items()):
+    is_map = isinstance(components, dict)
+    if not is_map or not all(fits(n, pl.String()) and fits(v, pl.Float64()) for n, v in components.items()):
         return f"reward_components is {components!r:.200}, want name -> number"
     return None
 
 
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and _fits(value)
-
-
-def _fits(value: str | float | bool) -> bool:
-    """Whether a value of JSON has a place in a column: a finite number of 64 bits, or text that is Unicode."""
+def fits(value: Any, dtype: pl.DataType) -> bool:
+    """Whether a value of JSON has a place in a column of texts, booleans, or finite numbers of 64 bits."""
+    if type(value) not in _PYTHON_TYPES[dtype]:
+        return False
     if isinstance(value, str):
-        return not any("\ud800" <= letter <= "\udfff" for letter in value)  # halves of a pair
+        return not any("\ud800" <= letter <= "\udfff" for letter in value)  # halves of a pair, which no file can hold
     return -(2**63) <= value < 2**63 if isinstance(value, int) else math.isfinite(value)
 
 
@@ -214,7 +218,7 @@ def _trained_on(directory: Path) -> tuple[list[str] | None, list[str]]:
     file = directory / "config.json"
     try:
         tasks = json.loads(file.read_text())["resolved"]["tasks"]
-        if not isinstance(tasks, list) or not all(isinstance(task, str) and _fits(task) for task in tasks):
+        if not isinstance(tasks, list) or not all(fits(task, pl.String()) for task in tasks):
             raise ValueError("resolved.tasks: want a list of task ids")
     except FileNotFoundError:
         return None, []

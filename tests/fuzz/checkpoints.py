@@ -13,7 +13,7 @@ from tests.fuzz.target import Target
 
 
 def _small_checkpoint(directory: Path) -> tuple[Path, dict[str, jax.ShapeDtypeStruct]]:
-    arrays = {"w": np.arange(6, dtype=np.float32).reshape(2, 3), "n": np.int32(7)}
+    arrays = {"w": np.arange(6, dtype=np.float32).reshape(2, 3), "n": np.array(7, np.int32)}
     checkpoint.write(directory / "5", arrays, {"num_updates": 5, "kpis": [1.0, 2.0]})
     return directory / "5", {name: jax.ShapeDtypeStruct(array.shape, array.dtype) for name, array in arrays.items()}
 

@@ -111,7 +111,7 @@ def evaluation_records(directory: Path) -> Target:
         file.write_bytes(data)
         frame, problems = collect_evaluations([file])
         assert {name: frame.schema[name] for name in REQUIRED | OPTIONAL} == REQUIRED | OPTIONAL
-        assert frame.select(REQUIRED).null_count().sum_horizontal().item() == 0
+        assert frame.select(list(REQUIRED)).null_count().sum_horizontal().item() == 0
         assert frame["score"].is_finite().all()
         assert not data.strip() or len(frame) or problems, "bytes were passed over without a word"
         write_table(frame, directory / "table.csv")

@@ -75,7 +75,7 @@ def command_line(_directory: Path) -> Target:
         --scenario seek_and_kill"""
     groups = ["\n".join(group.split()).encode() for line in flags.split("\n") for group in line.split("|")]
     words = [word for group in groups for word in group.split(b"\n")] + [b"\n", b"nan", b"-1", b"0", b"None", b"1e400"]
-    return Target(run=run, seeds=[b"\n".join(groups[:6]), *groups], words=words, max_bytes=512, num_inputs=60)
+    return Target(run=run, seeds=[b"\n".join(groups[:6]), *groups], words=words, max_bytes=512, num_inputs=40)
 
 
 def config_name(_directory: Path) -> Target:
