@@ -81,7 +81,7 @@ $(PEERS)-dopamine/.installed: $(VENV)/.installed benchmarks/peers/requirements-d
 
 soak: install    ## the main job for an hour while its actors are killed; then the page and plot made of it
 	$(BIN)/python -m benchmarks.soak $(ARGS)
-	$(BIN)/python -m benchmarks.soak_report
+	$(BIN)/python -m benchmarks.reliability
 
 bench-micro: install ## timed bodies of tests/perf
 	$(BIN)/python -m pytest tests/perf --benchmark-enable $(ARGS)

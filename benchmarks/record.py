@@ -1,13 +1,10 @@
 """A benchmark's record: one JSON file with what was measured, where, when, with what and by which command.
 
-Imports numpy, psutil and the standard library; jax only to ask for its devices, in `machine`.
+Imports psutil, gvz.{errors,machine} and the standard library; jax only to ask for its devices.
 """
 
-import importlib.metadata
 import json
 import os
-import platform
-import subprocess
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,13 +12,13 @@ from typing import Any
 import psutil
 
 from benchmarks.rounds import Row
+from gvz import machine
 from gvz.errors import ConfigError
 
 SCHEMA = 1
 """Stands in every record; raised by one when a record's meaning changes."""
 ROOT = Path(__file__).parent.parent
 DIRECTORY = ROOT / "results" / "performance"
-PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "vizdoom", "opencv-python-headless")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,36 +42,18 @@ class Record:
     rows: list[Row]
 
 
-def machine() -> dict[str, Any]:
+def describe_machine() -> dict[str, Any]:
     """What the figures were measured on; load and free memory are those at the start."""
-    import jax
-
-    models = [line.partition(":")[2].strip() for line in _lines("/proc/cpuinfo") if line.startswith("model name")]
     return {
-        "cpu": models[0] if models else platform.processor(),
-        "cores": len(os.sched_getaffinity(0)),
-        "memory_bytes": psutil.virtual_memory().total,
+        **machine.hardware(),
         "free_memory_bytes": psutil.virtual_memory().available,
         "load": [round(load, 2) for load in os.getloadavg()],
-        "system": f"{platform.system()} {platform.machine()}",
-        "devices": [f"{device.platform}: {device.device_kind}" for device in jax.devices()],
     }
 
 
-def versions() -> dict[str, str]:
-    """Python and the packages that decide the figures."""
-    return {"python": platform.python_version(), **{name: importlib.metadata.version(name) for name in PACKAGES}}
-
-
-def commit() -> str:
+def describe_commit() -> str:
     """Of the checkout, with `+changes` if measured files differ from it; "unknown" outside of one."""
-    command = ["git", "-C", str(ROOT)]
-    head = subprocess.run([*command, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=False)
-    if head.returncode != 0:
-        return "unknown"
-    measured = ("gvz", "actors", "learner", "configs", "benchmarks")
-    changed = subprocess.run([*command, "diff", "--quiet", "HEAD", "--", *measured], check=False)
-    return head.stdout.strip() + ("+changes" if changed.returncode else "")
+    return machine.commit((*machine.MEASURED, "benchmarks")) or "unknown"
 
 
 def write(record: Record, directory: Path) -> Path:
@@ -107,8 +86,3 @@ def read_all(directory: Path = DIRECTORY) -> list[Record]:
             raise ConfigError(f"{file}: made by --quick, its figures mean nothing; measure without")
         records.append(record)
     return records
-
-
-def _lines(path: str) -> list[str]:
-    file = Path(path)
-    return file.read_text().splitlines() if file.exists() else []

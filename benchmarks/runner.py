@@ -1,7 +1,7 @@
 """Finds the benchmarks, and runs each in a process of its own, so that none can sink, slow or outlive the rest.
 
 A benchmark is a file of this package with a docstring and a function `measure(budget) -> list of rows`; its file name
-is its name. Imports the standard library, gvz.{cache,errors,janitor,registry} and benchmarks.{record,rounds}.
+is its name. Imports the standard library, gvz.{cache,errors,janitor,machine,registry} and benchmarks.{record,rounds}.
 """
 
 import contextlib
@@ -21,6 +21,7 @@ from benchmarks.rounds import Budget
 from gvz import janitor
 from gvz.cache import xla_cache_directory
 from gvz.errors import ConfigError
+from gvz.machine import versions
 from gvz.registry import discover
 
 TIMEOUT_S = 900.0
@@ -52,7 +53,7 @@ def run_in_process(name: str, budget: Budget, command: str) -> record.Record:
     import jax
 
     jax.config.update("jax_compilation_cache_dir", str(xla_cache_directory()))
-    machine, commit = record.machine(), record.commit()
+    machine, commit = record.describe_machine(), record.describe_commit()
     date, start = time.strftime("%Y-%m-%d %H:%M", time.gmtime()), time.monotonic()
     rows = benchmarks()[name].measure(budget)
     return record.Record(
@@ -65,7 +66,7 @@ def run_in_process(name: str, budget: Budget, command: str) -> record.Record:
         quick=budget.quick,
         seconds=round(time.monotonic() - start, 1),
         machine=machine,
-        versions=record.versions(),
+        versions=versions(),
         rows=rows,
     )
 

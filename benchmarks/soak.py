@@ -28,6 +28,7 @@ from rich.console import Console
 
 from benchmarks import record
 from benchmarks.whole import end_run, tree_bytes
+from gvz import machine
 from gvz.rundir import read_records
 
 SCHEMA = 1
@@ -120,7 +121,7 @@ class Watched:
 def soak(options: Soak, console: Console) -> dict[str, Any]:
     """Runs it all; returns the record."""
     started = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
-    machine, commit = record.machine(), record.commit()
+    hardware, commit = machine.hardware(), record.describe_commit()
     with tempfile.TemporaryDirectory(prefix="gvz-soak-") as directory:
         run = Watched(Path(directory) / "run", options.flags)
         samples: list[dict[str, float]] = []
@@ -154,8 +155,8 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
             "date": started,
             "commit": commit,
             "command": "python -m benchmarks.soak " + shlex.join(_words(options)),
-            "machine": machine,
-            "versions": record.versions(),
+            "machine": hardware,
+            "versions": machine.versions(),
             "settings": {**asdict(options), "out": None, "flags": list(options.flags)},
             "kills": kills,
             "stretches": [{k: v if k == "kind" else round(v, 3) for k, v in s.items()} for s in stretches],

@@ -1,6 +1,6 @@
-"""docs/RELIABILITY.md from the committed record of the soak: its table, between markers, and its plot.
+"""docs/RELIABILITY.md from the committed records of the soak and of the fuzzing: tables between markers, and a plot.
 
-    python -m benchmarks.soak_report
+    python -m benchmarks.reliability
 
 Imports benchmarks.{record,report,soak}; matplotlib only to draw.
 """
@@ -12,9 +12,11 @@ from typing import Any
 
 from benchmarks import record
 from benchmarks.report import between
-from benchmarks.soak import DIRECTORY, SCHEMA, summary
+from benchmarks.soak import DIRECTORY, summary
 from gvz.errors import ConfigError
 
+SCHEMA = 1
+"""of both records"""
 PAGE = record.ROOT / "docs" / "RELIABILITY.md"
 PLOT = record.ROOT / "docs" / "images" / "reliability_soak.png"
 _GROWS = {
@@ -27,8 +29,8 @@ _GROWS = {
 }
 
 
-def read(file: Path = DIRECTORY / "soak.json") -> dict[str, Any]:
-    """The record.
+def read(file: Path) -> dict[str, Any]:
+    """A record.
 
     Raises:
         ConfigError: it is not there, or of another schema.
@@ -36,13 +38,30 @@ def read(file: Path = DIRECTORY / "soak.json") -> dict[str, Any]:
     try:
         made = json.loads(file.read_text())
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{file}: no record of a soak ({error}); `make soak` makes one") from error
+        raise ConfigError(f"{file}: no record ({error}); `make soak` and `make fuzz` make them") from error
     if not isinstance(made, dict) or made.get("schema") != SCHEMA:
-        raise ConfigError(f"{file}: want a record of schema {SCHEMA}; `make soak` makes one")
+        raise ConfigError(f"{file}: want a record of schema {SCHEMA}; `make soak` and `make fuzz` make them")
     return made
 
 
-def table(made: dict[str, Any]) -> str:
+def fuzz_table(made: dict[str, Any]) -> str:
+    """Inputs tried and edges covered, by what was fed with them."""
+    lines = [
+        f"*{made['date']} UTC, commit {made['commit']}, `{made['command']}`.*",
+        "",
+        "| target | inputs | seconds | edges covered | broken promises |",
+        "|---|---|---|---|---|",
+        *(
+            f"| {name} | {found['inputs']:,} | {found['seconds']:.0f} | {found['edges']:,} | "
+            f"{len(found['failures']) or 'none'} |"
+            for name, found in made["targets"].items()
+        ),
+        f"| **all** | **{made['inputs']:,}** | | | |",
+    ]
+    return "\n".join(lines)
+
+
+def soak_table(made: dict[str, Any]) -> str:
     """What was done, what it cost, what grew, what was lost."""
     ratios, machine = summary(made), made["machine"]
     minutes = sum(s["end_s"] - s["begin_s"] for s in made["stretches"] if s["kind"] == "kills") / 60
@@ -108,12 +127,14 @@ def draw(made: dict[str, Any], out: Path) -> None:
 def main() -> int:
     """Writes page and plot; returns the exit code."""
     try:
-        made = read()
-        PAGE.write_text(between(PAGE.read_text(), PAGE, "soak", table(made), "python -m benchmarks.soak_report"))
+        soak, fuzz = read(DIRECTORY / "soak.json"), read(DIRECTORY / "fuzz.json")
+        page, command = PAGE.read_text(), "python -m benchmarks.reliability"
+        page = between(page, PAGE, "soak", soak_table(soak), command)
+        PAGE.write_text(between(page, PAGE, "fuzz", fuzz_table(fuzz), command))
     except ConfigError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
-    draw(made, PLOT)
+    draw(soak, PLOT)
     for file in (PAGE, PLOT):
         print(file.relative_to(record.ROOT))
     return 0
