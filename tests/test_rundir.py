@@ -1,12 +1,9 @@
 """The run directory: locked, private, never overwritten; its records survive a cut."""
 
-import contextlib
 import dataclasses
 import gzip
 import json
-import resource
 import stat
-from collections.abc import Iterator
 
 import pytest
 
@@ -14,6 +11,7 @@ from gvz import rundir
 from gvz.config import load_config
 from gvz.errors import ConfigError, GvzError, ResumeError
 from gvz.rundir import RunDir, move_aside, read_records
+from tests.full_disk import full_disk
 
 CONFIG = load_config("rainbow_4task")
 
@@ -143,17 +141,6 @@ def test_fresh_refuses_what_is_no_run_or_in_use(tmp_path):
         move_aside(tmp_path / "run")
 
 
-@contextlib.contextmanager
-def full_disk(limit_bytes: int) -> Iterator[None]:
-    """No file of this process can grow beyond the limit: a write is cut there, as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 def test_rows_wait_for_room_on_a_full_disk_and_none_is_lost_or_torn(tmp_path):
     wanted = [{"number": number, "text": "x" * 100} for number in range(100)]
     with RunDir(tmp_path) as run:
@@ -192,9 +179,8 @@ def test_rows_that_wait_are_written_at_the_end_or_said_to_be_lost(tmp_path):
 
 def test_rows_do_not_wait_without_bound(tmp_path, monkeypatch):
     monkeypatch.setattr(rundir, "MAX_WAITING_BYTES", 1000)
-    with RunDir(tmp_path) as run:
-        with full_disk(0):
-            for _ in range(71):
-                run.append("metrics.jsonl", {})
-            with pytest.raises(GvzError, match="1008 bytes of records cannot be written"):
-                run.append("metrics.jsonl", {})
+    with RunDir(tmp_path) as run, full_disk(0):
+        for _ in range(71):
+            run.append("metrics.jsonl", {})
+        with pytest.raises(GvzError, match="1008 bytes of records cannot be written"):
+            run.append("metrics.jsonl", {})

@@ -1,5 +1,6 @@
 """Plays evaluation episodes over the cores. An episode's seed follows from the task, the episode's number and the base
-seed alone, so that every player meets the same episodes. Imports gvz.evaluation.players, gvz.specs; gvz.env to play.
+seed alone, so that every player meets the same episodes. Imports gvz.{janitor,specs}, gvz.evaluation.players; gvz.env
+to play.
 
 One game a process. A policy that decides for 4 or 8 games at once would save CPU time: with the network of
 `rainbow_4task` 3.37 -> 2.93 and 2.89 ms a decision, engine included, with that of `rainbow_quick` 2.00 -> 1.38 and
@@ -19,6 +20,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from gvz import janitor
 from gvz.errors import EngineError, GvzError, WaitTimeoutError
 from gvz.evaluation.players import Player
 from gvz.specs import EnvConfig
@@ -124,32 +126,37 @@ def play(jobs: Iterable[tuple[Entrant, Episode]], *, num_workers: int) -> Iterat
             for entrant, episode in ordered:
                 yield entrant, worker.play(entrant, id(entrant), episode)
         return
+    others = set(multiprocessing.active_children())
     executor = ProcessPoolExecutor(
         max_workers=max(1, min(num_workers, len(ordered))),
         mp_context=multiprocessing.get_context("spawn"),
         initializer=_begin_worker,
         initargs=(os.getpid(),),
     )
+    futures = {executor.submit(_play, job[0], id(job[0]), job[1]): job[0] for job in ordered}
+    finished: queue.SimpleQueue[Future[Row]] = queue.SimpleQueue()
+    for future in futures:
+        future.add_done_callback(finished.put)
+    left = len(futures)
     try:
-        futures = {executor.submit(_play, job[0], id(job[0]), job[1]): job[0] for job in ordered}
-        finished: queue.SimpleQueue[Future[Row]] = queue.SimpleQueue()
-        for future in futures:
-            future.add_done_callback(finished.put)
-        for number_done in range(len(futures)):
-            try:
-                future = finished.get(timeout=EPISODE_TIMEOUT_S)
-            except queue.Empty:
-                for worker in multiprocessing.active_children():
-                    worker.kill()  # else the end of the pool would wait for it
-                raise WaitTimeoutError(
-                    f"evaluation: waited {EPISODE_TIMEOUT_S:g} s for one of {num_workers} workers to end an episode; "
-                    f"{len(futures) - number_done} are left, and can be played by the same command"
-                ) from None
+        while left:
+            future = finished.get(timeout=EPISODE_TIMEOUT_S)
             yield futures[future], future.result()
+            left -= 1
     except BrokenProcessPool as error:
         raise GvzError("evaluation: a worker process died; what it had not finished can be played again") from error
+    except queue.Empty:
+        raise WaitTimeoutError(
+            f"evaluation: waited {EPISODE_TIMEOUT_S:g} s for one of {num_workers} workers to end an episode; {left} "
+            "are left, and can be played by the same command"
+        ) from None
     finally:
+        if left:  # nobody will take what they are at, and one may hang
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.kill()
         executor.shutdown(wait=True, cancel_futures=True)
+        if left:
+            janitor.clean_dead_instances()
 
 
 class _Worker:

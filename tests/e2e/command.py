@@ -24,9 +24,16 @@ SMALL = (
 ).split()
 
 
-def launch(run: Path, *extra: str, environment: Mapping[str, str] | None = None) -> subprocess.Popen[str]:
+_PATCHED = "import sys, gvz.train; {patch}; from gvz.launch import main; sys.exit(main())"
+
+
+def launch(
+    run: Path, *extra: str, environment: Mapping[str, str] | None = None, patch: str | None = None
+) -> subprocess.Popen[str]:
+    """Starts `python -m gvz.launch`; with a `patch` (such as gvz.train.SAVE_RETRY_S = 0) that is done before it."""
+    program = ["-m", "gvz.launch"] if patch is None else ["-c", _PATCHED.format(patch=patch)]
     return subprocess.Popen(
-        [sys.executable, "-m", "gvz.launch", *SMALL, "--run-dir", str(run), *extra],
+        [sys.executable, *program, *SMALL, "--run-dir", str(run), *extra],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -35,7 +42,7 @@ def launch(run: Path, *extra: str, environment: Mapping[str, str] | None = None)
     )
 
 
-def finish(process: subprocess.Popen[str], timeout_s: float = 240) -> tuple[int, str]:
+def finish(process: subprocess.Popen[str], timeout_s: float = 900) -> tuple[int, str]:
     """Exit code and standard error."""
     _, err = process.communicate(timeout=timeout_s)
     return process.returncode, err
@@ -54,7 +61,7 @@ def faults(run: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
 
 
-def wait_until(condition: Callable[[], bool], what: str, timeout_s: float = 180) -> None:
+def wait_until(condition: Callable[[], bool], what: str, timeout_s: float = 600) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, f"waited {timeout_s} s for {what}"
@@ -69,11 +76,6 @@ def num_updates(run: Path) -> int:
 
 def descendants(process: subprocess.Popen[str]) -> list[psutil.Process]:
     return psutil.Process(process.pid).children(recursive=True)
-
-
-def actors(process: subprocess.Popen[str]) -> list[psutil.Process]:
-    """The run's actor processes."""
-    return [p for p in psutil.Process(process.pid).children() if "actors.worker" in arguments(p)]
 
 
 def engines(process: psutil.Process | subprocess.Popen[str]) -> list[psutil.Process]:
@@ -105,6 +107,10 @@ def orphans() -> set[str]:
 def arrays_of(checkpoint: Path) -> dict[str, np.ndarray]:
     """The arrays of a checkpoint by their place in its tree, as "['replay'].action"."""
     leaves = list(json.loads((checkpoint / "manifest.json").read_text())["leaves"])
-    with ocp.StandardCheckpointer() as checkpointer:
-        stored = checkpointer.restore((checkpoint / "arrays").absolute())
-    return {leaves[int(number)]: array for number, array in stored.items()}
+    stored = ocp.PyTreeCheckpointer().restore((checkpoint / "arrays").absolute())
+    blocks: dict[int, dict[int, np.ndarray]] = {}
+    for name, block in stored.items():  # "LEAF.FIRST_ROW"
+        leaf, _, row = name.partition(".")
+        blocks.setdefault(int(leaf), {})[int(row)] = np.asarray(block)
+    joined = {leaf: [parts[row] for row in sorted(parts)] for leaf, parts in blocks.items()}
+    return {leaves[leaf]: np.concatenate(parts) if parts[0].ndim else parts[0] for leaf, parts in joined.items()}

@@ -63,7 +63,7 @@ def check_streams(run: Path, num_lanes: int, num_tasks: int) -> Streams:
         num_matched += matched
         unrecorded.append(missing)
     assert num_records == counts["records"]
-    assert num_records - num_last <= counts["env_steps"] <= num_records - num_last + sum(unrecorded)
+    assert num_records - num_last <= counts["env_steps"] <= num_records - num_last + sum(unrecorded) + num_lanes
     return Streams(num_records=num_records, num_matched=num_matched, unrecorded=unrecorded, rows=episodes)
 
 
@@ -77,7 +77,10 @@ def _match(stored: dict[str, np.ndarray], known: list[dict]) -> tuple[int, int]:
     for row in known:
         after = found[-1] + 1 if found else 0
         found += [at for at in range(after, len(played)) if _is(row, stored, *played[at])][:1]
-    return len(found), int(stored["last"].sum()) - len(found)
+    ended = stored["last"][ends - 1]
+    until = found[-1] + 1 if found else 0
+    before, after = int(ended[:until].sum()), int(ended[until:].sum())
+    return len(found), before - len(found) + max(0, after - 1)  # of the last one it may just not have been told
 
 
 def _is(row: dict, stored: dict[str, np.ndarray], length_steps: int, reward: float, end: int) -> bool:

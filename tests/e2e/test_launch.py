@@ -11,7 +11,7 @@ from command import alive, arrays_of, descendants, finish, launch, num_updates, 
 
 from learner.checkpoint import checkpoint_steps, verify
 
-pytestmark = [pytest.mark.e2e, pytest.mark.engine, pytest.mark.timeout(600), pytest.mark.usefixtures("nothing_left")]
+pytestmark = [pytest.mark.e2e, pytest.mark.engine, pytest.mark.timeout(1800), pytest.mark.usefixtures("nothing_left")]
 
 
 def test_a_run_trains_to_its_end_and_goes_on_when_asked_for_more(tmp_path):
@@ -59,7 +59,7 @@ def test_a_signal_saves_and_ends_everything(tmp_path, number, code):
     children = descendants(process)
     assert len([p for p in children if "vizdoom" in p.name()]) == 4
     os.killpg(process.pid, number)
-    got, err = finish(process, 60)
+    got, err = finish(process)
     assert got == code, err
     assert not alive(children)
     (saved,) = checkpoint_steps(run / "checkpoints")[-1:]
@@ -74,7 +74,7 @@ def test_a_second_signal_ends_at_once_and_clean(tmp_path):
     children = descendants(process)
     process.send_signal(signal.SIGINT)
     process.send_signal(signal.SIGINT)
-    code, err = finish(process, 30)
+    code, err = finish(process)
     assert code == 130, err
     assert not alive(children)
 
@@ -86,7 +86,7 @@ def test_a_signal_while_jax_is_imported_ends_at_once(tmp_path, number, code):
     wait_until(lambda: "jaxlib" in maps.read_text(), "the import of jax")
     start = time.monotonic()
     process.send_signal(number)
-    got, err = finish(process, 60)
+    got, err = finish(process)
     assert got == code, err
     assert err.splitlines()[-1] == "stopped at once"
     assert "Traceback" not in err

