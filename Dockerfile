@@ -16,6 +16,6 @@ RUN pip install --no-cache-dir --no-deps --no-build-isolation . \
     && useradd --create-home --uid 1000 gvz && mkdir runs && chown gvz runs
 # of any user that --user names, also one without a home
 ENV HOME=/tmp
-USER gvz
+USER 1000
 ENTRYPOINT ["gvz"]
 CMD ["--help"]

@@ -60,8 +60,9 @@ def parse(arguments: Sequence[str], **other_commands: type) -> Any:
     found = {name: module.COMMAND for name, module in discover("gvz.commands").items()} | other_commands
     overview = arguments[:1] in ([], ["-h"], ["--help"])
     choices = [Annotated[command, _subcommand(name, command, overview)] for name, command in found.items()]
+    of_all: Any = Union[tuple(choices)]  # noqa: UP007  # made at run time
     return tyro.cli(
-        Union[tuple(choices)],  # noqa: UP007  # made at run time
+        of_all,
         args=arguments,
         prog="gvz",
         description=DESCRIPTION,

@@ -268,7 +268,7 @@ def config_to_dict(config: RunConfig) -> dict[str, Any]:
     }
 
 
-def config_from_dict(saved: dict[str, Any]) -> RunConfig:
+def config_from_dict(saved: Any) -> RunConfig:
     """The configuration that `config_to_dict` wrote, with the derived numbers it ran with made explicit.
 
     Raises:

@@ -16,7 +16,7 @@ import os
 import signal
 import time
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -123,7 +123,7 @@ class Engine:
                 os.truncate(self.log, 0)
             self._game.set_seed(seed)
             self._game.new_episode()
-            state = self._game.get_state()
+            state = _state(self._game)
         if state is None:
             raise EngineError(f"engine {self._name}: the episode of seed {seed} ended before it began")
         return state
@@ -158,7 +158,7 @@ class Engine:
 
     def state(self) -> "GameState | None":
         """A copy of everything there is to see, or None once the player is dead."""
-        return self._game.get_state()
+        return _state(self._game)
 
     def variables(self) -> list[float]:
         """Values of the configured variables, in their order, now; after the player's death too.
@@ -209,7 +209,7 @@ class Engine:
         self._end()
 
     @contextlib.contextmanager
-    def _answering(self, what: str) -> Iterator[None]:
+    def _answering(self, what: str) -> Generator[None, None, None]:
         self._require_running(what)
         self.deadline = time.monotonic() + self.config.step_timeout_s
         try:
@@ -303,13 +303,18 @@ def _start(config: EngineConfig) -> "tuple[DoomGame, Path, Path]":
             return game, directory, log
 
 
+def _state(game: "DoomGame") -> "GameState | None":
+    """None where no episode runs, which ViZDoom's annotation leaves out."""
+    return game.get_state()
+
+
 def _map_screen(game: "DoomGame", instance_id: str) -> np.ndarray:
     """The screen buffer within the engine's shared memory. Its place is not documented, so it is found by content.
 
     Raises:
         EngineError: it is not there, so this version of ViZDoom works otherwise.
     """
-    state = game.get_state()
+    state = _state(game)
     screen = None if state is None else state.screen_buffer
     with (janitor.SHM_DIR / f"ViZDoomSM{instance_id}").open("rb") as file:
         memory = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)

@@ -16,7 +16,7 @@ import tempfile
 import threading
 import time
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import IO, Protocol
 
@@ -139,7 +139,7 @@ class _Attempt:
 
 
 @contextlib.contextmanager
-def one_of(lock_names: Sequence[str], deadline: float) -> Iterator[None]:
+def one_of(lock_names: Sequence[str], deadline: float) -> Generator[None, None, None]:
     """Holds one of the named locks, which all processes of this user share; a SIGKILL gives it back too.
 
     Raises:

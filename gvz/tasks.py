@@ -64,9 +64,9 @@ def named_tasks(scenario: str | None = None, level: int | None = None, split: Sp
         TaskError: an unknown scenario, level or split.
     """
     if level is not None and level not in range(5):
-        raise TaskError(f"named_tasks: level {level!r}, want 0..4")
+        raise TaskError(f"level: got {level!r}, want 0..4")
     if split is not None and split not in get_args(Split):
-        raise TaskError(f"named_tasks: split {split!r}, want one of {', '.join(get_args(Split))}")
+        raise TaskError(f"split: got {split!r}, want one of {', '.join(get_args(Split))}")
     chosen = scenarios().values() if scenario is None else (scenario_named(scenario),)
     tasks = (
         parse_task(f"{one.id}/{name}") for one in chosen for name in (one.tasks if split is None else one.splits[split])

@@ -11,7 +11,7 @@ import os
 import time
 import uuid
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -136,7 +136,7 @@ class Telemetry:
             self._wandb.log({"num_updates": num_updates, **row})
 
     @contextlib.contextmanager
-    def _until_the_disk_is_full(self, num_updates: int) -> Iterator[None]:
+    def _until_the_disk_is_full(self, num_updates: int) -> Generator[None, None, None]:
         """Events cannot go on after a gap. The records, which hold the same, can."""
         try:
             yield

@@ -66,11 +66,13 @@ def test_tasks_lists_all_named_tasks(capsys):
 def test_tasks_prints_a_table(capsys):
     assert cli.main(["tasks", "--scenario", "seek_and_kill", "--split", "test"]) == 0
     head, *lines = capsys.readouterr().out.splitlines()
-    assert head.split() == ["task", "level", "attributes", "sets"]
+    assert head.split() == ["level", "sets", "task"]
     assert len(lines) == 7
+    assert lines[0].split() == ["2", "test", "seek_and_kill/blue+shadows"]
     assert lines[-1].split() == [
-        *("seek_and_kill/complete", "4", "blue+mixed_enemies+obstacles+resized_enemies+shadows", "test")
+        *("4", "test", "seek_and_kill/complete", "=", "blue+mixed_enemies+obstacles+resized_enemies+shadows")
     ]
+    assert {len(line) > 80 for line in lines[:-1]} == {False}
 
 
 @pytest.mark.parametrize(

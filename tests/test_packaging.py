@@ -1,6 +1,7 @@
 """Wheel and sdist: what they hold, that they install, and that the benchmark runs where JAX cannot be imported."""
 
 import os
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -32,6 +33,12 @@ def run(*command: str | Path, where: Path, **environment: str) -> str:
 def tracked_files() -> set[str]:
     """What git knows of the packages."""
     return set(run("git", "ls-files", *PACKAGES, where=ROOT).splitlines())
+
+
+def names_in_wheel(directory: Path) -> set[str]:
+    (wheel,) = directory.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        return set(archive.namelist())
 
 
 @pytest.fixture(scope="module")
@@ -70,9 +77,7 @@ def installed(built, tmp_path_factory) -> Path:
 
 
 def test_the_wheel_holds_every_file_of_the_packages_and_nothing_else(built):
-    (wheel,) = built.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        names = {name for name in archive.namelist() if ".dist-info/" not in name}
+    names = {name for name in names_in_wheel(built) if ".dist-info/" not in name}
     assert tracked_files() <= names
     assert {name.partition("/")[0] for name in names} == set(PACKAGES)
     for needed in ("gvz/py.typed", "gvz/reports/templates/report.html.j2"):
@@ -84,6 +89,23 @@ def test_the_sdist_holds_what_a_wheel_is_built_from(built):
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     assert tracked_files() | {"pyproject.toml", "README.md", "LICENSE"} <= names
+
+
+def test_the_dockerfile_has_no_finding_of_its_linter():
+    run(Path(sys.executable).parent / "hadolint", "Dockerfile", where=ROOT)
+
+
+def test_what_the_dockerfile_copies_makes_the_same_wheel(built, tmp_path):
+    for line in (ROOT / "Dockerfile").read_text().splitlines():
+        if line.startswith("COPY "):
+            *sources, target = line.split()[1:]
+            for source in (ROOT / name for name in sources):
+                if source.is_dir():
+                    shutil.copytree(source, tmp_path / target, ignore=shutil.ignore_patterns("__pycache__"))
+                else:
+                    shutil.copy(source, tmp_path / target)
+    run(sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path / "dist", where=tmp_path)
+    assert names_in_wheel(tmp_path / "dist") == names_in_wheel(built)
 
 
 @pytest.mark.engine

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from gvz.errors import ConfigError
-from gvz.rundir import RECORD_FILES, read_records
+from gvz.rundir import RECORD_FILES, START_RECORDS, read_records
 
 if TYPE_CHECKING:
     import polars as pl
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write the records of runs as CSV or Parquet: a table of metrics, episodes, faults and evaluations each.
+    """Write the records of runs as CSV or Parquet: a table each of metrics, episodes, faults, starts and evaluations.
 
     The rows of all runs go into one table; `run_dir`, `run` and `run_seed` say whose they are.
 
@@ -41,7 +41,7 @@ class Export:
         from gvz.evaluation.frame import collect_evaluations
 
         problems: list[str] = []
-        tables = {Path(name).stem: run_table(self.run_dirs, name, problems) for name in RECORD_FILES}
+        tables = {Path(name).stem: run_table(self.run_dirs, name, problems) for name in (*RECORD_FILES, START_RECORDS)}
         tables["evaluation"], damaged = collect_evaluations(self.run_dirs)
         try:
             self.out.mkdir(parents=True, exist_ok=True)
@@ -57,13 +57,16 @@ class Export:
 
 COMMAND = Export
 
+MAX_COLUMNS = 2000
+"""a small file of rows with fields of their own each would fill the memory with empty cells"""
+
 
 def run_table(run_dirs: Sequence[Path], name: str, problems: list[str]) -> "pl.DataFrame":
     """The rows of one record file of each run, one after the other.
 
     Args:
         run_dirs: run directories; one without such a file has no rows.
-        name: one of RECORD_FILES.
+        name: one of RECORD_FILES, or START_RECORDS; compressed, too (.gz).
         problems: is added a message for every line that cannot be read.
 
     Returns:
@@ -77,12 +80,19 @@ def run_table(run_dirs: Sequence[Path], name: str, problems: list[str]) -> "pl.D
         try:
             config = json.loads((run_dir / "config.json").read_text())["config"]
             whose = {"run_dir": str(run_dir), "run": config["name"], "run_seed": config["seed"]}
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ConfigError(f"{run_dir} is not a run directory: its config.json cannot be read: {error}") from error
-        if (run_dir / name).exists():
-            found, damaged = read_records(run_dir / name)
-            rows += ({**whose, **_flat(row)} for row in found)
-            problems += damaged
+        except OSError as error:
+            raise ConfigError(f"{run_dir} is not a run directory (config.json: {error.strerror})") from error
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise ConfigError(f"{run_dir / 'config.json'} cannot be read: {error!r}") from error
+        for file in (run_dir / name, run_dir / f"{name}.gz"):
+            if file.exists():
+                found, damaged = read_records(file)
+                rows += ({**whose, **_flat(row)} for row in found)
+                problems += damaged
+    names = dict.fromkeys(name for row in rows for name in row)
+    if len(names) > MAX_COLUMNS:
+        problems.append(f"{name}: got rows of {len(names)} different fields, want at most {MAX_COLUMNS}; not written")
+        rows = []
     return _frame(rows)
 
 
@@ -100,8 +110,22 @@ def write_table(table: "pl.DataFrame", file: Path) -> Path:
 
 
 def _flat(row: dict[str, Any]) -> dict[str, Any]:
-    components = {f"reward/{name}": value for name, value in row.get("reward_components", {}).items()}
-    return {name: value for name, value in row.items() if name != "reward_components"} | components
+    components = row.get("reward_components")
+    if isinstance(components, dict):
+        row = {n: v for n, v in row.items() if n != "reward_components"}
+        row |= {f"reward/{name}": value for name, value in components.items()}
+    return {_text(name): _cell(value) for name, value in row.items()}
+
+
+def _cell(value: Any) -> Any:
+    """What a column can hold: numbers of 64 bits, booleans, text; anything else as its JSON text."""
+    if value is None or isinstance(value, bool | float) or (isinstance(value, int) and -(2**63) <= value < 2**63):
+        return value
+    return _text(value) if isinstance(value, str) else json.dumps(value)
+
+
+def _text(value: str) -> str:
+    return value.encode(errors="backslashreplace").decode()  # half a pair of surrogates has no place in a file
 
 
 def _frame(rows: Iterable[dict[str, Any]]) -> "pl.DataFrame":

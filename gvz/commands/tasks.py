@@ -13,7 +13,7 @@ from gvz.tasks import named_tasks
 
 @dataclass(frozen=True, kw_only=True)
 class Tasks:
-    """List the tasks: id, level, attributes, training and test sets."""
+    """List the tasks: level, training and test sets, scenario and attributes."""
 
     select: Annotated[TaskSelection, tyro.conf.arg(name="")] = ALL_TASKS
     json: bool = False
@@ -26,11 +26,15 @@ class Tasks:
             for row in rows:
                 print(json.dumps(row))
             return 0
-        table = [("task", "level", "attributes", "sets")]
-        table += [(r["task"], str(r["level"]), "+".join(r["attributes"]), " ".join(r["sets"])) for r in rows]
-        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        for cells in table:
-            print("  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip())
+        width = max(len(" ".join(row["sets"])) for row in [*rows, {"sets": ["sets"]}])
+        print(f"level  {'sets':{width}}  task")
+        for row in rows:
+            attributes = "+".join(row["attributes"])
+            said = not attributes or row["task"].endswith(f"/{attributes}")
+            print(
+                f"{row['level']:5}  {' '.join(row['sets']):{width}}  {row['task']}"
+                + ("" if said else f" = {attributes}")
+            )
         return 0
 
 

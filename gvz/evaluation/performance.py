@@ -96,7 +96,7 @@ def perform(entrant: Entrant, episode: Episode) -> Generator[Moment, None, None]
 def _moment(stage: DoomEnv, info: dict[str, Any], rewards: dict[str, float], **fields: Any) -> Moment:
     screen = stage.render()
     assert screen is not None, "the stage renders"
-    defaults = {"action": None, "values": None, "terminated": False, "truncated": False}
+    defaults: dict[str, Any] = {"action": None, "values": None, "terminated": False, "truncated": False}
     return Moment(
         screen=screen,
         reward=sum(rewards.values()),

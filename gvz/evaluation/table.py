@@ -50,14 +50,13 @@ def scores(rows: Sequence[Row], identity: Mapping[str, Any], tasks: Sequence[Tas
 
 
 def score_lines(found: Sequence[Score]) -> list[str]:
-    """A table of scores, the head first."""
-    names = [f"mean of {len(found) - 1} tasks" if one.task is None else one.task.id for one in found]
-    width = max(map(len, ["task", *names]))
-    lines = [f"{'task':{width}}  level  episodes  {'mean score [95%]':22}  % of the upper bound"]
-    for name, one in zip(names, found, strict=True):
+    """A table of scores, the head first; the names, which can be long, come last."""
+    lines = [f"{'mean score [95%]':23}  {'% of the bound [95%]':20}  episodes  level  task"]
+    for one in found:
+        name = f"mean of {len(found) - 1} tasks" if one.task is None else one.task.id
         level = "" if one.task is None else one.task.level
         score = "" if one.score is None else one.score
-        lines.append(f"{name:{width}}  {level!s:>5}  {one.episodes:8}  {score!s:22}  {one.percent}")
+        lines.append(f"{score!s:23}  {one.percent!s:20}  {one.episodes:8}  {level!s:>5}  {name}")
     return lines
 
 

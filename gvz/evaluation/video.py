@@ -64,7 +64,7 @@ def add_to_tensorboard(gif: Path, directory: Path, tag: str, step: int) -> None:
         step: gradient step.
     """
     from tensorboardX import FileWriter
-    from tensorboardX.proto.summary_pb2 import Summary
+    from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]  # made at run time
 
     with Image.open(gif) as animation:
         width, height = animation.size

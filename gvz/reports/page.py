@@ -34,7 +34,10 @@ def make_report(paths: Sequence[Path], out: Path, title: str | None = None) -> t
     results = read_results(paths)
     if results.episodes.is_empty() and not results.runs:
         found = "".join(f"\n  {problem}" for problem in results.problems)
-        raise ConfigError(f"report: nothing to report in {', '.join(map(str, paths))}{found}")
+        raise ConfigError(
+            f"report: nothing to report in {', '.join(map(str, paths))}; want run directories, results of "
+            f"`gvz experiment run`, or record files of `gvz evaluate`{found}"
+        )
     names = [asked.experiment.name for asked in results.asked]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise ConfigError(

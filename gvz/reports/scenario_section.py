@@ -16,7 +16,7 @@ from gvz.reports.curves import evaluation_curve, learning_curve
 from gvz.reports.document import Block, Cell, Figure, Section, Table, missing, words
 from gvz.reports.draw import draw_bars, draw_curves, draw_heat_map, draw_histogram
 from gvz.reports.experiment_section import what_id
-from gvz.reports.results import Results
+from gvz.reports.results import Results, Run
 from gvz.reports.scores import Scores, agent_scores, estimate, pick
 from gvz.scenarios.base import Scenario, Task
 from gvz.tasks import named_tasks, parse_task, scenario_named, scenarios
@@ -218,7 +218,7 @@ def _learning(results: Results, scenario: Scenario, out: Path) -> list[Figure]:
     if any(asked.experiment.evaluate_on == "own" for asked in results.asked):
         return []  # drawn with the experiment
     figures = []
-    agents: dict[str, list] = {}
+    agents: dict[str, list[Run]] = {}
     for run in results.runs:
         if run.scenario == scenario.id:
             agents.setdefault(results.agents[str(run.path)], []).append(run)

@@ -4,11 +4,12 @@ A scenario is data: a base map, a script template and what they hold by default 
 `Content` it changes. A task is a scenario with a set of attributes. `gvz.scenarios.compiler` makes a map of it.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Literal
 
 from gvz.errors import TaskError
 from gvz.scenarios.rewards import Reward, Rewarder
@@ -101,11 +102,7 @@ class Content:
             base_wad: self.things.get(base_wad, ()) + other.things.get(base_wad, ())
             for base_wad in (*self.things, *(other.things.keys() - self.things.keys()))
         }
-        return self.overlaid(Content(**{**_fields(other), "things": things}))
-
-
-def _fields(content: Content) -> dict[str, Any]:
-    return {name: getattr(content, name) for name in Content.__dataclass_fields__}
+        return self.overlaid(dataclasses.replace(other, things=things))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

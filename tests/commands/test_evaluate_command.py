@@ -25,7 +25,7 @@ from gvz.tasks import named_tasks
         ("--player idle --seeds -1", "--seeds: got [-1], want numbers of at least 0"),
         ("--player idle --out {file}/below/rows.jsonl", "cannot be written: Not a directory"),
         ("--player idle --out {file}", "line 1: not JSON (half-written?); move the file aside"),
-        ("--player idle --level 5", "level 5, want 0..4"),
+        ("--player idle --level 5", "level: got 5, want 0..4"),
         ("--player idle --level 0 --split test", "--level, --split: no task of test has level 0"),
         ("{file}", "is not a run directory"),
         ("{run} --checkpoints last", "--checkpoints: got 'last', want newest, all, last5"),

@@ -1,5 +1,6 @@
 """gvz export, as it is called."""
 
+import gzip
 import json
 from pathlib import Path
 
@@ -52,11 +53,24 @@ def test_parquet_keeps_types(run_dirs, tmp_path, capsys):
     assert not list((tmp_path / "t").glob("*.tmp"))
 
 
+def test_compressed_records_and_starts_are_tables_too(run_dirs, tmp_path, capsys):
+    (run_dirs[0] / "metrics.jsonl.gz").write_bytes(gzip.compress((run_dirs[0] / "metrics.jsonl").read_bytes()))
+    (run_dirs[0] / "metrics.jsonl").unlink()
+    start = {"schema": 1, "num_updates": 0, "cores": 2, "devices": ["cpu: cpu"], "versions": {"jax": "0.7"}}
+    (run_dirs[0] / "starts.jsonl").write_text(json.dumps(start) + "\n")
+    assert cli.main(["export", str(run_dirs[0]), "--out", str(tmp_path / "t")]) == 0
+    assert capsys.readouterr().out.splitlines() == [str(tmp_path / "t" / f"{n}.csv") for n in ("metrics", "starts")]
+    assert pl.read_csv(tmp_path / "t" / "metrics.csv")["num_updates"].to_list() == [0, 1]
+    starts = pl.read_csv(tmp_path / "t" / "starts.csv")
+    assert starts["cores"].to_list() == [2]
+    assert json.loads(starts["versions"][0]) == {"jax": "0.7"}
+
+
 def test_bad_input_is_named(run_dirs, tmp_path, capsys):
     assert cli.main(["export"]) == 2
     assert "got no run directory, want at least one" in capsys.readouterr().err
     assert cli.main(["export", str(tmp_path)]) == 2
-    assert f"{tmp_path} is not a run directory: its config.json cannot be read" in capsys.readouterr().err
+    assert f"{tmp_path} is not a run directory (config.json: No such file or directory)" in capsys.readouterr().err
     (tmp_path / "file").touch()
     assert cli.main(["export", str(run_dirs[0]), "--out", str(tmp_path / "file")]) == 2
     assert "--out: " in capsys.readouterr().err

@@ -11,8 +11,9 @@ def test_each_task_has_its_mean_interval_and_episodes():
     rows.append({**rows[0], "player": "somebody else", "score": 9.0})
     rows.append({**rows[0], "episode": 3, "score": 9.0})  # beyond the episodes asked for
     head, line = score_lines(scores(rows, {"player": "p"}, [default, blue], episodes=3))
-    assert head.split()[:3] == ["task", "level", "episodes"]
-    assert line.split() == [default.id, "0", "3", "4.0", "[4.0,", "4.0]", "20.0", "[20.0,", "20.0]"]
+    assert head.split()[-3:] == ["episodes", "level", "task"]
+    assert line.split() == ["4.0", "[4.0,", "4.0]", "20.0", "[20.0,", "20.0]", "3", "0", default.id]
+    assert line.index(default.id) == head.index("task")
 
 
 def test_the_last_line_is_the_mean_over_tasks():
@@ -23,7 +24,7 @@ def test_the_last_line_is_the_mean_over_tasks():
         for n in range(episodes)
     ]
     found = scores(rows, {"player": "p"}, [default, blue], episodes=4)
-    assert score_lines(found)[-1].split() == ["mean", "of", "2", "tasks", "5", "35.0", "[35.0,", "35.0]"]
+    assert score_lines(found)[-1].split() == ["35.0", "[35.0,", "35.0]", "5", "mean", "of", "2", "tasks"]
     row = score_row(found[-1])
     assert (row["task"], row["level"], row["score"], row["normalized_score"]) == (None, None, None, 35.0)
 

@@ -72,6 +72,10 @@ class Assembler:
             self._code += struct.pack("<i", value)
             self._reference(target)
 
+    def begin_body(self) -> None:
+        """What comes next has no instruction before it."""
+        self.last_opcode = 0
+
     def place(self, label: Label) -> None:
         """Lets `label` mean the next instruction."""
         label.address = self.address

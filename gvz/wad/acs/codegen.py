@@ -138,7 +138,7 @@ def _emit_script(unit: Unit, script: Script) -> None:
     address = unit.code.address
     for parameter in script.parameters:
         unit.declare_local(parameter.name, parameter.type, parameter.at)
-    unit.code.last_opcode = 0
+    unit.code.begin_body()
     emit_statement(unit, script.body)
     if unit.code.last_opcode != TERMINATE:
         unit.code.emit(TERMINATE)
@@ -154,7 +154,7 @@ def _emit_function(unit: Unit, function: Function) -> None:
     unit.function = function
     for parameter, variable in zip(function.parameters, symbol.parameters, strict=True):
         unit.declare_parameter(parameter.name, variable, parameter.at)
-    unit.code.last_opcode = 0
+    unit.code.begin_body()
     emit_statement(unit, function.body)
     returns = function.returns != "void"
     if unit.code.last_opcode not in (RETURN_VOID, RETURN_VALUE):

@@ -75,6 +75,8 @@ def tokenize(source: str) -> list[Token]:
                 tokens.append(Token("string", _string(text[1:-1], at), at))
             case "symbol":
                 tokens.append(Token("symbol", text, at))
+            case _:  # space, a comment
+                pass
         offset = match.end()
         if "\n" in text:
             line += text.count("\n")
