@@ -36,17 +36,8 @@ MODULES = sorted(file for package in ("gvz", "actors", "learner", "configs") for
 STOCK_WAD = Path(vizdoom.scenarios_path) / "defend_the_center.wad"
 
 UNPICKLERS = {"pickle", "_pickle", "cPickle", "cloudpickle", "dill", "joblib", "marshal", "shelve", "yaml", "torch"}
-EXECUTORS = {
-    "eval",
-    "exec",
-    "compile",
-    "__import__",
-    "import_module",
-    "exec_module",
-    "run_path",
-    "run_module",
-    "system",
-}
+EXECUTORS = {"eval", "exec", "compile", "__import__", "os.system", "os.popen"}
+EXECUTING_METHODS = {"import_module", "exec_module", "load_module", "run_path", "run_module"}
 ALLOWED = {
     ("gvz/config.py", "exec"): "a config file, which the user names",
     ("gvz/config.py", "compile"): "likewise",
@@ -92,8 +83,7 @@ def test_nothing_is_unpickled_or_executed_but_what_the_user_names(file: Path):
         assert where in PROCESS_POOLS
     for name, call in calls(file):
         keywords = {keyword.arg: keyword.value for keyword in call.keywords}
-        is_regular_expression = name == "compile" and ast.unparse(call.func) == "re.compile"
-        if name in EXECUTORS and not is_regular_expression:
+        if name in EXECUTING_METHODS or ast.unparse(call.func) in EXECUTORS:
             assert (where, name) in ALLOWED, f"{where}:{call.lineno}: {ast.unparse(call)[:80]}"
         for dangerous in ("allow_pickle", "shell"):
             assert dangerous not in keywords, f"{where}:{call.lineno}: {dangerous}"
@@ -146,7 +136,7 @@ def test_a_run_directory_and_all_in_it_are_private_whatever_the_umask(tmp_path: 
         saver = checkpoint.Checkpointer(run.path, keep=1)
         saver.save(1, tree, tree, {"num_updates": 1})
         saver.wait()
-        assert saver.failures() == []
+        assert saver.outcome() == ""
         telemetry = Telemetry(run, tasks=("a",), upper_bound=1.0, tensorboard=True, num_updates=0)
         telemetry.scalars(1, {"learner/loss": 1.0})
         telemetry.close()
@@ -198,6 +188,7 @@ def test_a_bomb_goes_off_when_it_is_unpickled(tmp_path: Path):
     assert (tmp_path / "mark").exists()
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # orbax's reads after the first failure
 def test_a_checkpoint_full_of_pickles_is_refused_and_not_unpickled(tmp_path: Path):
     mark, bomb = tmp_path / "mark", pickle.dumps(Bomb(tmp_path / "mark"))
     tree = {"w": np.ones(3, np.float32)}
