@@ -46,13 +46,15 @@ def traces(engine: Engine) -> list[str]:
     return found + ([f"pid {engine.pid}"] if janitor.process_start(engine.pid) is not None else [])
 
 
+HEAD = (
+    "from pathlib import Path; from gvz.engine import Engine, EngineConfig\n"
+    f"config = EngineConfig(wad=Path({str(STOCK_WAD)!r}), buttons=(), variables=())\n"
+)
+
+
 def run(code: str, **options: object) -> subprocess.CompletedProcess[str]:
     """Runs code that may use `config` and Engine in a process of its own."""
-    head = (
-        "from pathlib import Path; from gvz.engine import Engine, EngineConfig\n"
-        f"config = EngineConfig(wad=Path({str(STOCK_WAD)!r}), buttons=(), variables=())\n"
-    )
-    command = [sys.executable, "-W", "error", "-c", head + code]
+    command = [sys.executable, "-W", "error", "-c", HEAD + code]
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, **options)
 
 
@@ -186,6 +188,23 @@ def test_a_hung_engine_is_killed_and_raises(call: str):
     assert time.monotonic() - start < 5
     engine.close()
     assert traces(engine) == []
+
+
+def test_an_engine_that_was_stopped_together_with_its_client_lives():
+    code = (
+        "import dataclasses, time; engine = Engine(dataclasses.replace(config, step_timeout_s=1.0))\n"
+        "engine.new_episode(1); print(engine.pid, flush=True); end = time.monotonic() + 6\n"
+        "while time.monotonic() < end: engine.step([], 1)\n"
+        "engine.close()"
+    )
+    with subprocess.Popen([sys.executable, "-c", HEAD + code], stdout=subprocess.PIPE, text=True) as client:
+        assert client.stdout is not None
+        pid = int(client.stdout.readline())
+        for number in (signal.SIGSTOP, signal.SIGCONT):  # as a container is paused
+            os.kill(client.pid, number)
+            os.kill(pid, number)
+            time.sleep(2.5)
+        assert client.wait(60) == 0
 
 
 def test_the_terminals_ctrl_c_is_not_for_the_engine(engine: Engine):

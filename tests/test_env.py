@@ -301,7 +301,11 @@ def test_an_engine_that_died_between_episodes_is_replaced():
     whole = fingerprint(env, 7)
     assert env._engine is not None
     env._engine.kill()
+    _, info = env.reset(options={"episode_seed": 7})
+    assert info["engine_crash"] is True
+    assert "crash" in info["engine_error"]
     assert fingerprint(env, 7) == whole
+    assert env.reset()[1]["engine_crash"] is False
     env.close()
 
 

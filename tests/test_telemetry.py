@@ -13,6 +13,7 @@ from gvz.config import load_config
 from gvz.errors import ConfigError
 from gvz.rundir import RunDir, read_records
 from gvz.telemetry import Telemetry
+from tests.full_disk import full_disk
 from tests.tensorboard_events import read_events
 
 METRICS_PAGE = Path(__file__).parent.parent / "docs" / "reference" / "metrics.md"
@@ -95,6 +96,23 @@ def test_exported_tables_have_every_row_of_the_records(run_dir, tmp_path):
         rows, _ = read_records(run_dir / f"{name}.jsonl")
         table = pl.read_parquet(tmp_path / f"{name}.parquet")
         assert table["num_updates"].to_list() == [row["num_updates"] for row in rows]
+
+
+def test_on_a_full_disk_the_events_end_and_the_records_go_on(tmp_path):
+    with RunDir(tmp_path) as run:
+        log = Telemetry(run, tasks=TASKS, upper_bound=1100.0, tensorboard=True, num_updates=0)
+        with full_disk(2000):
+            for num_updates in range(1, 400):  # more than any buffer or queue holds
+                log.scalars(num_updates, {"learner/loss": 0.5})
+        log.scalars(400, {"learner/loss": 0.5})
+        log.close()
+    rows, problems = read_records(tmp_path / "metrics.jsonl")
+    assert problems == []
+    assert [row["num_updates"] for row in rows] == list(range(1, 401))
+    ([fault], _) = read_records(tmp_path / "faults.jsonl")
+    assert fault["kind"] == "tensorboard"
+    assert fault["message"].startswith("TensorBoard's events end at update ")
+    assert fault["message"].endswith("File too large); metrics.jsonl has the same scalars")
 
 
 def telemetry(run: RunDir) -> Telemetry:

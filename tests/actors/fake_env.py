@@ -33,7 +33,8 @@ class CountingEnv(gymnasium.Env[np.ndarray, int]):
 
     length: decisions an episode. end: "terminated" or "truncated". step_s: seconds a decision takes.
     fault: raise, segfault, hang, crash (the engine's own way) at decision `fault_at` of the process's life, or
-    no_start; each time, or once if there is a `fault_file`; in all tasks, or in `fault_task`.
+    crash_between (the same, seen at the next episode's start), or no_start; each time, or once if there is a
+    `fault_file`; in all tasks, or in `fault_task`.
     """
 
     def __init__(self, task: str, options: dict[str, Any]):
@@ -49,7 +50,10 @@ class CountingEnv(gymnasium.Env[np.ndarray, int]):
         super().reset(seed=seed)
         assert options is not None
         self.seed_, self.num_steps, self.action_sum = options["episode_seed"], 0, 0
-        return frame(self.seed_, 0), self.info({})
+        info = self.info({})
+        if self.options.get("fault") == "crash_between" and self.life_steps > 0 and self.strike():
+            info |= {"engine_crash": True, "engine_error": "it is no more"}
+        return frame(self.seed_, 0), info
 
     def step(self, action: int):
         assert self.action_space.contains(int(action)), action

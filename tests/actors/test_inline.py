@@ -220,6 +220,21 @@ def test_frames_of_another_shape_are_refused(tmp_path: Path):
         InlinePool(pool_config)
 
 
+def test_an_engine_that_died_between_episodes_is_told_of(tmp_path: Path):
+    options = {"fault": "crash_between", "fault_task": "b", "fault_file": str(tmp_path / "struck")}
+    pool_config = inline_config(tmp_path / "work", options)
+    with InlinePool(pool_config) as pool:
+        checker = Checker(pool_config)
+        checker.add(pool.drain(100))
+        messages = pool.poll()
+    (fault,) = [m for m in messages if isinstance(m, Fault)]
+    assert (fault.kind, fault.lane, fault.traceback) == ("engine_crash", 1, "it is no more")
+    assert "episode 1, seed " in fault.message
+    assert fault.message.endswith("the engine died before the first decision; a new one is started")
+    assert checker.num_cuts == 0
+    assert not any(m.cut for m in messages if isinstance(m, EpisodeStats))
+
+
 def test_a_crashed_engine_cuts_its_episode_and_the_lane_goes_on(tmp_path: Path):
     options = {"fault": "crash", "fault_at": 10, "fault_task": "b"}
     pool_config = inline_config(tmp_path, options)

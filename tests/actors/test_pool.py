@@ -1,6 +1,7 @@
 """The pool of actor processes under every fault: detected, replaced within a budget, nothing published lost."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -26,7 +27,7 @@ from gvz.errors import ConfigError, ResumeError, WorkerError
 from gvz.transport.messages import EpisodeStats, Fault, Message, ParamsHeader, Ready
 from gvz.transport.ring import WriterState
 
-DEADLINE_S = 60.0
+DEADLINE_S = 240.0
 
 
 class Run:
@@ -231,10 +232,25 @@ def test_a_spent_budget_is_an_error_that_tells_why(tmp_path: Path):
     assert "exited with code 1; that was end 3 within 100 s, and actors.max_restarts allows 2 restarts." in text
     assert f"The end of {tmp_path / 'actor_'}" in text
     assert text.endswith("RuntimeError: no engine today")
+    assert [f.kind for f in run.faults() if f.fatal][-1] == "gave_up", "what it said last came before the error"
     waits = [
         f.message.rsplit(" in ", 1)[1] for f in run.faults() if f.kind == "died" and f.actor == run.faults()[-1].actor
     ]
     assert waits[:2] == ["0.50 s", "1.00 s"], "each failed start waits longer"
+
+
+def test_a_process_that_cannot_be_started_again_counts_as_one_that_failed(tmp_path: Path):
+    pool_config = config(tmp_path / "work", {}, actors=ActorsConfig(max_restarts=2))
+    with ActorPool(pool_config) as pool:
+        run = Run(pool, pool_config)
+        pids = run.until_all_ready()
+        shutil.rmtree(tmp_path / "work")
+        (tmp_path / "work").touch()  # where the logs go
+        os.kill(pids[0], signal.SIGKILL)
+        with pytest.raises(WorkerError, match=r"actor 0 could not be started \(.*exists.*\); that was end 3 within"):
+            run.until(lambda: False)
+    assert [fault.kind for fault in run.faults()] == ["died", "died", "gave_up"]
+    assert run.faults()[-1].fatal
 
 
 def test_a_new_process_begins_new_episodes_even_if_the_old_one_wrote_nothing(tmp_path: Path):

@@ -1,11 +1,14 @@
 """Evaluation episodes: their seeds, the same rows however they are shared out, engines that die."""
 
+import multiprocessing
 import os
+import time
 
 import pytest
 
+import gvz.evaluation.play as play_module
 from gvz.env import DoomEnv
-from gvz.errors import EngineError, GvzError
+from gvz.errors import EngineError, GvzError, WaitTimeoutError
 from gvz.evaluation.play import Entrant, Episode, episode_seed, play, play_episode
 from gvz.evaluation.players import RandomPlayer, player_env
 from gvz.evaluation.record import simple_entrant
@@ -88,3 +91,18 @@ def test_a_worker_that_dies_is_an_error():
     entrant = Entrant(make_player=Suicide, env=SMALL, identity={"player": "suicide"})
     with pytest.raises(GvzError, match="a worker process died; what it had not finished can be played again"):
         list(play([(entrant, Episode(TASK, 0))], num_workers=1))
+
+
+class Sleeper:
+    """Never gets ready to play."""
+
+    def __init__(self):
+        time.sleep(3600)
+
+
+def test_workers_that_hang_are_killed_and_named(monkeypatch):
+    monkeypatch.setattr(play_module, "EPISODE_TIMEOUT_S", 3.0)
+    entrant = Entrant(make_player=Sleeper, env=SMALL, identity={"player": "sleeper"})
+    with pytest.raises(WaitTimeoutError, match=r"waited 3 s for one of 2 workers to end an episode; 3 are left"):
+        list(play([(entrant, Episode(TASK, number)) for number in range(3)], num_workers=2))
+    assert multiprocessing.active_children() == []
