@@ -158,8 +158,10 @@ class Learner:
 
         from learner import replay, train_step
         from learner.ingest import Ingest
+        from learner.memory import keep_freed_memory
         from learner.policy import flatten_params
 
+        keep_freed_memory()
         self.config, self.parts = config, parts
         self.state = train_step.init(parts.agent, parts.replay_spec, config.learner, jax.random.key(0))
         self.replay = filled_replay(parts.replay_spec)

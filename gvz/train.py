@@ -35,6 +35,7 @@ from learner import replay, train_step
 from learner.checkpoint import Checkpointer, Restored, checkpoint_steps, restore_newest
 from learner.ingest import Ingest
 from learner.limiter import RateLimiter
+from learner.memory import keep_freed_memory
 from learner.metrics import TaskKpis
 from learner.policy import flatten_params
 
@@ -421,6 +422,7 @@ def train(config: RunConfig, run: RunDir, stop: StopRequest) -> int:
         ResourceError: the machine is too small. GvzError: what a user can do something about.
         KeyboardInterrupt: a second signal, or a first one before the trainer was there; nothing is left running.
     """
+    keep_freed_memory()
     jax.config.update("jax_compilation_cache_dir", str(xla_cache_directory()))
     with Progress() as progress:
         for line in janitor.clean_dead_instances():

@@ -1,4 +1,5 @@
-"""Checkpoints: orbax arrays, a msgpack host state, and a manifest that proves the whole. May import gvz tier 0 only.
+"""Checkpoints: orbax arrays, a msgpack host state, and a manifest that proves the whole. May import gvz tier 0,
+learner.memory.
 
     checkpoints/<updates>/  arrays/ (orbax)  host.msgpack  manifest.json   the whole state, `keep` of them
     policies/<updates>/     the same, parameters only, never pruned         what evaluation reads
@@ -24,6 +25,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from gvz.errors import CheckpointError, WaitTimeoutError
+from learner.memory import release_freed_memory
 
 CHECKPOINT_SCHEMA = 1
 """Raised by one whenever the arrays' or the host state's meaning changes."""
@@ -245,12 +247,12 @@ class Checkpointer:
             WaitTimeoutError: the earlier save does not end.
         """
         self.wait()
-        arrays, params = snapshot(arrays), snapshot(params)
+        copies = [snapshot(params), snapshot(arrays)]  # the thread takes them out, so that it can let go of them
 
         def work() -> None:
             try:
-                write(self._policies / str(num_updates), params, {"num_updates": num_updates})
-                write(self._checkpoints / str(num_updates), arrays, host)
+                write(self._policies / str(num_updates), copies.pop(0), {"num_updates": num_updates})
+                write(self._checkpoints / str(num_updates), copies.pop(0), host)
                 # what is newer was damaged when the run went on from an older one: it takes no place among the kept
                 steps = [step for step in checkpoint_steps(self._checkpoints) if step <= num_updates]
                 for step in steps[: -self._keep]:
@@ -258,6 +260,8 @@ class Checkpointer:
                 self._outcome = ""
             except CheckpointError as error:
                 self._outcome = str(error)
+            copies.clear()
+            release_freed_memory()
 
         self._thread = threading.Thread(target=work, name=f"checkpoint {num_updates}", daemon=True)
         self._thread.start()
