@@ -5,6 +5,7 @@ import time
 from dataclasses import dataclass, field
 from types import TracebackType
 
+from rich.columns import Columns
 from rich.console import Console, Group
 from rich.live import Live
 from rich.progress_bar import ProgressBar
@@ -78,32 +79,35 @@ def plain_line(status: Status) -> str:
 
 def panel(status: Status, width: int) -> Group:
     """The live panel."""
+    scenario = status.tasks[0].task.partition("/")[0] if status.tasks else ""
     head = Text.assemble(
         (f"{status.phase}  ", "bold"),
+        f"{scenario}  " if scenario else "",
         f"{status.num_updates:,} / {status.total_updates:,} updates   ETA {format_duration(status.eta_s)}",
     )
-    bar = ProgressBar(total=status.total_updates, completed=status.num_updates, width=min(width, 100))
-    rates = Table.grid(padding=(0, 3))
-    rates.add_row(
-        f"{status.updates_per_s:.1f} updates/s",
-        f"{status.steps_per_s:,.0f} decisions/s",
-        f"{status.frames_per_s:,.0f} frames/s",
-        f"loss {status.loss:.4f}",
-    )
-    rates.add_row(
-        f"replay {status.replay_fill:.0%}",
-        f"learner waits {status.learner_wait:.0%}",
-        f"actors wait {status.actor_wait:.0%}",
-        f"parameters {status.staleness_updates:.0f} updates old",
+    bar = Table.grid()  # gives the bar a line of its own: it ends none
+    bar.add_row(ProgressBar(total=status.total_updates, completed=status.num_updates, width=min(width, 100)))
+    rates = Columns(
+        (
+            f"{status.updates_per_s:.1f} updates/s",
+            f"{status.steps_per_s:,.0f} decisions/s",
+            f"{status.frames_per_s:,.0f} frames/s",
+            f"loss {status.loss:.4f}",
+            f"replay {status.replay_fill:.0%}",
+            f"learner waits {status.learner_wait:.0%}",
+            f"actors wait {status.actor_wait:.0%}",
+            f"parameters {status.staleness_updates:.0f} updates old",
+        ),
+        padding=(0, 3),
     )
     tasks = Table(box=None, padding=(0, 2))
-    tasks.add_column("task")
+    tasks.add_column("task", overflow="fold")
     tasks.add_column("episodes", justify="right")
     tasks.add_column("recent score", justify="right")
     tasks.add_column("% of bound", justify="right")
     for t in status.tasks:
         percent = f"{100 * t.score / t.upper_bound:.1f}" if t.episodes else "-"
-        tasks.add_row(t.task, f"{t.episodes:,}", _short_score(t), percent)
+        tasks.add_row(t.task.partition("/")[2], f"{t.episodes:,}", _short_score(t), percent)
     restarts = [Text(f"{status.restarts} actor restarts", style="yellow")] if status.restarts else []
     return Group(head, bar, rates, *restarts, tasks)
 

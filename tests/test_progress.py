@@ -2,6 +2,7 @@
 
 import io
 
+import pytest
 from rich.console import Console
 
 from gvz.progress import Progress, Status, TaskStatus, format_duration, plain_line
@@ -47,13 +48,16 @@ def test_off_a_terminal_lines_are_printed_rarely():
     assert lines[1] == "checkpoint written"
 
 
-def test_on_a_terminal_the_panel_has_every_number():
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_on_a_terminal_the_panel_has_every_number(width):
     out = io.StringIO()
-    with Progress(Console(file=out, width=120, force_terminal=True, color_system=None)) as progress:
+    with Progress(Console(file=out, width=width, force_terminal=True, color_system=None)) as progress:
         progress.show(STATUS)
     text = out.getvalue()
     assert all(part in text for part in PARTS)
     assert "2 actor restarts" in text
+    assert "parameters 12 updates old" in text
+    assert "defend_the_center" in text
     assert "50.0" in text
 
 

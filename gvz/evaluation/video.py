@@ -4,6 +4,8 @@ Imports pillow; av to write MP4, tensorboardX to write events.
 """
 
 import importlib.util
+import time
+import uuid
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from itertools import chain
@@ -63,14 +65,17 @@ def add_to_tensorboard(gif: Path, directory: Path, tag: str, step: int) -> None:
         tag: names the image.
         step: gradient step.
     """
-    from tensorboardX import FileWriter
+    from tensorboardX.event_file_writer import EventsWriter
+    from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]  # made at run time
     from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]  # made at run time
 
     with Image.open(gif) as animation:
         width, height = animation.size
     image = Summary.Image(width=width, height=height, colorspace=3, encoded_image_string=gif.read_bytes())
-    events = FileWriter(str(directory))
-    events.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
+    directory.mkdir(parents=True, exist_ok=True)
+    events = EventsWriter(str(directory / "events"), f".{uuid.uuid4().hex}")  # else files of one second were one
+    summary = Summary(value=[Summary.Value(tag=tag, image=image)])
+    events.write_event(Event(step=step, wall_time=time.time(), summary=summary))
     events.close()
 
 
