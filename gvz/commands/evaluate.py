@@ -157,13 +157,14 @@ def _show_progress(rows: "Iterator[Row]", total: int) -> None:
     """Draws the rows as they come, on stderr: a bar with rate and time left, or now and then a line."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.table import Column
 
     from gvz.progress import format_duration
 
     console = Console(stderr=True)
     columns = (
-        *(BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn()),
-        TextColumn("{task.description}"),
+        *(BarColumn(20), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn()),
+        TextColumn("{task.description}", table_column=Column(overflow="fold")),  # long: it may take two lines
     )
     first_s = next_line_s = 0.0
     with Progress(*columns, console=console, disable=not console.is_terminal, speed_estimate_period=300) as bar:

@@ -14,6 +14,7 @@ from types import TracebackType
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Column
 
 from gvz.errors import ConfigError
 from gvz.experiments import progress
@@ -179,7 +180,8 @@ class Display:
 
     def __init__(self, total: int):
         self._console = Console(file=sys.stderr)
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        name = TextColumn("{task.description}", table_column=Column(overflow="fold"))  # long, so it may take two lines
+        columns = (BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn(), name)
         # without a thread of its own: children die with the thread that starts them, and there is to be one alone
         self._bars = Progress(*columns, console=self._console, auto_refresh=False)
         self._all = self._bars.add_task("jobs", total=total)
