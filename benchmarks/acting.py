@@ -33,19 +33,20 @@ def measure(budget: Budget) -> list[Row]:
     all_games = (4,) if budget.quick else (4, 8)
     with contextlib.ExitStack() as stack:
         directory = stack.enter_context(tempfile.TemporaryDirectory(prefix="gvz-benchmark-"))
-        pools = {}
-        for games in all_games:
-            actors = dataclasses.replace(config.actors, games_per_actor=games)
-            work = workload.work_directory(directory) / str(games)
-            parts = assemble(dataclasses.replace(config, actors=actors), work)
-            pools[games] = parts.pool_config
-        agent = parts.agent
+        parts = {
+            games: assemble(
+                dataclasses.replace(config, actors=dataclasses.replace(config.actors, games_per_actor=games)),
+                workload.work_directory(directory) / str(games),
+            )
+            for games in all_games
+        }
+        agent = parts[4].agent
         params = agent.init(jax.random.key(0))
         flat = np.asarray(jax.jit(flatten_params)(params))
         size = (str(config.env.render_width), str(config.env.render_height))
         engines = [stack.enter_context(Remote("bare_engine", workload.TASK, *size)) for _ in range(num_engines)]
         products = [stack.enter_context(Remote("cpu_matmul", **ENVIRONMENT)) for _ in range(cores)]
-        acting = {games: stack.enter_context(workload.playing(pool, flat)) for games, pool in pools.items()}
+        acting = {games: stack.enter_context(workload.playing(parts[games].pool_config, flat)) for games in all_games}
         values = alternate(
             budget.rounds,
             {

@@ -7,7 +7,7 @@ jax and the machine's own modules inside functions: whoever starts processes fir
 import contextlib
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -84,7 +84,7 @@ def random_players(config: "PoolConfig", **changes: Any) -> "PoolConfig":
 
 
 @contextlib.contextmanager
-def playing(config: "PoolConfig", params: np.ndarray | None = None) -> "Iterator[ActorPool]":
+def playing(config: "PoolConfig", params: np.ndarray | None = None) -> "Generator[ActorPool]":
     """A pool whose actors are all ready, and which acts by `params` float32[P] if it has a policy."""
     from actors.pool import ActorPool
     from gvz.transport.messages import ParamsHeader
