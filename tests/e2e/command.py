@@ -1,6 +1,5 @@
 """The real command as a process, and what can be seen of it: records, processes, shared memory, checkpoints."""
 
-import contextlib
 import json
 import os
 import subprocess
@@ -14,6 +13,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 import psutil
 
+from gvz import janitor
 from gvz.rundir import read_records
 
 SMALL = (
@@ -24,6 +24,9 @@ SMALL = (
 ).split()
 
 
+STARTED: list[subprocess.Popen[str]] = []
+"""the runs of a test"""
+
 _PATCHED = "import sys, gvz.train; {patch}; from gvz.launch import main; sys.exit(main())"
 
 
@@ -32,7 +35,7 @@ def launch(
 ) -> subprocess.Popen[str]:
     """Starts `python -m gvz.launch`; with a `patch` (such as gvz.train.SAVE_RETRY_S = 0) that is done before it."""
     program = ["-m", "gvz.launch"] if patch is None else ["-c", _PATCHED.format(patch=patch)]
-    return subprocess.Popen(
+    process = subprocess.Popen(
         [sys.executable, *program, *SMALL, "--run-dir", str(run), *extra],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -40,6 +43,8 @@ def launch(
         env={**os.environ, **(environment or {})},
         start_new_session=True,
     )
+    STARTED.append(process)
+    return process
 
 
 def finish(process: subprocess.Popen[str], timeout_s: float = 900) -> tuple[int, str]:
@@ -94,14 +99,10 @@ def alive(processes: list[psutil.Process]) -> list[psutil.Process]:
     return [p for p in processes if p.is_running() and p.status() != psutil.STATUS_ZOMBIE]
 
 
-def orphans() -> set[str]:
-    """Segments and queues of ours, or of engines, that no living process has mapped."""
-    mapped = ""
-    for process in psutil.process_iter():
-        with contextlib.suppress(OSError):
-            mapped += Path(f"/proc/{process.pid}/maps").read_text()
-    names = (p.name for p in Path("/dev/shm").iterdir() if p.name.startswith(("ViZDoom", "gvz-")))
-    return {name for name in names if f"/dev/shm/{name}" not in mapped}
+def left_behind() -> list[str]:
+    """What there still is of runs that have ended: segments, and what their janitor knows of."""
+    segments = [path.name for run in STARTED for path in janitor.SHM_DIR.glob(f"gvz-{run.pid}-*")]
+    return segments + janitor.dead_instances()
 
 
 def arrays_of(checkpoint: Path) -> dict[str, np.ndarray]:

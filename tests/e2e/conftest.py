@@ -5,15 +5,23 @@ from pathlib import Path
 
 import pytest
 
+from gvz import janitor
+
 sys.path.append(str(Path(__file__).parent))
 
-from command import orphans, wait_until
+from command import STARTED, left_behind, wait_until
 
 
 @pytest.fixture
 def nothing_left():
-    """No segment and no stray engine file of ours remains after the test."""
-    before, files = orphans(), set(Path.cwd().glob("_vizdoom*"))
+    """Nothing that a run of the test has made is there after it; a run that a failed test has left is ended."""
+    files = set(Path.cwd().glob("_vizdoom*"))
     yield
-    wait_until(lambda: orphans() <= before, "shared memory to be removed", 60)
+    for process in STARTED:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+            janitor.clean_dead_instances()
+    wait_until(lambda: not left_behind(), "engines and shared memory to be removed", 60)
+    STARTED.clear()
     assert set(Path.cwd().glob("_vizdoom*")) <= files

@@ -54,7 +54,9 @@ def actor(run: subprocess.Popen[str], number: int) -> psutil.Process:
 
     def plays() -> bool:
         pid, state = writer(run, number)
-        return state == WriterState.ACTING and janitor.process_start(pid) is not None
+        if state != WriterState.ACTING or janitor.process_start(pid) is None:
+            return False
+        return len(engines(psutil.Process(pid))) == 2  # else it has attached to the ring but not begun to say its own
 
     wait_until(lambda: list(janitor.SHM_DIR.glob(f"gvz-{run.pid}-*-ring-{number}")) != [], "the rings")
     wait_until(plays, f"actor {number} to play")
@@ -87,13 +89,15 @@ def test_a_run_goes_through_every_fault_of_its_actors_and_engines_and_loses_noth
     assert "sitecustomize.py" in told["traceback"]
     assert "exited with code 1; restart 1 of 20" in await_fault(run, 0, "died", 0)["message"]
 
+    victim = actor(process, 1)
     before, start = len(faults(run)), time.monotonic()
-    actor(process, 1).kill()
+    victim.kill()
     assert "actor 1 was ended by SIGKILL; restart 1 of 20" in await_fault(run, before, "died", 1)["message"]
     seconds["actor killed"] = time.monotonic() - start
 
+    victim = engines(actor(process, 0))[0]
     before, start = len(faults(run)), time.monotonic()
-    engines(actor(process, 0))[0].kill()
+    victim.kill()
     assert "a new one is started" in await_fault(run, before, "engine_crash", 0)["message"]
     seconds["engine killed"] = time.monotonic() - start
 
@@ -114,18 +118,18 @@ def test_a_run_goes_through_every_fault_of_its_actors_and_engines_and_loses_noth
         pid, _ = writer(process, 1)
         starting = [] if pid == stopped_actor.pid else engines(psutil.Process(pid))
     starting[0].send_signal(signal.SIGSEGV)
+    # an engine that dies before its first frame takes its client along: ViZDoom reads a null pointer
+    assert "actor 1 was ended by SIGSEGV" in await_fault(run, before, "died", 1)["message"]
+    seconds["engine killed at its start"] = time.monotonic() - start
     actor(process, 1)
-    seconds["engine at its start"] = time.monotonic() - start
-    at_start = [(row["kind"], row["actor"]) for row in faults(run)[before:]]
 
     slow.unlink()
     code, err = finish(process)
     assert code == 0, err
-    print(*(f"{what}: {s:.1f} s" for what, s in seconds.items()), at_start, sep="\n")
+    print(*(f"{what}: {s:.1f} s" for what, s in seconds.items()), sep="\n")
     assert max(seconds.values()) < 120, seconds
-    wanted = Counter({("exception", 0): 1, ("died", 0): 1, ("died", 1): 1, ("engine_crash", 0): 2, ("stuck", 1): 1})
-    assert Counter((row["kind"], row["actor"]) for row in rows(run, "faults.jsonl")) - Counter(at_start) == wanted
-    assert set(at_start) <= {("died", 1), ("exception", 1), ("engine_start", 1)}
+    wanted = Counter({("exception", 0): 1, ("died", 0): 1, ("died", 1): 2, ("engine_crash", 0): 2, ("stuck", 1): 1})
+    assert Counter((row["kind"], row["actor"]) for row in rows(run, "faults.jsonl")) == wanted
 
     streams = check_streams(run, num_lanes=4, num_tasks=4)
     assert rows(run, "metrics.jsonl")[-1]["num_updates"] == 600
