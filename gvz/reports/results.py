@@ -4,7 +4,7 @@ Imports polars, gvz.evaluation.frame, gvz.experiments, gvz.rundir, gvz.tasks. Re
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any, get_args
 import polars as pl
 
 from gvz.errors import ConfigError
-from gvz.evaluation.frame import collect_evaluations
+from gvz.evaluation.frame import collect_evaluations, fits
 from gvz.experiments.base import Experiment
 from gvz.experiments.plan import read_plan
 from gvz.rundir import read_records
@@ -137,9 +137,12 @@ def _read_run(file: Path, results: Path) -> tuple[Run | None, list[str]]:
     """The run, if it can be told, and what is wrong with it."""
     metrics, problems = _read_columns(file.parent, "metrics", _METRICS)
     episodes, more = _read_columns(file.parent, "episodes", _TRAINING_EPISODES)
-    starts, unread = _read_rows(file.parent, "starts")
+    starts, unread = _read_starts(file.parent)
     try:
         saved = json.loads(file.read_text())
+        json.dumps(saved, ensure_ascii=False).encode()  # text that no file can hold has no place in a report
+        if not isinstance(saved["resolved"]["tasks"], list):
+            raise TypeError("resolved.tasks: want a list")
         run = Run(
             path=file.parent,
             id=_run_id(file.parent, results),
@@ -150,7 +153,7 @@ def _read_run(file: Path, results: Path) -> tuple[Run | None, list[str]]:
             starts=tuple(starts),
         )
         _ = run.name, run.seed, run.total_updates, run.scenario
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+    except (OSError, ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError) as error:
         return None, [f"{file}: not a configuration of ours ({type(error).__name__}: {error}); the run is left out"]
     return run, [*problems, *more, *unread]
 
@@ -212,11 +215,40 @@ _TRAINING_EPISODES = {
 }
 
 
-def _read_columns(directory: Path, name: str, columns: dict[str, pl.DataType]) -> tuple[pl.DataFrame, list[str]]:
-    """These columns of a run's record file; rows without `num_updates` are left out."""
+def _read_columns(directory: Path, name: str, columns: Mapping[str, pl.DataType]) -> tuple[pl.DataFrame, list[str]]:
+    """These columns of a run's record file; rows without `num_updates` are left out, and values of other types."""
     rows, problems = _read_rows(directory, name)
-    data = {c: pl.Series([row.get(c) for row in rows], dtype=t, strict=False) for c, t in columns.items()}
-    return pl.DataFrame(data).drop_nulls("num_updates"), problems
+    values = {c: [v if fits(v := row.get(c), dtype) else None for row in rows] for c, dtype in columns.items()}
+    return pl.DataFrame(values, columns).drop_nulls("num_updates"), problems
+
+
+_START_TYPES = {
+    "cpu": str,
+    "system": str,
+    "commit": str,
+    "cores": int,
+    "memory_bytes": int,
+    "devices": list,
+    "versions": dict,
+}
+
+
+def _read_starts(directory: Path) -> tuple[list[dict[str, Any]], list[str]]:
+    """What a run was started on, and what is wrong with it."""
+    rows, problems = _read_rows(directory, "starts")
+    good = []
+    for number, row in enumerate(rows, 1):
+        try:
+            json.dumps(row, ensure_ascii=False).encode()
+            for name, kind in _START_TYPES.items():
+                value = row.get(name)
+                if not isinstance(value, kind | None) or (isinstance(value, int) and not fits(value, pl.Int64())):
+                    raise TypeError(f"{name} is {value!r:.80}")
+        except (ValueError, TypeError, RecursionError) as error:
+            problems.append(f"{directory / 'starts.jsonl'}, row {number}: not the start of a run ({error})")
+        else:
+            good.append(row)
+    return good, problems
 
 
 def _read_rows(directory: Path, name: str) -> tuple[list[dict[str, Any]], list[str]]:

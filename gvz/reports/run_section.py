@@ -3,6 +3,7 @@
 Imports polars, gvz.reports.
 """
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -85,13 +86,15 @@ def _machine(start: dict[str, Any]) -> tuple[str, ...]:
         f"{start.get('cpu', '-')}, {start.get('system', '-')}",
         str(start.get("cores", "-")),
         "-" if memory_bytes is None else f"{memory_bytes / 2**30:.0f} GiB",
-        ", ".join(start.get("devices") or ["-"]),
+        ", ".join(map(str, start.get("devices") or ["-"])),
         str(start.get("commit") or "-"),
         ", ".join(f"{name} {number}" for name, number in versions.items()),
     )
 
 
 def _hours(seconds: float) -> str:
+    if not math.isfinite(seconds):
+        return "-"
     minutes, seconds = divmod(round(seconds), 60)
     return f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"
 

@@ -26,6 +26,8 @@ from gvz.transport.segment import Fence, Segment, aligned, hash_layout
 _PUBLISHED, _HEARTBEAT_NS, _STATE, _PID, _WAITED_NS, _CONSUMED, _NUM_WORDS = 0, 1, 2, 3, 4, 8, 16
 _UNPUBLISHED = 2**64 - 1
 """sequence number of a slot that is being filled"""
+_MAX_PUBLISHED = 2**63
+"""no ring lives to see so many records; beyond them the numbers would not fit into their words"""
 _FIRST_SLEEP_S, _LONGEST_SLEEP_S = 20e-6, 1e-3
 
 
@@ -71,7 +73,7 @@ class _Ring:
 
     def _num_unread(self) -> int:
         published, consumed = self._words[_PUBLISHED], self._words[_CONSUMED]
-        if not 0 <= published - consumed <= self.capacity:
+        if not 0 <= published - consumed <= self.capacity or published > _MAX_PUBLISHED:
             raise TransportError(
                 f"ring {self.name}: {published} records published and {consumed} consumed do not fit a capacity of "
                 f"{self.capacity}; its control words are damaged"

@@ -39,14 +39,13 @@ class Fuzz:
     seconds: int = 60
     """for each target"""
     out: Path = Path("results/reliability/fuzz.json")
-    """the record"""
+    """the record; targets that are not named keep what stands in it"""
 
     def run(self) -> int:
         """Fuzzes, prints a line for each target, writes the record."""
         if unknown := set(self.targets) - set(TARGETS):
             print(f"error: no target {', '.join(sorted(unknown))}; there are {', '.join(TARGETS)}", file=sys.stderr)
             return 2
-        started = time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime())
         found: dict[str, dict[str, Any]] = {}
         with tempfile.TemporaryDirectory(prefix="gvz-fuzz-") as directory:
             os.environ |= {"TMPDIR": directory, "XDG_RUNTIME_DIR": directory, "JAX_PLATFORMS": "cpu"}
@@ -59,13 +58,13 @@ class Fuzz:
                 return 130
             finally:
                 janitor.clean_dead_instances()
+        if self.targets and self.out.exists():  # those of before stand beside
+            found = json.loads(self.out.read_text())["targets"] | found
         record = {
             "schema": 1,
-            "date": started,
             "command": "python -m tests.fuzz " + " ".join(sys.argv[1:]),
             **machine.hardware(),
             "versions": machine.versions(PACKAGES),
-            "commit": machine.commit(("gvz", "actors", "learner", "tests/fuzz")),
             "inputs": sum(target["inputs"] for target in found.values()),
             "targets": found,
         }
@@ -78,7 +77,8 @@ class Fuzz:
 def fuzz(name: str, directory: Path, seconds: int) -> dict[str, Any]:
     """Fuzzes one target.
 
-    Returns: inputs tried, seconds, edges and features covered, inputs in the corpus, and what broke the promise.
+    Returns: date and commit, seconds, inputs tried, edges and features covered, inputs in the corpus, and what broke
+    the promise.
     """
     home, crashes = directory / name, directory / f"{name}-crashes"
     for folder in (home, crashes):
@@ -94,7 +94,7 @@ def fuzz(name: str, directory: Path, seconds: int) -> dict[str, Any]:
     command = [sys.executable, "-m", "tests.fuzz.child", name, str(home)]
     command += [f"-{flag}={value}" for flag, value in flags.items()]
     log = home / "log"
-    start_s = time.monotonic()
+    started, start_s = time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime()), time.monotonic()
     with log.open("wb") as stream:
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream, start_new_session=True
@@ -108,6 +108,8 @@ def fuzz(name: str, directory: Path, seconds: int) -> dict[str, Any]:
                 os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
     return {
+        "date": started,
+        "commit": machine.commit(("gvz", "actors", "learner", "tests/fuzz")),
         "seconds": round(time.monotonic() - start_s, 1),
         **counts(log.read_text(errors="replace")),
         "crashes": broken(log.read_text(errors="replace"), code, sorted(crashes.iterdir())),

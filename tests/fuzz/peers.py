@@ -179,7 +179,7 @@ def ring(_directory: Path) -> Target:
                 taken = True
         return taken
 
-    return Target(run=run, seeds=[image], words=WORDS, max_bytes=len(image))
+    return Target(run=run, seeds=[image], once_broken=[b"\xff" * 72], words=WORDS, max_bytes=len(image))
 
 
 def parameter_queue(_directory: Path) -> Target:

@@ -92,3 +92,45 @@ def test_records_may_be_compressed(small, tmp_path):
     assert run.training_episodes["normalized_score"].max() == 100.0
     assert json.loads((tmp_path / "config.json").read_text())["resolved"]["tasks"] == list(run.tasks)
     assert len(results.episodes) > 0
+
+
+@pytest.fixture
+def a_run(small, tmp_path):
+    """A run directory of its own."""
+    source = small / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111"
+    return shutil.copytree(source, tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"total_updates": 20', '"total_updates": Infinity'),
+        ('"tasks": ["', '"tasks": "", "x": ["'),
+        ('"name": "', '"name": "\\ud800'),
+        ('"config": {', '"config": ' + "[" * 100_000 + " {"),
+    ],
+)
+def test_a_configuration_that_no_report_can_show_is_told_of(a_run, old, new):
+    file = a_run / "config.json"
+    text = json.dumps(json.loads(file.read_text()))
+    assert old in text
+    file.write_text(text.replace(old, new))
+    results = read_results([a_run])
+    assert results.runs == ()
+    assert any(f"{file}: not a configuration of ours (" in problem for problem in results.problems)
+
+
+def test_values_of_another_type_are_left_out_and_starts_told_of(a_run):
+    row = {"schema": 1, "num_updates": 7, "learner/updates_per_s": "fast", "actors/env_steps": 2**63}
+    (a_run / "metrics.jsonl").write_text(json.dumps(row) + "\n" + json.dumps({**row, "num_updates": [7]}) + "\n")
+    starts = [{"schema": 1, "cores": 2}, {"schema": 1, "memory_bytes": 2**80}, {"schema": 1, "versions": "1"}]
+    (a_run / "starts.jsonl").write_text("".join(json.dumps(start) + "\n" for start in starts))
+    results = read_results([a_run])
+    (run,) = results.runs
+    assert run.metrics["num_updates"].to_list() == [7]
+    assert run.metrics["learner/updates_per_s"].to_list() == [None]
+    assert run.metrics["actors/env_steps"].to_list() == [None]
+    assert run.starts == ({"schema": 1, "cores": 2},)
+    told = "\n".join(results.problems)
+    assert f"starts.jsonl, row 2: not the start of a run (memory_bytes is {2**80})" in told
+    assert "starts.jsonl, row 3: not the start of a run (versions is '1')" in told

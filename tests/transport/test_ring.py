@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
@@ -249,13 +249,14 @@ def test_a_lost_repeated_or_torn_record_is_found(
 
 @settings(max_examples=100, deadline=None)
 @given(published=st.integers(0, 2**64 - 1), consumed=st.integers(0, 2**64 - 1))
+@example(published=2**64 - 1, consumed=2**64 - 1)
 def test_impossible_indices_are_found(published: int, consumed: int):
     reader = RingReader.create(f"gvz-test-{secrets.token_hex(6)}", CAPACITY, SHAPE)
     assert reader.name is not None
     words = words_of(reader.name)
     words[0], words[8] = published, consumed
     try:
-        if published == consumed:
+        if published == consumed <= 2**63:
             assert len(reader.read(5)) == 0
         else:  # too far apart, or records that were never written
             with pytest.raises(TransportError, match=r"control words are damaged|records were lost"):
