@@ -11,6 +11,7 @@ a checkpoint is unpickled, so one from a stranger can be read.
 
 import hashlib
 import json
+import logging
 import os
 import shutil
 import threading
@@ -80,6 +81,7 @@ def _files(directory: Path) -> list[Path]:
 
 def _checkpointer() -> ocp.Checkpointer:
     """Orbax, but for its copy of every array it is given: ours are snapshots."""
+    logging.getLogger("absl").setLevel(logging.ERROR)  # orbax warns, at every save, of what is meant to be so
     handler = ocp.type_handlers.NumpyHandler(deepcopy_host_arrays=False)
     registry = ocp.type_handlers.create_type_handler_registry((np.ndarray, handler))
     return ocp.Checkpointer(ocp.PyTreeCheckpointHandler(use_ocdbt=False, type_handler_registry=registry))

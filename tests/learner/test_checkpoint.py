@@ -49,9 +49,10 @@ def save(run: Path, step: int, keep: int = 2) -> None:
     assert saver.outcome() == ""
 
 
-def test_what_is_written_is_read_back_exactly(tmp_path):
+def test_what_is_written_is_read_back_exactly_and_silently(tmp_path, caplog):
     save(tmp_path, 7)
     restored = checkpoint.restore_newest(tmp_path / "checkpoints", jax.eval_shape(example))
+    assert caplog.text == ""
     assert restored is not None
     assert (restored.num_updates, restored.damage) == (7, [])
     assert restored.host == {"num_updates": 7, "note": "é"}
