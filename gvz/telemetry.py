@@ -5,18 +5,21 @@ docs/reference/metrics.md. Episode rows carry no wall-clock time, so that two sy
 same bytes. Imports gvz.{errors,progress,rundir}, gvz.transport, tensorboardX; wandb where it is asked for.
 """
 
-import contextlib
+import errno
+import io
 import json
 import os
+import socket
+import struct
 import time
 import uuid
 from collections import deque
-from collections.abc import Generator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]  # made at run time
+from tensorboardX.record_writer import masked_crc32c
 from tensorboardX.summary import scalar
 
 from gvz.errors import ConfigError
@@ -78,7 +81,6 @@ class Telemetry:
         self._episodes = [0] * len(tasks)
         self._events = start_events(run.tensorboard, num_updates) if tensorboard else None
         self._wandb = start_wandb(run) if wandb else None
-        self._num_updates = num_updates
 
     def episode(self, stats: EpisodeStats, *, num_updates: int, env_steps: int) -> None:
         """Records a finished episode."""
@@ -125,22 +127,22 @@ class Telemetry:
     def scalars(self, num_updates: int, values: Mapping[str, float]) -> None:
         """Records a row of scalars at a gradient step."""
         row = {**values, **{f"task/{t.task}/score": t.score for t in self.task_statuses() if t.episodes}}
-        self._num_updates = num_updates
         self._run.append("metrics.jsonl", {"num_updates": num_updates, "time_s": time.time(), **row})
         if self._events is not None:
-            with self._until_the_disk_is_full(num_updates):
-                for name, value in row.items():
-                    event = Event(step=num_updates, wall_time=time.time(), summary=scalar(name, value))
-                    self._events.write_event(event)
+            now = time.time()
+            events = (Event(step=num_updates, wall_time=now, summary=scalar(*item)) for item in row.items())
+            self._write_events(b"".join(map(event_record, events)), num_updates)
         if self._wandb is not None:
             self._wandb.log({"num_updates": num_updates, **row})
 
-    @contextlib.contextmanager
-    def _until_the_disk_is_full(self, num_updates: int) -> Generator[None, None, None]:
+    def _write_events(self, data: bytes, num_updates: int) -> None:
         """Events cannot go on after a gap. The records, which hold the same, can."""
+        assert self._events is not None
         try:
-            yield
+            if self._events.write(data) < len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
+            self._events.close()
             self._events = None
             message = f"TensorBoard's events end at update {num_updates} ({error}); metrics.jsonl has the same scalars"
             self.fault(Fault(actor=-1, lane=None, kind="tensorboard", message=message), num_updates=num_updates)
@@ -169,25 +171,32 @@ class Telemetry:
     def close(self) -> None:
         """Flushes the events. Can be repeated."""
         if self._events is not None:
-            with self._until_the_disk_is_full(self._num_updates):
-                self._events.close()
-            self._events = None
+            self._events.close()
         if self._wandb is not None:
             self._wandb.finish()
             self._wandb = None
 
 
-def start_events(directory: Path, num_updates: int) -> EventsWriter:
+def start_events(directory: Path, num_updates: int) -> io.FileIO:
     """A file of TensorBoard events, in which those of a killed run from `num_updates` on are taken back.
 
-    Written by the caller, as its buffer fills. (tensorboardX's own `SummaryWriter` writes in a thread which ends at
-    the first error, and its queue then blocks whoever logs, for ever.)
+    (tensorboardX's own `SummaryWriter` writes in a thread, which ends at the first error; its queue then blocks
+    whoever logs, for ever.)
     """
     directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-    events = EventsWriter(str(directory / "events"))
-    events.write_event(Event(step=num_updates, file_version="brain.Event:2"))
-    events.write_event(Event(step=num_updates, session_log=SessionLog(status=SessionLog.START)))
-    return events
+    file = (directory / f"events.out.tfevents.{time.time():.0f}.{socket.gethostname()}").open("ab", buffering=0)
+    file.write(
+        event_record(Event(wall_time=time.time(), file_version="brain.Event:2"))
+        + event_record(Event(step=num_updates, session_log=SessionLog(status=SessionLog.START)))
+    )
+    return file
+
+
+def event_record(event: Any) -> bytes:
+    """An event as it stands in a file: its length, the length's checksum, the event, its checksum."""
+    data = event.SerializeToString()
+    length = struct.pack("<Q", len(data))
+    return length + struct.pack("<I", masked_crc32c(length)) + data + struct.pack("<I", masked_crc32c(data))
 
 
 def start_wandb(run: RunDir) -> "wandb.Run":

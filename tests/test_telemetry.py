@@ -112,7 +112,7 @@ def test_on_a_full_disk_the_events_end_and_the_records_go_on(tmp_path):
     ([fault], _) = read_records(tmp_path / "faults.jsonl")
     assert fault["kind"] == "tensorboard"
     assert fault["message"].startswith("TensorBoard's events end at update ")
-    assert fault["message"].endswith("File too large); metrics.jsonl has the same scalars")
+    assert fault["message"].endswith("No space left on device); metrics.jsonl has the same scalars")
 
 
 def telemetry(run: RunDir) -> Telemetry:
