@@ -36,7 +36,7 @@ BLOCK_BYTES = 2**24
 it (300 MB in one piece took 19 s and 300 MB more, in blocks 3 s and 130 MB; the same loaded cores)."""
 
 WRITE_TIMEOUT_S = 1800.0
-"""a checkpoint that is not written by then never will be: orbax gives up its own part after 600 s"""
+"""a checkpoint that is not written by then never will be: the disk does not answer"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
