@@ -47,16 +47,16 @@ def read(file: Path) -> dict[str, Any]:
 def fuzz_table(made: dict[str, Any]) -> str:
     """Inputs tried and edges covered, by what was fed with them."""
     lines = [
-        f"*{made['date']} UTC, commit {made['commit']}, `{made['command']}`.*",
+        f"*`{made['command']}`; {made['cpu']}, {made['cores']} cores.*",
         "",
-        "| target | inputs | seconds | edges covered | broken promises |",
-        "|---|---|---|---|---|",
+        "| target | inputs | seconds | edges covered | broken promises | UTC, commit |",
+        "|---|---|---|---|---|---|",
         *(
             f"| {name} | {found['inputs']:,} | {found['seconds']:.0f} | {found['edges']:,} | "
-            f"{len(found['failures']) or 'none'} |"
+            f"{len(found['crashes']) or 'none'} | {found['date'][:16]}, {found['commit']} |"
             for name, found in made["targets"].items()
         ),
-        f"| **all** | **{made['inputs']:,}** | | | |",
+        f"| **all** | **{made['inputs']:,}** | | | | |",
     ]
     return "\n".join(lines)
 

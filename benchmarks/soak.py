@@ -154,7 +154,7 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
             "schema": SCHEMA,
             "date": started,
             "commit": commit,
-            "command": "python -m benchmarks.soak " + shlex.join(_words(options)),
+            "command": shlex.join(["python", "-m", "benchmarks.soak", *_words(options)]),
             "machine": hardware,
             "versions": machine.versions(),
             "settings": {**asdict(options), "out": None, "flags": list(options.flags)},
