@@ -12,7 +12,7 @@ from actors.config import ActorsConfig
 from actors.process import ActorProcess, log_path, read_log_tail
 from gvz import janitor
 from gvz.errors import TransportError, WorkerError
-from gvz.transport.messages import ActorSpec, Fault, Message, Ready
+from gvz.transport.messages import ActorSpec, EpisodeStats, Fault, Message, Ready
 from gvz.transport.ring import RingReader, WriterState
 
 _DUMP_S = 0.5
@@ -77,9 +77,11 @@ class SupervisedActor:
         exit_text = self.process.exit_text()  # first: what it said before its end is then all there
         messages: list[Message] = []
         try:
-            messages += self.process.receive()
+            received = self.process.receive()
+            self._check(received)
+            messages += received
         except TransportError as error:  # its process is beside itself, the others are not
-            exit_text = f"sent something else than a message ({error})"
+            exit_text = f"sent what is no message of its own ({error})"
         if any(isinstance(message, Ready) for message in messages):
             self._ready_at, self._silent_s = now, 0.0
         if self._kill_at is not None:
@@ -102,6 +104,15 @@ class SupervisedActor:
     def note_unread(self) -> None:
         """As `note`, from what is still in the ring."""
         self.note(self.ring.peek(self.ring.capacity).steps)
+
+    def _check(self, received: list[Message]) -> None:
+        """Raises TransportError: an episode of a game that is not this actor's."""
+        games = dict(zip(self._spec.lanes, self._spec.lane_tasks, strict=True))
+        for message in received:
+            if isinstance(message, EpisodeStats) and games.get(message.lane) != message.task:
+                raise TransportError(
+                    f"got an episode of lane {message.lane}, task {message.task}, want lane: task of {games}"
+                )
 
     def _start_again(self, now: float) -> list[Message]:
         try:

@@ -24,7 +24,7 @@ from gvz.alarms import Expected, alarms
 from gvz.assemble import Parts, Pool, assemble
 from gvz.cache import xla_cache_directory
 from gvz.config import RunConfig
-from gvz.errors import CheckpointError, WaitTimeoutError, WorkerError
+from gvz.errors import CheckpointError, GvzError, WaitTimeoutError, WorkerError
 from gvz.progress import Progress, Status
 from gvz.rundir import START_RECORDS, RunDir
 from gvz.stop import StopRequest
@@ -439,12 +439,21 @@ def train(config: RunConfig, run: RunDir, stop: StopRequest) -> int:
             for damage in restored.damage:
                 progress.say(f"damaged checkpoint passed over: {damage}")
             progress.say(f"run in {run.path} goes on from update {restored.num_updates}")
-            run.truncate_records(restored.host["records"])
         run.write_config(config)
         started_from = 0 if restored is None else restored.num_updates
         run.append(START_RECORDS, {"num_updates": started_from, "time_s": time.time(), **machine.describe()})
         stop.at_once = False
-        trainer = Trainer(config, run, parts, progress, restored)
+        try:
+            if restored is not None:
+                run.truncate_records(restored.host["records"])
+            trainer = Trainer(config, run, parts, progress, restored)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            if restored is None or isinstance(error, GvzError):
+                raise
+            raise CheckpointError(
+                f"{run.checkpoints / str(started_from)}: its host state is not one of a run ({error!r}); move it "
+                "aside, and the run goes on from the checkpoint before it"
+            ) from error
         del restored
         with contextlib.closing(trainer):
             try:

@@ -22,6 +22,7 @@ from fake_env import FRAME_SHAPE, Checker, config
 from actors import supervisor
 from actors.config import ActorsConfig
 from actors.pool import ActorPool, PoolConfig
+from actors.process import ActorProcess
 from gvz import janitor
 from gvz.errors import ConfigError, ResumeError, WorkerError
 from gvz.transport.messages import EpisodeStats, Fault, Message, ParamsHeader, Ready
@@ -251,6 +252,28 @@ def test_a_process_that_cannot_be_started_again_counts_as_one_that_failed(tmp_pa
             run.until(lambda: False)
     assert [fault.kind for fault in run.faults()] == ["died", "died", "gave_up"]
     assert run.faults()[-1].fatal
+
+
+def test_an_actor_that_tells_of_anothers_game_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    pool_config = config(tmp_path, {})
+    receive = ActorProcess.receive
+
+    def receive_a_strangers(process: ActorProcess) -> list[Message]:
+        monkeypatch.setattr(ActorProcess, "receive", receive)  # once
+        stranger = next(m for m in run.messages if isinstance(m, EpisodeStats) and m.lane == 3)
+        return [*receive(process), stranger]
+
+    with ActorPool(pool_config) as pool:
+        run = Run(pool, pool_config)
+        run.until_all_ready()
+        run.until(lambda: 3 in run.first_episodes())
+        monkeypatch.setattr(ActorProcess, "receive", receive_a_strangers)
+        run.until(lambda: pool.statistics().restarts == 1)
+        run.play(300)
+    (fault,) = run.faults()
+    assert "actor 0 sent what is no message of its own (got an episode of lane 3, task 1, want lane: task of {" in (
+        fault.message
+    )
 
 
 def test_a_new_process_begins_new_episodes_even_if_the_old_one_wrote_nothing(tmp_path: Path):

@@ -1,10 +1,13 @@
 """The real command on real Doom: trains, is interrupted, killed and resumed, and leaves nothing behind."""
 
+import json
 import os
 import signal
 import time
+from hashlib import blake2b
 from pathlib import Path
 
+import msgpack
 import numpy as np
 import pytest
 from command import alive, arrays_of, descendants, finish, launch, num_updates, rows, wait_until
@@ -12,6 +15,15 @@ from command import alive, arrays_of, descendants, finish, launch, num_updates, 
 from learner.checkpoint import checkpoint_steps, verify
 
 pytestmark = [pytest.mark.e2e, pytest.mark.engine, pytest.mark.timeout(1800), pytest.mark.usefixtures("nothing_left")]
+
+
+def forge_host_state(checkpoint: Path, host: dict) -> None:
+    """Replaces it by another, with a manifest that vouches for it."""
+    file, manifest = checkpoint / "host.msgpack", checkpoint / "manifest.json"
+    file.write_bytes(msgpack.packb(host))
+    listed = json.loads(manifest.read_text())
+    listed["files"]["host.msgpack"] = [file.stat().st_size, blake2b(file.read_bytes(), digest_size=16).hexdigest()]
+    manifest.write_text(json.dumps(listed))
 
 
 def test_a_run_trains_to_its_end_and_goes_on_when_asked_for_more(tmp_path):
@@ -42,6 +54,11 @@ def test_a_run_trains_to_its_end_and_goes_on_when_asked_for_more(tmp_path):
     assert code == 0, err
     assert "goes on from update 200" in err
     assert rows(run, "metrics.jsonl")[-1]["num_updates"] == 240
+
+    forge_host_state(run / "checkpoints" / "240", {"records": {}})
+    code, err = finish(launch(run, "--learner.total-updates", "250"))
+    assert code == 1
+    assert "checkpoints/240: its host state is not one of a run (KeyError('counts')); move it aside" in err
 
     code, err = finish(launch(run, "--learner.total-updates", "240", "--seed", "7"))
     assert code == 2
