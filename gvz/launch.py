@@ -82,8 +82,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             with RunDir(Path(directory)) as run:
                 config = resumed_config(run, launch.run)
                 run.check_resumable(config)
+                stop.importing = True
                 from gvz.train import train  # imports jax: only once the input is known to be good
 
+                stop.importing = False
                 return train(config, run, stop)
         except GvzError as error:
             print(f"error: {error}", file=sys.stderr)

@@ -1,5 +1,6 @@
 """Ctrl-C and SIGTERM: the first asks the loop to finish its update, a second one ends it at once. Standard library."""
 
+import os
 import signal
 from types import FrameType, TracebackType
 
@@ -10,11 +11,14 @@ class StopRequest:
     Attributes:
         signal: number of the first signal caught, or None.
         at_once: the first signal ends things too, by KeyboardInterrupt: there is nothing yet that could be saved.
+        importing: it ends the process from within the handler: an exception in the middle of the import of a library
+            may leave its C++ half made, and the interpreter's end then crashes.
     """
 
     def __init__(self, *, at_once: bool = False) -> None:
         self.signal: int | None = None
         self.at_once = at_once
+        self.importing = False
         self._before: dict[int, object] = {}
 
     def __enter__(self) -> "StopRequest":
@@ -31,6 +35,9 @@ class StopRequest:
         again = self.signal is not None
         if not again:
             self.signal = number
+        if self.importing:
+            os.write(2, b"stopped at once\n")
+            os._exit(self.exit_code)
         if again or self.at_once:
             raise KeyboardInterrupt
 

@@ -214,7 +214,8 @@ def test_a_launcher_killed_while_it_starts_leaves_nothing(tmp_path, moment):
 def check_stalls(tmp_path: Path, pause_s: float) -> None:
     run = tmp_path / "run"
     rules = {"default": {"sleep_s": 0.3}, "fast_enemies": {"endless": True}}
-    process = launch(run, "--learner.total-updates", "500", environment=mischief(rules))
+    flags = "--learner.total-updates 500 --replay.capacity 12000".split()
+    process = launch(run, *flags, environment=mischief(rules))
     wait_until(lambda: num_updates(run) >= 100, "update 100")
     process.send_signal(signal.SIGSTOP)
     time.sleep(pause_s)

@@ -13,7 +13,15 @@ from gvz.reports.results import Run
 def run_of(seed: int, episodes: list[tuple[int, str, float]]) -> Run:
     frame = pl.DataFrame(episodes, ["num_updates", "task", "normalized_score"], orient="row")
     config = {"name": "r", "seed": seed, "learner": {"total_updates": 100}}
-    return Run(path=Path("r"), id="r", config=config, tasks=("a/x",), metrics=pl.DataFrame(), training_episodes=frame)
+    return Run(
+        path=Path("r"),
+        id="r",
+        config=config,
+        tasks=("a/x",),
+        metrics=pl.DataFrame(),
+        training_episodes=frame,
+        starts=(),
+    )
 
 
 def test_the_running_mean_by_hand():
