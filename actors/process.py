@@ -11,14 +11,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+from gvz import janitor
 from gvz.cache import xla_cache_directory
-from gvz.errors import WaitTimeoutError
 from gvz.transport.channel import Channel
 from gvz.transport.messages import ActorSpec, Message, Stop
 
 LOG_TAIL_BYTES = 4000
-_KILL_TIMEOUT_S = 30.0
-"""the kernel takes milliseconds over a SIGKILL, unless the process hangs in a driver or in a dead file system"""
 
 ENVIRONMENT = {
     "JAX_PLATFORMS": "cpu",
@@ -101,11 +99,7 @@ class ActorProcess:
         self._process.terminate()
         if not self.wait(grace_s):
             self._process.kill()
-            if not self.wait(_KILL_TIMEOUT_S):
-                raise WaitTimeoutError(
-                    f"learner: waited {_KILL_TIMEOUT_S:.0f} s for {self._who} (pid {self.pid}) to end after SIGKILL; "
-                    "it hangs in the kernel, which `ps -o pid,stat,wchan` shows"
-                )
+            janitor.reap_killed(self._process, self._who)
 
 
 def log_path(spec: ActorSpec) -> Path:

@@ -12,12 +12,11 @@ from typing import Any
 
 from benchmarks import record
 from benchmarks.report import between
-from benchmarks.soak import DIRECTORY, summary
+from benchmarks.soak import DIRECTORY, SCHEMA, summary
 from gvz.errors import ConfigError
 
-SCHEMA = 1
-"""of both records"""
 PAGE = record.ROOT / "docs" / "RELIABILITY.md"
+RECORDS = (DIRECTORY / "soak.json", DIRECTORY / "fuzz.json")
 PLOT = record.ROOT / "docs" / "images" / "reliability_soak.png"
 _GROWS = {
     "learner_bytes": "resident memory of the learner",
@@ -78,7 +77,7 @@ def soak_table(made: dict[str, Any]) -> str:
         f"| actors killed (SIGKILL) | {len(made['kills'])} in {minutes:.0f} minutes |",
         f"| restarts counted by the run | {made['restarts']} |",
         f"| gradient steps | {made['updates']:,} |",
-        f"| records lost, repeated or torn | {made['sequence_errors']} |",
+        "| records lost, repeated or torn | none: the first would have ended the run, and the soak with it |",
         f"| damaged rows in the records | {made['damaged_rows']} |",
         f"| gradient steps/s, undisturbed stretches | {rates['undisturbed']} |",
         f"| gradient steps/s, stretches with kills | {rates['kills']} |",
@@ -124,13 +123,22 @@ def draw(made: dict[str, Any], out: Path) -> None:
     plt.close(figure)
 
 
+def write_page(page: str, soak: dict[str, Any], fuzz: dict[str, Any]) -> str:
+    """The page with what the two records give between its markers.
+
+    Raises:
+        ConfigError: a marker is missing.
+    """
+    command = "python -m benchmarks.reliability"
+    page = between(page, PAGE, "soak", soak_table(soak), command)
+    return between(page, PAGE, "fuzz", fuzz_table(fuzz), command)
+
+
 def main() -> int:
     """Writes page and plot; returns the exit code."""
     try:
-        soak, fuzz = read(DIRECTORY / "soak.json"), read(DIRECTORY / "fuzz.json")
-        page, command = PAGE.read_text(), "python -m benchmarks.reliability"
-        page = between(page, PAGE, "soak", soak_table(soak), command)
-        PAGE.write_text(between(page, PAGE, "fuzz", fuzz_table(fuzz), command))
+        soak, fuzz = map(read, RECORDS)
+        PAGE.write_text(write_page(PAGE.read_text(), soak, fuzz))
     except ConfigError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code

@@ -49,22 +49,23 @@ class Remote:
                 needs is not installed).
         """
         self._name = script
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  closed in `close`
         self._directory = tempfile.TemporaryDirectory(prefix="gvz-peer-")  # a peer's ViZDoom writes where it stands
+        self._errors = Path(self._directory.name) / "stderr"
         self._process: subprocess.Popen[bytes] | None = None
         if not Path(python).exists():
             self.close()
             raise RemoteError(f"{script}: there is no interpreter {python}; make one with `make bench-peers`")
         root = str(PEERS.parent.parent)
         path = [root] if str(python) == sys.executable else []  # peers see nothing of ours
-        self._process = subprocess.Popen(
-            [str(Path(python).absolute()), str(PEERS / f"{script}.py"), *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            cwd=self._directory.name,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(path), **environment},
-        )
+        with self._errors.open("wb") as errors:
+            self._process = subprocess.Popen(
+                [str(Path(python).absolute()), str(PEERS / f"{script}.py"), *arguments],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                cwd=self._directory.name,
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(path), **environment},
+            )
         self._buffer = b""
         try:
             self.about = self._answer(START_TIMEOUT_S)
@@ -121,7 +122,6 @@ class Remote:
                 process.kill()
                 process.wait()
             process.stdout.close()
-        self._errors.close()
         self._directory.cleanup()
 
     def _answer(self, timeout_s: float) -> dict[str, Any]:
@@ -146,8 +146,7 @@ class Remote:
 
     def _tail(self) -> str:
         """The last line it wrote to its standard error: in Python, the exception."""
-        self._errors.seek(0)
-        lines = self._errors.read().decode(errors="replace").strip().splitlines()
+        lines = self._errors.read_text(errors="replace").strip().splitlines()
         return lines[-1][:300] if lines else "it ended without a word"
 
 

@@ -1,7 +1,7 @@
 """The soak: the main job for an hour at full speed while its actors are killed one after the other.
 
     python -m benchmarks.soak                      # 60 minutes of kills, a kill every 20 s; record, page and plot
-    python -m benchmarks.soak --minutes 6 --stretches 1 --out /tmp/soak.json
+    python -m benchmarks.soak --minutes 6 --stretches 1 --out soak.json
 
 The run is the real command. Stretches with kills take turns with short ones without, so that the price of the kills is
 a ratio within one run on one machine. Memory, descriptors, shared memory and processes are sampled all the time; at the
@@ -32,6 +32,7 @@ from gvz import machine
 from gvz.rundir import read_records
 
 SCHEMA = 1
+"""of the records in DIRECTORY, those of the fuzzing too"""
 DIRECTORY = record.ROOT / "results" / "reliability"
 SHARED_MEMORY = Path("/dev/shm")
 _START_TIMEOUT_S, _STOP_TIMEOUT_S = 900.0, 120.0
@@ -166,7 +167,6 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
             "updates": rows[-1]["num_updates"],
             "exit_code": code,
             "damaged_rows": len(problems),
-            "sequence_errors": run.output().count("TransportError"),
             "left_behind": run_leftovers(run.process.pid),
         }
 
@@ -259,8 +259,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console.print(
         f"{len(made['kills'])} kills, {made['restarts']} restarts, left behind: {made['left_behind'] or 'nothing'}"
     )
-    good = made["exit_code"] == 128 + signal.SIGTERM and not made["left_behind"] and not made["sequence_errors"]
-    return 0 if good else 1
+    return 0 if made["exit_code"] == 128 + signal.SIGTERM and not made["left_behind"] else 1
 
 
 if __name__ == "__main__":

@@ -2,10 +2,12 @@
 imports what it needs once it runs.
 """
 
+import functools
+import operator
 import os
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any, Union
+from typing import Annotated, Any
 
 import tyro
 
@@ -59,10 +61,9 @@ def parse(arguments: Sequence[str], **other_commands: type) -> Any:
     """
     found = {name: module.COMMAND for name, module in discover("gvz.commands").items()} | other_commands
     overview = arguments[:1] in ([], ["-h"], ["--help"])
-    choices = [Annotated[command, _subcommand(name, command, overview)] for name, command in found.items()]
-    of_all: Any = Union[tuple(choices)]  # noqa: UP007  # made at run time
+    choices: list[Any] = [Annotated[command, _subcommand(name, command, overview)] for name, command in found.items()]
     return tyro.cli(
-        of_all,
+        functools.reduce(operator.or_, choices),
         args=arguments,
         prog="gvz",
         description=DESCRIPTION,

@@ -17,12 +17,13 @@ import re
 import shutil
 import signal
 import stat
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
 from typing import Literal
 
-from gvz.errors import ResourceError
+from gvz.errors import ResourceError, WaitTimeoutError
 
 Kind = Literal["engine", "segment"]
 """engine: `name` is an engine's private directory; segment: `name` is a file of /dev/shm."""
@@ -32,6 +33,8 @@ ENGINE_DIR_PREFIX = "gvz-engine-"
 """every engine's private directory is called so, followed by random letters"""
 INSTANCE_FILE = "instance"
 """in an engine's private directory: "pid start id" of its engine, written by `engine_wrapper.py`"""
+KILL_TIMEOUT_S = 30.0
+"""the kernel takes milliseconds over a SIGKILL, unless the process hangs in a driver or in a dead file system"""
 _ENGINE_SHM_PREFIXES = ("ViZDoomSM", "ViZDoomMQCtr", "ViZDoomMQDoom")
 _PR_SET_PDEATHSIG = 1
 _UNREADABLE = (OSError, ValueError, KeyError, TypeError, RecursionError)
@@ -171,6 +174,21 @@ def die_with_parent(parent_pid: int) -> None:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
     if os.getppid() != parent_pid:
         sys.exit(1)
+
+
+def reap_killed(process: "subprocess.Popen[bytes]", who: str) -> None:
+    """Waits for the end of a child that was sent SIGKILL.
+
+    Raises:
+        WaitTimeoutError: it is still there.
+    """
+    try:
+        process.wait(KILL_TIMEOUT_S)
+    except subprocess.TimeoutExpired as error:
+        raise WaitTimeoutError(
+            f"waited {KILL_TIMEOUT_S:g} s for {who} (pid {process.pid}) to end after SIGKILL; it hangs in the kernel, "
+            "which `ps -o pid,stat,wchan` shows"
+        ) from error
 
 
 def process_start(pid: int) -> int | None:

@@ -16,7 +16,7 @@ import uuid
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]  # made at run time
 from tensorboardX.record_writer import masked_crc32c
@@ -26,9 +26,6 @@ from gvz.errors import ConfigError
 from gvz.progress import TaskStatus
 from gvz.rundir import RunDir
 from gvz.transport.messages import EpisodeStats, Fault
-
-if TYPE_CHECKING:
-    import wandb  # pyright: ignore[reportMissingImports]  # an extra
 
 RECENT_EPISODES = 30
 """episodes in a task's recent score (thesis 4.3.2 uses 30 for its KPI)"""
@@ -199,7 +196,7 @@ def event_record(event: Any) -> bytes:
     return length + struct.pack("<I", masked_crc32c(length)) + data + struct.pack("<I", masked_crc32c(data))
 
 
-def start_wandb(run: RunDir) -> "wandb.Run":
+def start_wandb(run: RunDir) -> Any:  # wandb.Run, a type only where the extra is installed
     """The Weights & Biases run of a run directory, begun or, where one began before, gone on with.
 
     WANDB_MODE, WANDB_PROJECT, WANDB_ENTITY and the others of its environment variables hold; with WANDB_MODE=offline

@@ -1,7 +1,8 @@
 """THE data flow of training, an arrow a line: drain -> replay.add -> limiter -> train_step -> broadcast.
 
 What is laid round it (supervision, records, checkpoints, resume) calls into the modules that do the work. Nothing
-here waits for the device between log periods except a publication, which copies the parameters to the host.
+here waits for the device between log periods but a publication, which copies the parameters to the host, and a
+checkpoint.
 """
 
 import contextlib
@@ -114,7 +115,6 @@ class Trainer:
         self._metrics: dict[str, float] = {}
         self._rates, self._collected_s, self._last_status_s = Rates(), time.monotonic(), 0.0
         self._without_records_s = 0.0
-        self._last_rates: dict[str, float] = {}
         pool = InlinePool if config.mode == "sync" else ActorPool
         self._pool: Pool = pool(parts.pool_config, None if host is None else host["pool"])
         self._send()
@@ -385,13 +385,14 @@ def _own_fault(kind: str, message: str) -> Fault:
 
 def _expected(config: RunConfig, parts: Parts) -> Expected:
     tasks, spec, agent = parts.pool_config.tasks, parts.agent.spec, config.agent
+    v_min, v_max = agent.value_range(spec.v_min, spec.v_max)
     played = Counter(tasks[lane % len(tasks)] for lane in range(config.num_lanes))
     return Expected(
         games={task: played[task] for task in tasks},
         timeout_steps=-(-config.resolved_scenario().timeout_frames(config.env.profile) // config.env.frame_skip),
         num_slots=parts.replay_spec.num_slots,
-        v_min=spec.v_min if agent.v_min is None else agent.v_min,
-        v_max=spec.v_max if agent.v_max is None else agent.v_max,
+        v_min=v_min,
+        v_max=v_max,
         distributional=agent.distributional,
     )
 

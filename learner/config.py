@@ -95,6 +95,10 @@ class AgentConfig:
         if self.v_min is not None and self.v_max is not None and not self.v_min < self.v_max:
             raise ConfigError(f"agent.v_min, v_max: got {self.v_min}, {self.v_max}, want v_min < v_max")
 
+    def value_range(self, v_min: float, v_max: float) -> tuple[float, float]:
+        """(v_min, v_max) as configured; what is left open is the given one, that of the scenario's returns."""
+        return v_min if self.v_min is None else self.v_min, v_max if self.v_max is None else self.v_max
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ReplayConfig:

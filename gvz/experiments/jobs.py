@@ -1,7 +1,7 @@
 """A job: what is to be done for one run (train, then evaluate) or one player, and the process that does it now.
 
-The next command follows from what stands on the disk, so a job that was cut goes on. Imports gvz.config and
-gvz.experiments.
+The next command follows from what stands on the disk, so a job that was cut goes on. Imports
+gvz.{config,janitor,experiments}.
 """
 
 import fcntl
@@ -16,16 +16,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Protocol
 
+from gvz import janitor
 from gvz.config import load_config
-from gvz.errors import WaitTimeoutError
 from gvz.experiments import progress
 from gvz.experiments.base import TrainingRun
 from gvz.experiments.plan import Evaluation
 from gvz.experiments.scale import scaled_settings
 from gvz.specs import SimplePlayer
-
-KILL_TIMEOUT_S = 30.0
-"""the kernel takes milliseconds over a SIGKILL, unless the process hangs in a driver or in a dead file system"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -236,13 +233,7 @@ class RunningJob:
         """Ends the command and all it started at once."""
         if self.poll() is None:
             os.killpg(self._process.pid, signal.SIGKILL)
-            try:
-                self._process.wait(KILL_TIMEOUT_S)
-            except subprocess.TimeoutExpired as error:
-                raise WaitTimeoutError(
-                    f"waited {KILL_TIMEOUT_S:g} s for {self.job.id} (pid {self._process.pid}) to end after SIGKILL; it "
-                    "hangs in the kernel, which `ps -o pid,stat,wchan` shows"
-                ) from error
+            janitor.reap_killed(self._process, self.job.id)
             self.poll()
 
     def _note(self, line: str) -> None:

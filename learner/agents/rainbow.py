@@ -103,11 +103,7 @@ class Rainbow:
         return AgentLoss(loss, priority, losses.take_action(q_tm1, batch.a_tm1), td_error)
 
     def _value_range(self) -> tuple[float, float]:
-        config, spec = self.config, self.spec
-        return (
-            spec.v_min if config.v_min is None else config.v_min,
-            spec.v_max if config.v_max is None else config.v_max,
-        )
+        return self.config.value_range(self.spec.v_min, self.spec.v_max)
 
 
 AGENT = Rainbow

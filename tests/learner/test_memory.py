@@ -4,8 +4,10 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 PROGRAM = """
-import ctypes, json, resource, sys
+import ctypes, json, resource, sys, threading
 import psutil
 from learner import memory
 
@@ -16,13 +18,21 @@ if sys.argv[1] == "keep":
 def step() -> None:
     ctypes.create_string_buffer(BYTES)  # cleared, so touched
 
+def five_steps() -> None:
+    for _ in range(5):
+        step()
+
 def faults() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 
 step()
 before = faults()
-for _ in range(5):
-    step()
+if sys.argv[2] == "another thread":
+    thread = threading.Thread(target=five_steps)
+    thread.start()
+    thread.join()
+else:
+    five_steps()
 count = (faults() - before) / 5
 kept = psutil.Process().memory_info().rss
 memory.release_freed_memory()
@@ -30,22 +40,23 @@ print(json.dumps([count, kept - psutil.Process().memory_info().rss]))
 """
 
 
-def measure(what: str) -> tuple[float, int]:
+def measure(what: str, where: str) -> tuple[float, int]:
     """Page faults of a step that takes 100 MB, and bytes given back after it."""
-    done = subprocess.run([sys.executable, "-c", PROGRAM, what], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", PROGRAM, what, where], capture_output=True, text=True, check=True)
     count, released = json.loads(done.stdout)
     return count, released
 
 
-def test_kept_memory_is_not_faulted_in_again_and_can_be_released():
+@pytest.mark.parametrize("where", ["main thread", "another thread"])
+def test_kept_memory_is_not_faulted_in_again_and_can_be_released(where):
     pages = 100 * 2**20 / 4096
-    count, released = measure("keep")
+    count, released = measure("keep", where)
     assert count < pages / 100
     assert released > 90 * 2**20
 
 
 def test_without_it_every_step_pays():
     pages = 100 * 2**20 / 4096
-    count, released = measure("do not")
+    count, released = measure("do not", "main thread")
     assert count > pages / 2
     assert released < 10 * 2**20

@@ -127,7 +127,10 @@ def leaves_close(a, b, **tolerance):
 
 def raw(state):
     """Leaves as numpy, keys as their bits."""
-    is_key = lambda leaf: jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)  # noqa: E731
+
+    def is_key(leaf: jax.Array) -> bool:
+        return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
     return [np.asarray(jax.random.key_data(x) if is_key(x) else x) for x in jax.tree.leaves(state)]
 
 
