@@ -47,30 +47,30 @@ def measure(budget: Budget) -> list[Row]:
         engines = [stack.enter_context(Remote("bare_engine", workload.TASK, *size)) for _ in range(num_engines)]
         products = [stack.enter_context(Remote("cpu_matmul", **ENVIRONMENT)) for _ in range(cores)]
         acting = {games: stack.enter_context(workload.playing(parts[games].pool_config, flat)) for games in all_games}
+        plays = {
+            f"actor pool, full network, {games} games an actor": partial(workload.decisions_per_s, pool, budget.body_s)
+            for games, pool in acting.items()
+        }
         values = alternate(
             budget.rounds,
             {
                 "engines": lambda: count_per_s(engines, {"seconds": budget.body_s}),
                 "flops": lambda: count_per_s(products, {"seconds": budget.body_s}),
-                **{
-                    f"acting {games}": partial(workload.decisions_per_s, pool, budget.body_s)
-                    for games, pool in acting.items()
-                },
+                **plays,
             },
         )
+        profile = workload.processor_times(budget.rounds, plays)
     obs = jax.ShapeDtypeStruct((1, *agent.spec.obs_shape), jnp.uint8)
     flops = workload.flops(
         workload.direct(agent).act, params, jax.random.key(0), obs, jax.ShapeDtypeStruct((1,), jnp.int32), 0.0
     )
     limits = [1 / (1 / e + flops / f) for e, f in zip(values["engines"], values["flops"], strict=True)]
-    bests = [max(each) for each in zip(*(values[f"acting {games}"] for games in all_games), strict=True)]
+    bests = [max(each) for each in zip(*(values[name] for name in plays), strict=True)]
     return [
         rates(f"bare engines x{num_engines}", decisions_per_s=values["engines"]),
         rates("limit: engine and arithmetic", decisions_per_s=limits),
-        *(
-            rates(f"actor pool, full network, {games} games an actor", decisions_per_s=values[f"acting {games}"])
-            for games in all_games
-        ),
+        *(rates(name, decisions_per_s=values[name]) for name in plays),
+        *profile,
         measured("float32 products, all cores", "GFLOP/s", [f / 1e9 for f in values["flops"]]),
         measured("arithmetic of one decision", "MFLOP", [flops / 1e6]),
         goal(

@@ -62,7 +62,8 @@ def measure(budget: Budget) -> list[Row]:
             peer("levdoom 320x240", f"LevDoom, {count} games, 320x240", "levdoom_async", str(count))
             peer("levdoom 256x144", f"LevDoom, {count} games, 256x144", "levdoom_async", str(count), "256X144")
         values = alternate(budget.rounds, bodies)
-    rows = [*(rates(name, decisions_per_s=found) for name, found in values.items()), *rows]
+        profile = workload.processor_times(budget.rounds, {name: bodies[name] for name in (groups["limit"][0], ours)})
+    rows = [*(rates(name, decisions_per_s=found) for name, found in values.items()), *rows, *profile]
     best = {
         group: [max(found) for found in zip(*(values[n] for n in names), strict=True)]
         for group, names in groups.items()

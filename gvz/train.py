@@ -8,9 +8,6 @@ checkpoint.
 import contextlib
 import dataclasses
 import time
-from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -21,15 +18,15 @@ import numpy as np
 from actors.inline import InlinePool
 from actors.pool import STOP_TIMEOUT_S, ActorPool
 from gvz import bill, janitor, machine
-from gvz.alarms import Expected, alarms
 from gvz.assemble import Parts, Pool, assemble
 from gvz.cache import xla_cache_directory
 from gvz.config import RunConfig
 from gvz.errors import CheckpointError, GvzError, WaitTimeoutError, WorkerError
-from gvz.progress import Progress, Status
+from gvz.monitor import Counts, Monitor
+from gvz.progress import Progress
 from gvz.rundir import START_RECORDS, RunDir
 from gvz.stop import StopRequest
-from gvz.telemetry import Rates, Telemetry
+from gvz.telemetry import Telemetry
 from gvz.transport.messages import EpisodeStats, Fault, ParamsHeader
 from gvz.watchdog import Watchdog
 from learner import replay, train_step
@@ -50,26 +47,6 @@ LONGEST_ROUND_S = 1800.0
 """a learner that is at one round for so long (it compiles in one, too) is stuck in the device, and ended"""
 SAVE_RETRY_S, LONGEST_SAVE_RETRY_S = 60.0, 3600.0
 """a failed checkpoint is tried again after so long, twice as long each time, or at the next period"""
-STATUS_PERIOD_S = 0.5
-"""seconds between looks at the counters for the live panel"""
-
-
-@dataclass(kw_only=True, slots=True)
-class Counts:
-    """What has been done so far; part of every checkpoint."""
-
-    records: int = 0
-    """step records put into the replay, overwritten ones included"""
-    env_steps: int = 0
-    """decisions among them"""
-    updates: int = 0
-    """gradient steps"""
-    version: int = 0
-    """of the newest parameters on the broadcast queue"""
-    published_updates: int = 0
-    """gradient steps of that version"""
-    logged_updates: int = 0
-    saved_updates: int = 0
 
 
 class Trainer:
@@ -111,10 +88,8 @@ class Trainer:
             self._telemetry.restore(host["telemetry"])
         self._checkpointer = Checkpointer(run.path, keep=config.checkpoint.keep)
         self._failed_saves, self._retry_save_s = 0, 0.0
-        self._expected, self._warned = _expected(config, parts), set[str]()
-        self._metrics: dict[str, float] = {}
-        self._rates, self._collected_s, self._last_status_s = Rates(), time.monotonic(), 0.0
-        self._without_records_s = 0.0
+        self._monitor = Monitor(config, parts, progress, self._telemetry)
+        self._collected_s, self._without_records_s = time.monotonic(), 0.0
         pool = InlinePool if config.mode == "sync" else ActorPool
         self._pool: Pool = pool(parts.pool_config, None if host is None else host["pool"])
         self._send()
@@ -233,30 +208,16 @@ class Trainer:
 
     def _record(self) -> None:
         """Counters -> panel; metrics -> records every log period, the only wait for the device."""
-        counts, now = self._counts, time.monotonic()
-        logging = counts.updates >= counts.logged_updates + self._config.log.period_updates
-        if logging:
+        counts = self._counts
+        if counts.updates >= counts.logged_updates + self._config.log.period_updates:
             counts.logged_updates = counts.updates
             tasks = self._parts.pool_config.tasks
-            self._metrics, self._state = train_step.read_metrics(self._state, tasks, self._run.path)
-        elif counts.updates > 0 or now - self._last_status_s < STATUS_PERIOD_S:
-            return
-        self._last_status_s = now
-        row = self._measure()
-        if logging:
-            learner = {f"learner/{name}": value for name, value in self._metrics.items()}
-            scalars = {**row, **learner, **self._replay_shares()}
-            self._telemetry.scalars(counts.updates, scalars)
-            self._warn(scalars)
-        self._progress.show(self._status(row))
-
-    def _warn(self, scalars: Mapping[str, float]) -> None:
-        """Says what should make a person look, each thing once."""
-        for condition, text in alarms(scalars, self._telemetry.task_statuses(), self._expected).items():
-            if condition not in self._warned:
-                self._warned.add(condition)
-                self._progress.say(f"warning: {text}")
-                self._telemetry.fault(_own_fault("warning", text), num_updates=self._counts.updates)
+            means, self._state = train_step.read_metrics(self._state, tasks, self._run.path)
+            stored = np.asarray(replay.records_per_task(self._parts.replay_spec, self._replay))
+            shares = dict(zip(tasks, (stored / stored.sum()).tolist(), strict=True))
+            self._monitor.log(counts, self._pool.statistics(), self._ingest.take_staleness(), means, shares)
+        elif counts.updates == 0:
+            self._monitor.look(counts, self._pool.statistics(), self._ingest.take_staleness)
 
     def _save(self) -> None:
         """Whole state -> checkpoint, every period; a failed one is reported and tried again."""
@@ -307,7 +268,7 @@ class Trainer:
         self._failed_saves += 1
         self._retry_save_s = time.monotonic() + wait_s
         self._progress.say(f"checkpoint failed, tried again within {wait_s:.0f} s: {failure}")
-        self._telemetry.fault(_own_fault("checkpoint", failure), num_updates=self._counts.updates)
+        self._monitor.fault("checkpoint", failure, self._counts.updates)
         return failure
 
     def _host_state(self) -> dict[str, Any]:
@@ -321,80 +282,6 @@ class Trainer:
             "pool": self._pool.state(),
             "records": self._run.record_lengths(),
         }
-
-    def _measure(self) -> dict[str, float]:
-        """A row of metrics: rates and waits since the last one, sizes, and the learner's own means."""
-        counts, statistics = self._counts, self._pool.statistics()
-        rates = self._rates(
-            {
-                "learner/updates_per_s": counts.updates,
-                "learner/samples_per_s": counts.updates * self._config.learner.batch_size,
-                "actors/decisions_per_s": counts.env_steps,
-                "actors/frames_per_s": counts.env_steps * self._config.env.frame_skip,
-                "learner/wait_share": statistics.waited_for_records_s,
-                "actors/wait_share": statistics.waited_for_space_s / self._config.num_actors,
-            }
-        )
-        staleness = self._ingest.take_staleness()
-        return {
-            **rates,
-            "actors/env_steps": counts.env_steps,
-            "actors/restarts": statistics.restarts,
-            "actors/staleness_mean_versions": staleness.mean,
-            "actors/staleness_p95_versions": staleness.p95,
-            "actors/staleness_max_versions": staleness.max,
-            "replay/fill_share": min(1.0, counts.records / self._parts.replay_spec.num_slots),
-        }
-
-    def _replay_shares(self) -> dict[str, float]:
-        """Each task's share of the records stored."""
-        counts = np.asarray(replay.records_per_task(self._parts.replay_spec, self._replay))
-        tasks = self._parts.pool_config.tasks
-        return {f"replay/share/{name}": float(n) / counts.sum() for name, n in zip(tasks, counts, strict=True)}
-
-    def _status(self, row: Mapping[str, float]) -> Status:
-        counts, learner = self._counts, self._config.learner
-        if counts.updates:
-            phase = "training"
-        elif counts.env_steps:
-            phase = f"warm-up {counts.env_steps:,}/{learner.warmup_steps:,} decisions"
-        else:
-            phase = "starting actors"
-        return Status(
-            phase=phase,
-            num_updates=counts.updates,
-            total_updates=learner.total_updates,
-            env_steps=counts.env_steps,
-            updates_per_s=row["learner/updates_per_s"],
-            steps_per_s=row["actors/decisions_per_s"],
-            frames_per_s=row["actors/frames_per_s"],
-            replay_fill=row["replay/fill_share"],
-            learner_wait=row["learner/wait_share"],
-            actor_wait=row["actors/wait_share"],
-            staleness_updates=row["actors/staleness_mean_versions"] * learner.publish_period_updates,
-            loss=self._metrics.get("loss", float("nan")),
-            restarts=int(row["actors/restarts"]),
-            tasks=self._telemetry.task_statuses(),
-        )
-
-
-def _own_fault(kind: str, message: str) -> Fault:
-    """Of the learner itself, not of an actor."""
-    return Fault(actor=-1, lane=None, kind=kind, message=message)
-
-
-def _expected(config: RunConfig, parts: Parts) -> Expected:
-    tasks, spec, agent = parts.pool_config.tasks, parts.agent.spec, config.agent
-    v_min, v_max = agent.value_range(spec.v_min, spec.v_max)
-    played = Counter(tasks[lane % len(tasks)] for lane in range(config.num_lanes))
-    return Expected(
-        games={task: played[task] for task in tasks},
-        timeout_steps=-(-config.resolved_scenario().timeout_frames(config.env.profile) // config.env.frame_skip),
-        num_slots=parts.replay_spec.num_slots,
-        v_min=v_min,
-        v_max=v_max,
-        distributional=agent.distributional,
-    )
 
 
 def _template(config: RunConfig, parts: Parts) -> dict[str, Any]:

@@ -23,6 +23,7 @@ TIER_3 = (
     "gvz.gallery",
     "gvz.launch",
     "gvz.machine",
+    "gvz.monitor",
     "gvz.progress",
     "gvz.reports",
     "gvz.rundir",

@@ -28,7 +28,7 @@ _UNPUBLISHED = 2**64 - 1
 """sequence number of a slot that is being filled"""
 _MAX_PUBLISHED = 2**63
 """no ring lives to see so many records; beyond them the numbers would not fit into their words"""
-_FIRST_SLEEP_S, _LONGEST_SLEEP_S = 20e-6, 1e-3
+_FIRST_SLEEP_S, _LONGEST_SLEEP_S = 20e-6, 10e-3
 
 
 class WriterState(IntEnum):
