@@ -42,6 +42,11 @@ class Record:
     rows: list[Row]
 
 
+def environment() -> dict[str, str]:
+    """Of what is measured: this one, but bytecode is cached, as it is wherever PYTHONDONTWRITEBYTECODE is not set."""
+    return {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+
+
 def describe_machine() -> dict[str, Any]:
     """What the figures were measured on; load and free memory are those at the start."""
     return {

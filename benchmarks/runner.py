@@ -1,7 +1,8 @@
 """Finds the benchmarks, and runs each in a process of its own, so that none can sink, slow or outlive the rest.
 
 A benchmark is a file of this package with a docstring and a function `measure(budget) -> list of rows`; its file name
-is its name. Imports the standard library, gvz.{cache,errors,janitor,machine,registry} and benchmarks.{record,rounds}.
+is its name. Imports the standard library, gvz.{cache,errors,janitor,machine,registry}, learner.memory and
+benchmarks.{record,rounds}.
 """
 
 import contextlib
@@ -23,6 +24,7 @@ from gvz.cache import xla_cache_directory
 from gvz.errors import ConfigError
 from gvz.machine import versions
 from gvz.registry import discover
+from learner.memory import keep_freed_memory
 
 TIMEOUT_S = 900.0
 """a benchmark that takes longer is ended"""
@@ -49,7 +51,8 @@ def chosen(names: tuple[str, ...]) -> list[str]:
 
 
 def run_in_process(name: str, budget: Budget, command: str) -> record.Record:
-    """Measures one benchmark here and now."""
+    """Measures one benchmark here and now. Nothing in this process has used jax before."""
+    keep_freed_memory()  # as gvz/train.py does, and as early: threads that have allocated keep their arenas
     import jax
 
     jax.config.update("jax_compilation_cache_dir", str(xla_cache_directory()))
@@ -82,7 +85,7 @@ def run(name: str, budget: Budget, command: str, out: Path, *, timeout_s: float 
         [sys.executable, "-m", "benchmarks.runner", name, json.dumps(arguments)],
         cwd=record.ROOT,
         # a run that a benchmark starts needs room on the GPU beside it
-        env={"XLA_PYTHON_CLIENT_PREALLOCATE": "false", **os.environ},
+        env={"XLA_PYTHON_CLIENT_PREALLOCATE": "false", **record.environment()},
         start_new_session=True,  # Ctrl-C reaches us alone, and what it starts can be ended as one group
     )
     try:

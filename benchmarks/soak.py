@@ -66,7 +66,9 @@ class Watched:
         words = ["--config", "rainbow_4task.py", "--run-dir", str(directory), "--log.period-updates", "5", *flags]
         self.command = [sys.executable, "-m", "gvz.launch", *words]
         self._output = (directory.parent / "output.log").open("w+b")
-        self.process = subprocess.Popen(self.command, stdout=self._output, stderr=self._output, cwd=record.ROOT)
+        self.process = subprocess.Popen(
+            self.command, stdout=self._output, stderr=self._output, cwd=record.ROOT, env=record.environment()
+        )
         self._root = psutil.Process(self.process.pid)
 
     def output(self) -> str:

@@ -1,11 +1,11 @@
-"""Seconds to the help page, and from the command to the first episode's row of `rainbow_4task` on a warm cache.
+"""Seconds to the help page and from the command to the first episode's row of `rainbow_4task`, on a warm cache, and what
+the start of an actor takes, which is the price of every one that is replaced.
 
-The first run fills the caches (bytecode, compiled maps, compiled programs) and is thrown away; bytecode is written even
-where PYTHONDONTWRITEBYTECODE says otherwise, as containers often do. Goals: `--help` under 0.5 s
-without importing jax, the first row within 15 s.
+The first run fills the caches (bytecode, compiled maps, compiled programs) and is thrown away. Goals: `--help` under
+0.5 s without importing jax, the first row within 15 s.
 """
 
-import os
+import dataclasses
 import subprocess
 import sys
 import tempfile
@@ -13,19 +13,20 @@ import time
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from benchmarks import workload
 from benchmarks.rounds import Budget, Row, alternate, goal, measured
 from benchmarks.whole import end_run
 
 _LAUNCH = [sys.executable, "-m", "gvz.launch"]
-_ENVIRONMENT = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
 _GVZ = str(Path(sys.executable).with_name("gvz"))
 _TIMEOUT_S = 600.0
 _POLL_S = 0.05
 
 
 def measure(budget: Budget) -> list[Row]:
-    """Alternates all three."""
+    """Alternates all of them."""
     with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
         counter = iter(range(1000))
         values = alternate(
@@ -34,6 +35,7 @@ def measure(budget: Budget) -> list[Row]:
                 "launch": partial(_help_s, *_LAUNCH),
                 "gvz": partial(_help_s, _GVZ),
                 "episode": lambda: _first_episode_s(Path(directory) / f"run_{next(counter)}", budget),
+                "actor": lambda: _actor_start_s(Path(directory) / "actor", budget),
             },
             warm_up=not budget.quick,
         )
@@ -42,12 +44,13 @@ def measure(budget: Budget) -> list[Row]:
         goal(8, "`gvz --help`", values["gvz"], at_most=0.5, unit="s"),
         measured("modules of jax that `python -m gvz.launch --help` imports", "modules", [_jax_modules_of_help()]),
         goal(8, "from the command to the first episode's row", values["episode"], at_most=15.0, unit="s"),
+        measured("processor time until an actor with four games plays, its engines' included", "s", values["actor"]),
     ]
 
 
 def _help_s(*command: str) -> float:
     start = time.perf_counter()
-    subprocess.run([*command, "--help"], stdout=subprocess.DEVNULL, check=True, env=_ENVIRONMENT)
+    subprocess.run([*command, "--help"], stdout=subprocess.DEVNULL, check=True)
     return time.perf_counter() - start
 
 
@@ -67,7 +70,6 @@ def _first_episode_s(directory: Path, budget: Budget) -> float:
         [*_LAUNCH, "--config", "rainbow_4task.py", "--run-dir", str(directory), *workload.quick_flags(budget)],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        env=_ENVIRONMENT,
     )
     try:
         while not (records.exists() and b"\n" in records.read_bytes()):
@@ -77,3 +79,16 @@ def _first_episode_s(directory: Path, budget: Budget) -> float:
         return time.perf_counter() - start
     finally:
         end_run(process)
+
+
+def _actor_start_s(directory: Path, budget: Budget) -> float:
+    """Processor seconds that one actor and its engines have taken when it is ready to play."""
+    from gvz.assemble import assemble
+
+    parts = assemble(workload.run_config(budget), directory)
+    before = workload.processor_s()
+    with workload.playing(
+        dataclasses.replace(parts.pool_config, num_actors=1), np.zeros(parts.pool_config.num_params, np.float32)
+    ):
+        after = workload.processor_s()
+    return sum(after[where] - before[where] for where in ("Python", "engines"))

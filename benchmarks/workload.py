@@ -129,14 +129,14 @@ def processor_times(rounds: int, plays: Mapping[str, Callable[[], float]]) -> li
     found: dict[str, list[float]] = {}
     for _ in range(rounds):
         for name, play in plays.items():
-            before, start = _processor_s(), time.perf_counter()
+            before, start = processor_s(), time.perf_counter()
             decisions = play() * (time.perf_counter() - start)
-            for where, seconds in _processor_s().items():
+            for where, seconds in processor_s().items():
                 found.setdefault(f"{name}: {where}", []).append((seconds - before[where]) / decisions * 1e6)
     return [measured(f"processor time a decision, {name}", "us", values) for name, values in found.items()]
 
 
-def _processor_s() -> dict[str, float]:
+def processor_s() -> dict[str, float]:
     """Seconds of processor time so far of this process and of those below it."""
     seconds: dict[str, float] = dict.fromkeys(PROCESSES, 0.0)
     this = psutil.Process()
@@ -191,10 +191,8 @@ class Learner:
 
         from learner import replay, train_step
         from learner.ingest import Ingest
-        from learner.memory import keep_freed_memory
         from learner.policy import flatten_params
 
-        keep_freed_memory()
         self.config, self.parts = config, parts
         self.state = train_step.init(parts.agent, parts.replay_spec, config.learner, jax.random.key(0))
         self.replay = filled_replay(parts.replay_spec)

@@ -1,6 +1,5 @@
-"""A task as a Gymnasium environment: what comes out of it, when it ends, seeds, crashes, registration."""
+"""A task as an environment: what comes out of it, when it ends, its seeds, its arguments, its window."""
 
-import hashlib
 import json
 import subprocess
 import sys
@@ -8,22 +7,16 @@ import time
 from collections.abc import Iterator
 
 import cv2
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
-from gymnasium.utils.env_checker import check_env
 
 import gvz
 from gvz.env import DoomEnv, is_solved, make_env
-from gvz.errors import ConfigError, EngineError, ResourceError, TaskError
-from gvz.registration import gymnasium_id
-from gvz.tasks import named_tasks, parse_task
+from gvz.errors import ConfigError, ResourceError, TaskError
+from tests.episodes import TURN, fingerprint, idle_to_the_end, play
 
 pytestmark = pytest.mark.engine
-
-TURN = 1
-"""an action of Defend the Center that wastes no ammunition"""
 
 
 @pytest.fixture(scope="module")
@@ -32,29 +25,6 @@ def shared() -> Iterator[DoomEnv]:
     env = DoomEnv("defend_the_center/default", render_mode="rgb_array")
     yield env
     env.close()
-
-
-def play(env: DoomEnv, episode_seed: int, max_steps: int = 60) -> tuple[np.ndarray, list[float], list[dict]]:
-    """Frames u8[T+1 H W C], rewards and infos of an episode, with actions drawn from its seed."""
-    rng = np.random.default_rng(episode_seed)
-    frame, info = env.reset(options={"episode_seed": episode_seed})
-    frames, rewards, infos = [frame], [], [info]
-    for _ in range(max_steps):
-        frame, reward, terminated, truncated, info = env.step(rng.integers(env.action_space.n))
-        frames.append(frame)
-        rewards.append(reward)
-        infos.append(info)
-        if terminated or truncated:
-            break
-    return np.stack(frames), rewards, infos
-
-
-def idle_to_the_end(env: DoomEnv, action: int = TURN) -> list[tuple]:
-    """All steps of one episode."""
-    steps = []
-    while not steps or not (steps[-1][2] or steps[-1][3]):
-        steps.append(env.step(action))
-    return steps
 
 
 def make_invulnerable(env: DoomEnv) -> None:
@@ -213,11 +183,6 @@ def test_steps_outside_an_episode_are_refused(shared: DoomEnv):
 # --------------------------------------------------------------------------------------------------- seeds
 
 
-def fingerprint(env: DoomEnv, episode_seed: int) -> str:
-    frames, rewards, infos = play(env, episode_seed)
-    return hashlib.sha256(frames.tobytes() + json.dumps([rewards, infos]).encode()).hexdigest()
-
-
 @pytest.mark.parametrize("task", ["defend_the_center/complete", "health_gathering/lava+supreme+short_agent"])
 def test_an_episode_is_replayed_from_its_seed_alone(task: str):
     env = DoomEnv(task)
@@ -271,89 +236,6 @@ def test_a_seed_gives_a_sequence_of_episodes(shared: DoomEnv):
     shared.reset(seed=5)
     shared.reset(options={"episode_seed": 77})
     assert shared.reset()[1]["episode_seed"] == one[1], "a replay does not move the sequence"
-
-
-# ------------------------------------------------------------------------------------------------- crashes
-
-
-def test_a_crash_truncates_the_episode_and_the_next_one_is_whole():
-    env = DoomEnv("defend_the_center/default")
-    whole = fingerprint(env, 7)
-    env.reset(seed=1)
-    before = env.step(TURN)
-    assert env._engine is not None
-    env._engine.kill()
-    observation, reward, terminated, truncated, info = env.step(TURN)
-    np.testing.assert_array_equal(observation, before[0])
-    assert (reward, terminated, truncated) == (0.0, False, True)
-    assert info["engine_crash"] is True
-    assert "crash" in info["engine_error"]
-    assert info["episode_frames"] == before[4]["episode_frames"]
-    assert set(info["reward_components"].values()) == {0.0}
-    with pytest.raises(ResetNeeded):
-        env.step(TURN)
-    assert fingerprint(env, 7) == whole
-    env.close()
-
-
-def test_an_engine_that_died_between_episodes_is_replaced():
-    env = DoomEnv("defend_the_center/default")
-    whole = fingerprint(env, 7)
-    assert env._engine is not None
-    env._engine.kill()
-    _, info = env.reset(options={"episode_seed": 7})
-    assert info["engine_crash"] is True
-    assert "crash" in info["engine_error"]
-    assert fingerprint(env, 7) == whole
-    assert env.reset()[1]["engine_crash"] is False
-    env.close()
-
-
-def test_crash_upon_crash_is_an_error():
-    env = DoomEnv("defend_the_center/default")
-
-    def crash() -> dict:
-        env.reset(seed=1)
-        assert env._engine is not None
-        env._engine.kill()
-        return env.step(TURN)[4]
-
-    assert all(crash()["engine_crash"] for _ in range(3))
-    with pytest.raises(EngineError, match=r"default: 4 engine crashes without a whole episode between; the last:"):
-        crash()
-    env.close()
-
-
-def test_a_whole_episode_makes_crashes_forgotten():
-    env = DoomEnv("defend_the_center/default", frame_skip=35)
-    for _ in range(4):
-        env.reset(seed=1)
-        assert env._engine is not None
-        env._engine.kill()
-        env.step(TURN)
-        env.reset(seed=1)
-        idle_to_the_end(env)
-    env.close()
-
-
-def test_another_map_than_the_tasks_is_an_error():
-    env = DoomEnv("defend_the_center/default")
-    env._engine_config = DoomEnv("defend_the_center/gore")._engine_config
-    with pytest.raises(EngineError, match=r"default: .* runs a map with magic number \d+, want \d+"):
-        env.reset(seed=1)
-    env.close()
-
-
-def test_close_may_be_repeated_and_reset_starts_anew():
-    env = DoomEnv("defend_the_center/default")
-    env.close()
-    first = fingerprint(env, 7)
-    env.close()
-    env.close()
-    with pytest.raises(ResetNeeded):
-        env.step(0)
-    assert fingerprint(env, 7) == first
-    env.close()
 
 
 # ---------------------------------------------------------------------------------------- arguments, errors
@@ -422,95 +304,4 @@ def test_human_mode_without_a_display_says_so(monkeypatch: pytest.MonkeyPatch):
     env = DoomEnv("defend_the_center/default", render_mode="human")
     with pytest.raises(ResourceError, match="render_mode human: no window can be opened"):
         env.reset(seed=1)
-    env.close()
-
-
-# ------------------------------------------------------------------------------------------------- Gymnasium
-
-
-@pytest.mark.parametrize("task", named_tasks(), ids=str)
-def test_gymnasiums_checker_passes(task):
-    env = DoomEnv(task)
-    check_env(env, skip_render_check=True)
-    env.close()
-
-
-def test_gymnasiums_checker_passes_in_every_form():
-    for fields in (
-        {"action_set": "combinations"},
-        {"action_set": "unified", "buffers": ("depth",)},
-        {"grayscale": True},
-    ):
-        env = DoomEnv("seek_and_kill/default", render_mode="rgb_array", **fields)
-        check_env(env, skip_render_check=True)
-        env.close()
-
-
-def test_ids_are_names():
-    ids = [gymnasium_id(task) for task in named_tasks()]
-    assert len(set(ids)) == len(ids) == 76
-    assert gymnasium_id(parse_task("defend_the_center/default")) == "GViZDoom/DefendTheCenter-Default-v0"
-    assert (
-        gymnasium_id(parse_task("defend_the_center/mossy_bricks+gore"))
-        == "GViZDoom/DefendTheCenter-Gore-MossyBricks-v0"
-    )
-    assert gymnasium_id(parse_task("seek_and_kill/complete")) == "GViZDoom/SeekAndKill-Complete-v0"
-
-
-def test_every_named_task_is_registered():
-    for task in named_tasks():
-        spec = gymnasium.spec(gymnasium_id(task))
-        assert spec.kwargs == {"task": task.id}
-    env = gymnasium.make("GViZDoom/DefendTheCenter-Gore-v0", frame_skip=2, render_mode="rgb_array")
-    assert isinstance(env.unwrapped, DoomEnv)
-    env.reset(seed=1)
-    assert env.step(TURN)[4]["episode_frames"] == 2
-    assert env.render().shape == (144, 256, 3)
-    env.close()
-
-
-@pytest.mark.parametrize(
-    ("imports", "prefix"),
-    [
-        ("import gymnasium, gvz", ""),
-        ("import gvz, gymnasium", ""),
-        ("import gvz.errors, gymnasium.spaces", ""),
-        ("import gymnasium", "gvz:"),
-        ("import gvz, gymnasium", "gvz:"),
-    ],
-)
-def test_ids_are_known_in_whatever_order_of_imports(imports: str, prefix: str):
-    code = f"{imports}; env = gymnasium.make('{prefix}GViZDoom/DefendTheCenter-Gore-v0'); print(env.unwrapped.task)"
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert done.stdout.strip() == "defend_the_center/gore", done.stderr
-
-
-def test_import_gvz_alone_loads_no_gymnasium():
-    code = "import gvz, sys; print([m for m in ('gymnasium', 'numpy', 'cv2') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout.strip() == "[]"
-
-
-def test_a_vector_environment_resets_itself_and_keeps_the_final_frame():
-    envs = gymnasium.vector.SyncVectorEnv(
-        [lambda: DoomEnv("defend_the_center/default", frame_skip=35)] * 2,
-        autoreset_mode=gymnasium.vector.AutoresetMode.SAME_STEP,
-    )
-    envs.reset(seed=1)
-    for _ in range(40):
-        observations, _, terminated, _, infos = envs.step(np.array([TURN, TURN]))
-        if terminated.any():
-            break
-    done = int(terminated.argmax())
-    assert infos["final_obs"][done].shape == (84, 84, 3)
-    assert (infos["final_obs"][done] != observations[done]).any()
-    envs.close()
-
-
-def test_frame_stacking_is_gymnasiums():
-    env = gymnasium.wrappers.FrameStackObservation(DoomEnv("defend_the_center/default"), 4)
-    observation, _ = env.reset(seed=1)
-    assert observation.shape == (4, 84, 84, 3)
     env.close()

@@ -1,0 +1,54 @@
+"""A pool in a test: drained, polled, every record checked; and what is left of it afterwards."""
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from fake_env import Checker
+
+from actors.pool import ActorPool, PoolConfig
+from gvz import janitor
+from gvz.transport.messages import EpisodeStats, Fault, Message
+
+DEADLINE_S = 240.0
+
+
+class Run:
+    """A pool that is drained and polled until something has happened, every record checked."""
+
+    def __init__(self, pool: ActorPool, pool_config: PoolConfig):
+        self.pool = pool
+        self.checker = Checker(pool_config)
+        self.messages: list[Message] = []
+
+    def until(self, done: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + DEADLINE_S
+        while not done():
+            assert time.monotonic() < deadline, self.messages
+            self.checker.add(self.pool.drain(100, wait_s=0.01))
+            self.messages += self.pool.poll()
+
+    def play(self, num_records: int) -> None:
+        wanted = self.checker.num_records + num_records
+        self.until(lambda: self.checker.num_records >= wanted)
+
+    def faults(self) -> list[Fault]:
+        return [m for m in self.messages if isinstance(m, Fault)]
+
+    def first_episodes(self) -> dict[int, int]:
+        """Number of the first episode that each lane has reported."""
+        return {m.lane: m.episode for m in reversed(self.messages) if isinstance(m, EpisodeStats)}
+
+    def until_all_ready(self) -> list[int]:
+        """Process ids, by actor."""
+        self.until(lambda: self.pool.statistics().actors_ready == 2)
+        return [status.pid for status in self.pool.writer_statuses()]
+
+
+def segments() -> set[Path]:
+    return {path for path in Path("/dev/shm").iterdir() if path.name.startswith(f"gvz-{os.getpid()}-")}
+
+
+def alive(pid: int) -> bool:
+    return janitor.process_start(pid) is not None

@@ -1,0 +1,91 @@
+"""Engines that die under an environment: the episode is cut and marked, the next one whole, the end an error."""
+
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+
+from gvz.env import DoomEnv
+from gvz.errors import EngineError
+from tests.episodes import TURN, fingerprint, idle_to_the_end
+
+pytestmark = pytest.mark.engine
+
+
+def test_a_crash_truncates_the_episode_and_the_next_one_is_whole():
+    env = DoomEnv("defend_the_center/default")
+    whole = fingerprint(env, 7)
+    env.reset(seed=1)
+    before = env.step(TURN)
+    assert env._engine is not None
+    env._engine.kill()
+    observation, reward, terminated, truncated, info = env.step(TURN)
+    np.testing.assert_array_equal(observation, before[0])
+    assert (reward, terminated, truncated) == (0.0, False, True)
+    assert info["engine_crash"] is True
+    assert "crash" in info["engine_error"]
+    assert info["episode_frames"] == before[4]["episode_frames"]
+    assert set(info["reward_components"].values()) == {0.0}
+    with pytest.raises(ResetNeeded):
+        env.step(TURN)
+    assert fingerprint(env, 7) == whole
+    env.close()
+
+
+def test_an_engine_that_died_between_episodes_is_replaced():
+    env = DoomEnv("defend_the_center/default")
+    whole = fingerprint(env, 7)
+    assert env._engine is not None
+    env._engine.kill()
+    _, info = env.reset(options={"episode_seed": 7})
+    assert info["engine_crash"] is True
+    assert "crash" in info["engine_error"]
+    assert fingerprint(env, 7) == whole
+    assert env.reset()[1]["engine_crash"] is False
+    env.close()
+
+
+def test_crash_upon_crash_is_an_error():
+    env = DoomEnv("defend_the_center/default")
+
+    def crash() -> dict:
+        env.reset(seed=1)
+        assert env._engine is not None
+        env._engine.kill()
+        return env.step(TURN)[4]
+
+    assert all(crash()["engine_crash"] for _ in range(3))
+    with pytest.raises(EngineError, match=r"default: 4 engine crashes without a whole episode between; the last:"):
+        crash()
+    env.close()
+
+
+def test_a_whole_episode_makes_crashes_forgotten():
+    env = DoomEnv("defend_the_center/default", frame_skip=35)
+    for _ in range(4):
+        env.reset(seed=1)
+        assert env._engine is not None
+        env._engine.kill()
+        env.step(TURN)
+        env.reset(seed=1)
+        idle_to_the_end(env)
+    env.close()
+
+
+def test_another_map_than_the_tasks_is_an_error():
+    env = DoomEnv("defend_the_center/default")
+    env._engine_config = DoomEnv("defend_the_center/gore")._engine_config
+    with pytest.raises(EngineError, match=r"default: .* runs a map with magic number \d+, want \d+"):
+        env.reset(seed=1)
+    env.close()
+
+
+def test_close_may_be_repeated_and_reset_starts_anew():
+    env = DoomEnv("defend_the_center/default")
+    env.close()
+    first = fingerprint(env, 7)
+    env.close()
+    env.close()
+    with pytest.raises(ResetNeeded):
+        env.step(0)
+    assert fingerprint(env, 7) == first
+    env.close()

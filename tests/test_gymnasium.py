@@ -1,0 +1,104 @@
+"""The environments as Gymnasium's own: its checker, registration by name, vector environments, wrappers."""
+
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from gvz.env import DoomEnv
+from gvz.registration import gymnasium_id
+from gvz.tasks import named_tasks, parse_task
+from tests.episodes import TURN
+
+pytestmark = pytest.mark.engine
+
+
+@pytest.mark.parametrize("task", named_tasks(), ids=str)
+def test_gymnasiums_checker_passes(task):
+    env = DoomEnv(task)
+    check_env(env, skip_render_check=True)
+    env.close()
+
+
+def test_gymnasiums_checker_passes_in_every_form():
+    for fields in (
+        {"action_set": "combinations"},
+        {"action_set": "unified", "buffers": ("depth",)},
+        {"grayscale": True},
+    ):
+        env = DoomEnv("seek_and_kill/default", render_mode="rgb_array", **fields)
+        check_env(env, skip_render_check=True)
+        env.close()
+
+
+def test_ids_are_names():
+    ids = [gymnasium_id(task) for task in named_tasks()]
+    assert len(set(ids)) == len(ids) == 76
+    assert gymnasium_id(parse_task("defend_the_center/default")) == "GViZDoom/DefendTheCenter-Default-v0"
+    assert (
+        gymnasium_id(parse_task("defend_the_center/mossy_bricks+gore"))
+        == "GViZDoom/DefendTheCenter-Gore-MossyBricks-v0"
+    )
+    assert gymnasium_id(parse_task("seek_and_kill/complete")) == "GViZDoom/SeekAndKill-Complete-v0"
+
+
+def test_every_named_task_is_registered():
+    for task in named_tasks():
+        spec = gymnasium.spec(gymnasium_id(task))
+        assert spec.kwargs == {"task": task.id}
+    env = gymnasium.make("GViZDoom/DefendTheCenter-Gore-v0", frame_skip=2, render_mode="rgb_array")
+    assert isinstance(env.unwrapped, DoomEnv)
+    env.reset(seed=1)
+    assert env.step(TURN)[4]["episode_frames"] == 2
+    assert env.render().shape == (144, 256, 3)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("imports", "prefix"),
+    [
+        ("import gymnasium, gvz", ""),
+        ("import gvz, gymnasium", ""),
+        ("import gvz.errors, gymnasium.spaces", ""),
+        ("import gymnasium", "gvz:"),
+        ("import gvz, gymnasium", "gvz:"),
+    ],
+)
+def test_ids_are_known_in_whatever_order_of_imports(imports: str, prefix: str):
+    code = f"{imports}; env = gymnasium.make('{prefix}GViZDoom/DefendTheCenter-Gore-v0'); print(env.unwrapped.task)"
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.stdout.strip() == "defend_the_center/gore", done.stderr
+
+
+def test_import_gvz_alone_loads_no_gymnasium():
+    code = "import gvz, sys; print([m for m in ('gymnasium', 'numpy', 'cv2') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_vector_environment_resets_itself_and_keeps_the_final_frame():
+    envs = gymnasium.vector.SyncVectorEnv(
+        [lambda: DoomEnv("defend_the_center/default", frame_skip=35)] * 2,
+        autoreset_mode=gymnasium.vector.AutoresetMode.SAME_STEP,
+    )
+    envs.reset(seed=1)
+    for _ in range(40):
+        observations, _, terminated, _, infos = envs.step(np.array([TURN, TURN]))
+        if terminated.any():
+            break
+    done = int(terminated.argmax())
+    assert infos["final_obs"][done].shape == (84, 84, 3)
+    assert (infos["final_obs"][done] != observations[done]).any()
+    envs.close()
+
+
+def test_frame_stacking_is_gymnasiums():
+    env = gymnasium.wrappers.FrameStackObservation(DoomEnv("defend_the_center/default"), 4)
+    observation, _ = env.reset(seed=1)
+    assert observation.shape == (4, 84, 84, 3)
+    env.close()
