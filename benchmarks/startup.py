@@ -1,5 +1,5 @@
-"""Seconds to the help page and from the command to the first episode's row of `rainbow_4task`, on a warm cache, and what
-the start of an actor takes, which is the price of every one that is replaced.
+"""Seconds to the help page and from the command to the first episode's row of `rainbow_4task`, on a warm cache, and
+what the start of an actor takes, which is the price of every one that is replaced.
 
 The first run fills the caches (bytecode, compiled maps, compiled programs) and is thrown away. Goals: `--help` under
 0.5 s without importing jax, the first row within 15 s.

@@ -40,9 +40,9 @@ def measure(budget: Budget) -> list[Row]:
     num_runs, updates, period = (1, 4, 2) if budget.quick else (2, _MEASURED_UPDATES, _LOG_PERIOD_UPDATES)
     with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
         parts = assemble(config, workload.work_directory(directory))
-        runs, first_updates_s, learner_alone, actors_alone = [], [], [], []
+        firsts, runs, learner_alone, actors_alone = [], [], [], []
         for number in range(num_runs):
-            first_updates_s.append(_run(Path(directory) / f"first_{number}", budget, 1, 1)["first_row_s"])
+            firsts.append(_run(Path(directory) / f"first_{number}", budget, 1, 1, watch_memory=True))
             runs.append(_run(Path(directory) / f"run_{number}", budget, updates, period))
             learner = workload.Learner(config, parts)
             per_call = parts.num_updates_per_call
@@ -66,7 +66,7 @@ def measure(budget: Budget) -> list[Row]:
         for name, summed in (("mean", statistics.fmean), ("p95", statistics.median), ("max", max))
     }
     bill, batch_size = parts.bill.memory_bytes, config.learner.batch_size
-    peaks = [run["peak_bytes"] for run in runs]
+    peaks = [run["peak_bytes"] for run in firsts]
     on = "" if jax.default_backend() == "cpu" else f" on a {jax.default_backend()}"
     return [
         rates(
@@ -78,7 +78,7 @@ def measure(budget: Budget) -> list[Row]:
         rates(f"learner alone{on}", updates_per_s=learner_alone, batch_size=batch_size),
         rates("actors alone, full network", decisions_per_s=actors_alone),
         goal(6, "useful work of both together, against each alone", shares, at_least=0.9, unit="x"),
-        measured("from the command to the first gradient step", "s", first_updates_s),
+        measured("from the command to the first gradient step", "s", [run["first_row_s"] for run in firsts]),
         measured("peak of the memory of all processes", "GB", [peak / 1e9 for peak in peaks]),
         measured("memory on the bill", "GB", [bill / 1e9]),
         goal(6, "peak memory off the bill", [abs(p / bill - 1) for p in peaks], at_most=0.1, unit="x"),
@@ -86,8 +86,13 @@ def measure(budget: Budget) -> list[Row]:
     ]
 
 
-def _run(directory: Path, budget: Budget, updates: int, log_period: int) -> dict[str, Any]:
-    """One run of the real command: rows of metrics, peak of memory, seconds from the command to its first row."""
+def _run(
+    directory: Path, budget: Budget, updates: int, log_period: int, *, watch_memory: bool = False
+) -> dict[str, Any]:
+    """One run of the real command: rows of metrics, seconds from the command to its first row, the peak of its memory.
+
+    Memory is watched from the first row on, if at all: to add up the pages of such a process takes a while.
+    """
     flags = ["--learner.total-updates", str(updates), "--log.period-updates", str(log_period)]
     flags += workload.quick_flags(budget)
     command = [sys.executable, "-m", "gvz.launch", "--config", "rainbow_4task.py", "--run-dir", str(directory), *flags]
@@ -95,7 +100,7 @@ def _run(directory: Path, budget: Budget, updates: int, log_period: int) -> dict
     with tempfile.TemporaryFile() as output:
         process = subprocess.Popen(command, stdout=output, stderr=output)
         try:
-            with _peak_memory(process.pid) as peak:
+            with _peak_memory(process.pid, directory / "metrics.jsonl" if watch_memory else None) as peak:
                 code = process.wait(_RUN_TIMEOUT_S)
         finally:
             end_run(process)
@@ -128,13 +133,17 @@ def _rates(rows: list[dict[str, Any]]) -> tuple[float, float]:
 
 
 @contextlib.contextmanager
-def _peak_memory(pid: int) -> Any:
-    """Yields a list of one number: the largest sum of proportional set sizes of a process and all below it, bytes."""
+def _peak_memory(pid: int, records: Path | None) -> Any:
+    """Yields a list of one number: the largest sum of proportional set sizes of a process and all below it, bytes.
+
+    Looks from when `records` exists; never without them.
+    """
     peak, done = [0], threading.Event()
 
     def watch() -> None:
-        while not done.wait(_MEMORY_PERIOD_S):
-            peak[0] = max(peak[0], tree_bytes(pid))
+        while records is not None and not done.wait(_MEMORY_PERIOD_S):
+            if records.exists():
+                peak[0] = max(peak[0], tree_bytes(pid))
 
     thread = threading.Thread(target=watch)
     thread.start()
