@@ -29,6 +29,8 @@ from gvz.transport.messages import EpisodeStats, Fault
 
 RECENT_EPISODES = 30
 """episodes in a task's recent score (thesis 4.3.2 uses 30 for its KPI)"""
+UPLOAD_TIMEOUT_S = 600.0
+"""for what is not yet with Weights & Biases when a run ends; the rest stays in `wandb/`, for `wandb sync`"""
 
 
 class Rates:
@@ -218,6 +220,8 @@ def start_wandb(run: RunDir) -> Any:  # wandb.Run, a type only where the extra i
     id_file = run.path / "wandb_id"  # a resumed run is the same run there, one begun with --fresh another
     if not id_file.exists():
         id_file.write_text(uuid.uuid4().hex[:12])
+    # versions that cannot bound the last upload wait for it
+    bounded = {"finish_timeout": UPLOAD_TIMEOUT_S} if "finish_timeout" in wandb.Settings.model_fields else {}
     try:
         started = wandb.init(
             dir=str(run.path),
@@ -226,7 +230,7 @@ def start_wandb(run: RunDir) -> Any:  # wandb.Run, a type only where the extra i
             resume="allow",
             name=f"{saved['config']['name']}/seed_{saved['config']['seed']}",
             config=saved,
-            settings=wandb.Settings(console="off", silent=True),
+            settings=wandb.Settings(console="off", silent=True, **bounded),
         )
     except wandb.Error as error:
         raise ConfigError(
