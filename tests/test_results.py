@@ -46,3 +46,23 @@ def test_the_quick_comparison_says_what_its_records_give():
             tasks = {task.id for task in named_tasks("defend_the_center", level=level)}
             assert value == round(np.mean([row["normalized_score"] for row in final if row["task"] in tasks]), 1)
         assert said[-1] == round(np.mean([row["normalized_score"] for row in final if row["task"] in test_tasks]), 1)
+
+
+def test_the_readme_says_how_fast_the_records_are():
+    def medians(name: str, rate: str) -> dict[str, float]:
+        rows = json.loads((ROOT / "results" / "performance" / f"{name}.json").read_text())["rows"]
+        return {row["name"]: row[rate]["median"] for row in rows if row["kind"] == "rates"}
+
+    updates, decisions = medians("learner_update", "updates_per_s"), medians("actors", "decisions_per_s")
+
+    def fastest(peer: str, size: str) -> str:
+        best = max(value for name, value in decisions.items() if name.startswith(peer) and name.endswith(size))
+        return f"{float(f'{best:.3g}'):,.0f}"
+
+    readme = " ".join((ROOT / "README.md").read_text().split())
+    assert (
+        f"makes {updates['learner, 1 to a call']:.1f} gradient steps/s of 32 samples, where Tianshou's Rainbow makes "
+        f"{updates['Tianshou']:.1f} and Dopamine's {updates['Dopamine']:.1f} in turns with it; the actors play "
+        f"{fastest('actor pool', '256x144')} decisions/s at random, where EnvPool makes {fastest('EnvPool', 'threads')} "
+        f"and LevDoom {fastest('LevDoom', '320x240')}, or {fastest('LevDoom', '256x144')} at our size"
+    ) in readme
