@@ -63,6 +63,7 @@ def test_the_readme_says_how_fast_the_records_are():
     assert (
         f"makes {updates['learner, 1 to a call']:.1f} gradient steps/s of 32 samples, where Tianshou's Rainbow makes "
         f"{updates['Tianshou']:.1f} and Dopamine's {updates['Dopamine']:.1f} in turns with it; the actors play "
-        f"{fastest('actor pool', '256x144')} decisions/s at random, where EnvPool makes {fastest('EnvPool', 'threads')} "
-        f"and LevDoom {fastest('LevDoom', '320x240')}, or {fastest('LevDoom', '256x144')} at our size"
+        f"{fastest('actor pool', '256x144')} decisions/s at random, where EnvPool makes "
+        f"{fastest('EnvPool', 'threads')} and LevDoom {fastest('LevDoom', '320x240')}, or "
+        f"{fastest('LevDoom', '256x144')} at our size"
     ) in readme
