@@ -35,7 +35,7 @@ SCHEMA = 1
 """of the records in DIRECTORY, those of the fuzzing too"""
 DIRECTORY = record.ROOT / "results" / "reliability"
 SHARED_MEMORY = Path("/dev/shm")
-_START_TIMEOUT_S, _STOP_TIMEOUT_S = 900.0, 120.0
+_START_TIMEOUT_S, _STOP_TIMEOUT_S, _CLEARED_S = 900.0, 120.0, 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,12 +190,23 @@ def summary(made: dict[str, Any]) -> dict[str, float]:
 
 
 def run_leftovers(pid: int) -> list[str]:
-    """Segments of a run that has ended, by its process id, and of engines that no process has mapped."""
+    """Segments of a run that has ended, by its process id, and of engines that no process has mapped.
+
+    Another run beside it may be about to clear away what it has killed, so what is found is looked at for a minute.
+    """
+    deadline = time.monotonic() + _CLEARED_S
+    while (left := _unmapped(f"gvz-{pid}-", "ViZDoom")) and time.monotonic() < deadline:
+        time.sleep(1.0)
+    return left
+
+
+def _unmapped(*prefixes: str) -> list[str]:
+    """Files of shared memory that no process has mapped."""
+    left = [f.name for f in SHARED_MEMORY.iterdir() if f.name.startswith(prefixes)]
     mapped = ""
     for process in psutil.process_iter():
         with contextlib.suppress(OSError):
             mapped += Path(f"/proc/{process.pid}/maps").read_text()
-    left = [f.name for f in SHARED_MEMORY.iterdir() if f.name.startswith((f"gvz-{pid}-", "ViZDoom"))]
     return sorted(name for name in left if f"/dev/shm/{name}" not in mapped)
 
 

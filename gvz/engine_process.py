@@ -54,7 +54,8 @@ def make_directory() -> Path:
 def write_launcher(directory: Path, engine: Path, log: Path) -> Path:
     """Writes the script that the client library launches in place of the engine (see engine_wrapper.py).
 
-    It is made anew for every engine, because an installed file might not be executable, and its first line might
+    The client has made its message queues by then, so the script notes their id before anything that takes time. It is
+    made anew for every engine, because an installed file might not be executable, and its first line might
     be too long or hold blanks for a `#!` line.
 
     Raises:
@@ -62,8 +63,9 @@ def write_launcher(directory: Path, engine: Path, log: Path) -> Path:
     """
     wrapper = Path(__file__).with_name("engine_wrapper.py")
     words = (sys.executable, "-IS", wrapper, os.getpid(), directory, log, engine)
-    launcher = directory / "launch"
-    launcher.write_text(f'#!/bin/sh\nexec {shlex.join(str(word) for word in words)} "$@"\n')
+    launcher, arguments = directory / "launch", shlex.quote(str(directory / janitor.ARGUMENTS_FILE))
+    command = shlex.join(str(word) for word in words)
+    launcher.write_text(f'#!/bin/sh\nprintf "%s\\n" "$*" >{arguments}\nexec {command} "$@"\n')
     launcher.chmod(_LAUNCHER_MODE)
     if not os.access(launcher, os.X_OK):
         raise EngineError(

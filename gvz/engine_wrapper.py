@@ -21,13 +21,15 @@ def main(owner_pid: int, directory: str, log: str, engine: str, arguments: list[
     # the engine's end, so it lives exactly as long as client and engine both do.
     if ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL) != 0:
         sys.exit(f"engine wrapper: prctl failed: {os.strerror(ctypes.get_errno())}")
-    if os.getppid() != owner_pid:  # it died before the line above
+    instance_id = arguments[arguments.index("+viz_instance_id") + 1]
+    if os.getppid() != owner_pid:  # it died before the line above, perhaps before anybody knew what it had made
+        for queue in Path("/dev/shm").glob(f"ViZDoom*{instance_id}"):
+            queue.unlink(missing_ok=True)
         sys.exit(1)
     os.setsid()  # the terminal's Ctrl-C is for the owner, who then ends the engine in order
     os.chdir(directory)  # the engine writes _vizdoom/ here ...
     os.environ["HOME"] = directory  # ... and would look for its settings in the user's home
     start = Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]
-    instance_id = arguments[arguments.index("+viz_instance_id") + 1]
     Path("instance.partial").write_text(f"{os.getpid()} {start} {instance_id}\n")
     Path("instance.partial").rename("instance")
     output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)

@@ -33,6 +33,8 @@ ENGINE_DIR_PREFIX = "gvz-engine-"
 """every engine's private directory is called so, followed by random letters"""
 INSTANCE_FILE = "instance"
 """in an engine's private directory: "pid start id" of its engine, written by `engine_wrapper.py`"""
+ARGUMENTS_FILE = "arguments"
+"""likewise: the engine's arguments, which its launcher writes first of all, some milliseconds before it is an engine"""
 KILL_TIMEOUT_S = 30.0
 """the kernel takes milliseconds over a SIGKILL, unless the process hangs in a driver or in a dead file system"""
 _ENGINE_SHM_PREFIXES = ("ViZDoomSM", "ViZDoomMQCtr", "ViZDoomMQDoom")
@@ -139,7 +141,7 @@ def _read_dead(path: Path) -> tuple[str, str] | None:
 def clean_engine(directory: Path) -> list[str]:
     """Ends the engine of a private directory if it runs, unlinks its shared memory, deletes the directory."""
     done: list[str] = []
-    instance = read_instance(directory)
+    instance, instance_id = read_instance(directory), _launched_id(directory)
     if instance is not None:
         pid, start, instance_id = instance
         # the engine carries its instance id on its command line: proof that this process is the one recorded
@@ -147,6 +149,7 @@ def clean_engine(directory: Path) -> list[str]:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
             done.append(f"engine {instance_id} (pid {pid})")
+    if instance_id is not None:
         for prefix in _ENGINE_SHM_PREFIXES:
             done += _unlink_shm(prefix + instance_id)
     if directory.is_dir():
@@ -165,6 +168,16 @@ def read_instance(directory: Path) -> tuple[int, int, str] | None:
     if match is None:
         raise ValueError(f"{directory / INSTANCE_FILE}: got {text!r}, want process id, start time, instance id")
     return int(match[1]), int(match[2]), match[3]
+
+
+def _launched_id(directory: Path) -> str | None:
+    """Instance id of an engine that was launched, also if it died before it could note who it is."""
+    try:
+        text = (directory / ARGUMENTS_FILE).read_text(errors="replace")
+    except FileNotFoundError:
+        return None
+    match = re.search(r"\+viz_instance_id ([A-Za-z0-9]+)\b", text)
+    return None if match is None else match[1]
 
 
 def die_with_parent(parent_pid: int) -> None:

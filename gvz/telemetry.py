@@ -221,7 +221,9 @@ def start_wandb(run: RunDir) -> Any:  # wandb.Run, a type only where the extra i
     if not id_file.exists():
         id_file.write_text(uuid.uuid4().hex[:12])
     # versions that cannot bound the last upload wait for it
-    bounded = {"finish_timeout": UPLOAD_TIMEOUT_S} if "finish_timeout" in wandb.Settings.model_fields else {}
+    bounded: dict[str, Any] = (
+        {"finish_timeout": UPLOAD_TIMEOUT_S} if "finish_timeout" in wandb.Settings.model_fields else {}
+    )
     try:
         started = wandb.init(
             dir=str(run.path),

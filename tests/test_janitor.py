@@ -1,5 +1,6 @@
 """The janitor removes what dead owners left, and nothing else."""
 
+import contextlib
 import json
 import os
 import signal
@@ -10,12 +11,14 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 import vizdoom
 
 from gvz import janitor
 from gvz.errors import ResourceError
 
+WRAPPER = Path(janitor.__file__).with_name("engine_wrapper.py")
 STOCK_WAD = Path(vizdoom.scenarios_path) / "defend_the_center.wad"
 
 
@@ -190,6 +193,38 @@ def test_a_killed_client_takes_its_engine_along_and_the_janitor_the_rest(registr
     assert not list(janitor.SHM_DIR.glob(f"*{instance_id}"))
     assert not Path(directory).exists()
     assert list(registry.glob("*.json")) == []
+
+
+@pytest.mark.engine
+def test_an_engine_killed_before_it_was_one_leaves_nothing(registry: Path):
+    """What its client had made by then is known from the launcher."""
+    code = (
+        "from pathlib import Path; from gvz.engine import Engine, EngineConfig\n"
+        f"Engine(EngineConfig(wad=Path({str(STOCK_WAD)!r}), buttons=(), variables=()))"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE) as client:
+        wrappers: list[psutil.Process] = []
+        while not wrappers and client.poll() is None:
+            with contextlib.suppress(psutil.Error):
+                children = psutil.Process(client.pid).children()
+                wrappers = [child for child in children if str(WRAPPER) in child.cmdline()[:3]]
+        wrappers[0].kill()
+        assert client.wait(120) != 0
+    (directory,) = (Path(json.loads(path.read_text())["name"]) for path in registry.glob("*.json"))
+    assert not (directory / janitor.INSTANCE_FILE).exists()
+    instance_id = (directory / janitor.ARGUMENTS_FILE).read_text().split("+viz_instance_id ")[1].split()[0]
+    assert len(list(janitor.SHM_DIR.glob(f"ViZDoomMQ*{instance_id}"))) == 2
+    janitor.clean_dead_instances()
+    assert not list(janitor.SHM_DIR.glob(f"*{instance_id}"))
+    assert not directory.exists()
+
+
+def test_a_launched_engine_without_a_client_removes_what_that_had_made(tmp_path: Path):
+    queue = janitor.SHM_DIR / f"ViZDoomMQCtrtest{os.getpid()}"
+    queue.touch()
+    words = [sys.executable, "-IS", WRAPPER, "1", tmp_path, tmp_path / "log", "true"]
+    done = subprocess.run([*words, "+viz_instance_id", f"test{os.getpid()}"], check=False)
+    assert (done.returncode, queue.exists()) == (1, False)
 
 
 @pytest.mark.engine

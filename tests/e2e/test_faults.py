@@ -63,6 +63,16 @@ def actor(run: subprocess.Popen[str], number: int) -> psutil.Process:
     return psutil.Process(writer(run, number)[0])
 
 
+def suspend_acting(run: subprocess.Popen[str], number: int) -> psutil.Process:
+    """Stops an actor between two episodes' beginnings, whose engines may take longer."""
+    while True:
+        stopped = actor(run, number)
+        stopped.suspend()
+        if writer(run, number)[1] == WriterState.ACTING:
+            return stopped
+        stopped.resume()
+
+
 def await_fault(run_dir: Path, since: int, kind: str, number: int) -> dict:
     """The row of faults.jsonl that tells of it, among those after the first `since`."""
 
@@ -101,10 +111,10 @@ def test_a_run_goes_through_every_fault_of_its_actors_and_engines_and_loses_noth
     assert "a new one is started" in await_fault(run, before, "engine_crash", 0)["message"]
     seconds["engine killed"] = time.monotonic() - start
 
-    stopped_actor, stopped_engine = actor(process, 1), engines(actor(process, 0))[0]
+    stopped_engine = engines(actor(process, 0))[0]
     wait_until(lambda: num_updates(run) >= 20, "training")
     before, start = len(faults(run)), time.monotonic()
-    stopped_actor.suspend()
+    stopped_actor = suspend_acting(process, 1)
     stopped_engine.suspend()
     assert "no answer within 10 s, killed" in await_fault(run, before, "engine_crash", 0)["traceback"]
     seconds["engine stopped"] = time.monotonic() - start
