@@ -174,7 +174,7 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
 
 
 def summary(made: dict[str, Any]) -> dict[str, float]:
-    """The figures that the promises are about: ratios of the last to the first fifth, and of killed to undisturbed."""
+    """What the promises are about: medians of the last fifth over the first, of killed stretches over undisturbed."""
     samples = made["samples"]
     fifth = max(1, len(samples["time_s"]) // 5)
     grown = {
@@ -183,7 +183,7 @@ def summary(made: dict[str, Any]) -> dict[str, float]:
         if name != "time_s"
     }
     killed, undisturbed = (
-        statistics.fmean(s["updates_per_s"] for s in made["stretches"] if s["kind"] == kind)
+        statistics.median(s["updates_per_s"] for s in made["stretches"] if s["kind"] == kind)
         for kind in ("kills", "undisturbed")
     )
     return {**grown, "updates_per_s": killed / undisturbed}

@@ -54,16 +54,16 @@ def make_directory() -> Path:
 def write_launcher(directory: Path, engine: Path, log: Path) -> Path:
     """Writes the script that the client library launches in place of the engine (see engine_wrapper.py).
 
-    The client has made its message queues by then, so the script notes their id before anything that takes time. It is
-    made anew for every engine, because an installed file might not be executable, and its first line might
-    be too long or hold blanks for a `#!` line.
+    The client has made its message queues by then, so the script notes their id first of all. It is made anew for
+    every engine, because an installed file might not be executable, and its first line might be too long or hold blanks
+    for a `#!` line.
 
     Raises:
         EngineError: programs in this directory may not be run.
     """
     wrapper = Path(__file__).with_name("engine_wrapper.py")
     words = (sys.executable, "-IS", wrapper, os.getpid(), directory, log, engine)
-    launcher, arguments = directory / "launch", shlex.quote(str(directory / janitor.ARGUMENTS_FILE))
+    launcher, arguments = directory / janitor.LAUNCHER_FILE, shlex.quote(str(directory / janitor.ARGUMENTS_FILE))
     command = shlex.join(str(word) for word in words)
     launcher.write_text(f'#!/bin/sh\nprintf "%s\\n" "$*" >{arguments}\nexec {command} "$@"\n')
     launcher.chmod(_LAUNCHER_MODE)

@@ -20,6 +20,7 @@ import stat
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import Literal
 
@@ -35,6 +36,10 @@ INSTANCE_FILE = "instance"
 """in an engine's private directory: "pid start id" of its engine, written by `engine_wrapper.py`"""
 ARGUMENTS_FILE = "arguments"
 """likewise: the engine's arguments, which its launcher writes first of all, some milliseconds before it is an engine"""
+LAUNCHER_FILE = "launch"
+"""likewise: what the client launches"""
+_LAUNCH_S = 0.05
+"""from fork to the first line of a launcher, and ample"""
 KILL_TIMEOUT_S = 30.0
 """the kernel takes milliseconds over a SIGKILL, unless the process hangs in a driver or in a dead file system"""
 _ENGINE_SHM_PREFIXES = ("ViZDoomSM", "ViZDoomMQCtr", "ViZDoomMQDoom")
@@ -141,15 +146,17 @@ def _read_dead(path: Path) -> tuple[str, str] | None:
 def clean_engine(directory: Path) -> list[str]:
     """Ends the engine of a private directory if it runs, unlinks its shared memory, deletes the directory."""
     done: list[str] = []
-    instance, instance_id = read_instance(directory), _launched_id(directory)
-    if instance is not None:
+    instance = read_instance(directory)
+    if instance is None:
+        for name in _launched_or_orphaned(directory):
+            done += _unlink_shm(name)
+    else:
         pid, start, instance_id = instance
         # the engine carries its instance id on its command line: proof that this process is the one recorded
         if process_start(pid) == start and instance_id in _arguments(pid):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
             done.append(f"engine {instance_id} (pid {pid})")
-    if instance_id is not None:
         for prefix in _ENGINE_SHM_PREFIXES:
             done += _unlink_shm(prefix + instance_id)
     if directory.is_dir():
@@ -170,14 +177,43 @@ def read_instance(directory: Path) -> tuple[int, int, str] | None:
     return int(match[1]), int(match[2]), match[3]
 
 
-def _launched_id(directory: Path) -> str | None:
-    """Instance id of an engine that was launched, also if it died before it could note who it is."""
-    try:
+def _launched_or_orphaned(directory: Path) -> list[str]:
+    """What may be in shared memory of an engine that died before it noted who it is.
+
+    Its client makes two message queues and then launches it. The launcher's first line notes their id. If the client
+    died before that line, they are what nobody holds any more of the queues that are younger than the launcher.
+    """
+    launcher = directory / LAUNCHER_FILE
+    if not launcher.exists():
+        return []
+    if not (directory / ARGUMENTS_FILE).exists():
+        time.sleep(_LAUNCH_S)  # it may be on its way
+    if (directory / ARGUMENTS_FILE).exists():
         text = (directory / ARGUMENTS_FILE).read_text(errors="replace")
-    except FileNotFoundError:
-        return None
-    match = re.search(r"\+viz_instance_id ([A-Za-z0-9]+)\b", text)
-    return None if match is None else match[1]
+        match = re.search(r"\+viz_instance_id ([A-Za-z0-9]+)\b", text)
+        return [] if match is None else [prefix + match[1] for prefix in _ENGINE_SHM_PREFIXES]
+    since_s = launcher.stat().st_mtime
+    unheld = _unheld_queues(since_s)
+    if unheld:
+        time.sleep(_LAUNCH_S)  # a live client holds its queues microseconds after it has made them
+        unheld &= _unheld_queues(since_s)
+    return sorted(unheld)
+
+
+def _unheld_queues(since_s: float) -> set[str]:
+    """This user's message queues made since then, of no engine that ever ran, and mapped by no process."""
+    names: set[str] = set()
+    for file in SHM_DIR.glob("ViZDoomMQ*"):
+        with contextlib.suppress(FileNotFoundError):
+            found = file.stat()
+            ran = (SHM_DIR / re.sub("MQ(Ctr|Doom)", "SM", file.name, count=1)).exists()
+            if found.st_uid == os.getuid() and found.st_mtime >= since_s and not ran:
+                names.add(file.name)
+    for maps in Path("/proc").glob("[0-9]*/maps") if names else ():
+        with contextlib.suppress(OSError):
+            text = maps.read_text()
+            names = {name for name in names if f"/{name}" not in text}
+    return names
 
 
 def die_with_parent(parent_pid: int) -> None:

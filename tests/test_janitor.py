@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import mmap
 import os
 import signal
 import subprocess
@@ -217,6 +218,28 @@ def test_an_engine_killed_before_it_was_one_leaves_nothing(registry: Path):
     janitor.clean_dead_instances()
     assert not list(janitor.SHM_DIR.glob(f"*{instance_id}"))
     assert not directory.exists()
+
+
+def test_what_a_client_had_made_when_it_died_before_the_launch_is_what_nobody_holds(registry: Path, tmp_path: Path):
+    directory = tmp_path / f"{janitor.ENGINE_DIR_PREFIX}0123456789abcdef"
+    janitor.record("engine", str(directory))
+    change_record(registry, owner_start=1)
+    directory.mkdir()
+    names = [f"ViZDoomMQ{part}" for part in ("Ctrlost", "Doomlost", "Ctrheld", "Ctrran", "Ctrold")] + ["ViZDoomSMran"]
+    files = {name: janitor.SHM_DIR / f"{name}{os.getpid()}" for name in names}
+    try:
+        files["ViZDoomMQCtrold"].write_bytes(b"queue")
+        time.sleep(0.05)
+        (directory / janitor.LAUNCHER_FILE).touch()
+        for name in set(files) - {"ViZDoomMQCtrold"}:
+            files[name].write_bytes(b"queue")
+        with files["ViZDoomMQCtrheld"].open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ):
+            removed = janitor.clean_dead_instances()
+        lost = [files[name].name for name in ("ViZDoomMQCtrlost", "ViZDoomMQDoomlost")]
+        assert removed == [*(f"shared memory {name}" for name in lost), f"directory {directory}"]
+    finally:
+        for file in files.values():
+            file.unlink(missing_ok=True)
 
 
 def test_a_launched_engine_without_a_client_removes_what_that_had_made(tmp_path: Path):
