@@ -34,9 +34,6 @@ _SETTLE_S = 0.3
 """seconds played before the clock starts: what waited in full rings is not counted"""
 
 
-PROCESSES = ("engines", "Python", "learner's side")
-"""where a decision's processor time goes: the games, what plays them, and this process, which drains and supervises"""
-
 QUICK: dict[str, dict[str, Any]] = {
     "agent": {
         "conv_channels": (4,),
@@ -137,8 +134,8 @@ def processor_times(rounds: int, plays: Mapping[str, Callable[[], float]]) -> li
 
 
 def processor_s() -> dict[str, float]:
-    """Seconds of processor time so far of this process and of those below it."""
-    seconds: dict[str, float] = dict.fromkeys(PROCESSES, 0.0)
+    """Seconds of processor time so far: of the games, of what plays them, and of this process, which drains them."""
+    seconds = {"engines": 0.0, "Python": 0.0, "learner's side": 0.0}
     this = psutil.Process()
     for process in (this, *this.children(recursive=True)):
         with contextlib.suppress(psutil.NoSuchProcess):

@@ -23,8 +23,8 @@ def main(owner_pid: int, directory: str, log: str, engine: str, arguments: list[
         sys.exit(f"engine wrapper: prctl failed: {os.strerror(ctypes.get_errno())}")
     instance_id = arguments[arguments.index("+viz_instance_id") + 1]
     if os.getppid() != owner_pid:  # it died before the line above, perhaps before anybody knew what it had made
-        for queue in Path("/dev/shm").glob(f"ViZDoom*{instance_id}"):
-            queue.unlink(missing_ok=True)
+        for queue in ("MQCtr", "MQDoom"):
+            Path(f"/dev/shm/ViZDoom{queue}{instance_id}").unlink(missing_ok=True)
         sys.exit(1)
     os.setsid()  # the terminal's Ctrl-C is for the owner, who then ends the engine in order
     os.chdir(directory)  # the engine writes _vizdoom/ here ...
