@@ -61,7 +61,7 @@ format: install  ## apply formatting and safe fixes
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-bench: install   ## throughput beside limits and peers, 25 minutes on 2 quiet cores; then the page made of it
+bench: install   ## throughput beside limits and peers, half an hour on 2 quiet cores; then the page made of it
 	$(BIN)/python -m benchmarks all --out results/performance $(ARGS)
 	$(BIN)/python -m benchmarks.report
 

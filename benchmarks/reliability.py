@@ -12,7 +12,7 @@ from typing import Any
 
 from benchmarks import record
 from benchmarks.report import between
-from benchmarks.soak import DIRECTORY, SCHEMA, summary
+from benchmarks.soak import DIRECTORY, SCHEMA, kill_ratios, summary
 from gvz.errors import ConfigError
 
 PAGE = record.ROOT / "docs" / "RELIABILITY.md"
@@ -62,7 +62,7 @@ def fuzz_table(made: dict[str, Any]) -> str:
 
 def soak_table(made: dict[str, Any]) -> str:
     """What was done, what it cost, what grew, what was lost."""
-    ratios, machine = summary(made), made["machine"]
+    ratios, priced, machine = summary(made), kill_ratios(made), made["machine"]
     minutes = sum(s["end_s"] - s["begin_s"] for s in made["stretches"] if s["kind"] == "kills") / 60
     rates = {
         kind: ", ".join(f"{s['updates_per_s']:.2f}" for s in made["stretches"] if s["kind"] == kind)
@@ -81,7 +81,8 @@ def soak_table(made: dict[str, Any]) -> str:
         f"| damaged rows in the records | {made['damaged_rows']} |",
         f"| gradient steps/s, undisturbed stretches | {rates['undisturbed']} |",
         f"| gradient steps/s, stretches with kills | {rates['kills']} |",
-        f"| with kills / undisturbed | {ratios['updates_per_s']:.3f} |",
+        f"| with kills / undisturbed before and after | {ratios['updates_per_s']:.3f} "
+        f"[{min(priced):.3f}, {max(priced):.3f}] |",
         *(f"| {text}, last fifth / first fifth | {ratios[name]:.3f} |" for name, text in _GROWS.items()),
         f"| exit code after SIGTERM | {made['exit_code']} |",
         f"| left behind | {', '.join(made['left_behind']) or 'nothing'} |",

@@ -3,9 +3,10 @@
     python -m benchmarks.soak                      # 60 minutes of kills, a kill every 20 s; record, page and plot
     python -m benchmarks.soak --minutes 6 --stretches 1 --out soak.json
 
-The run is the real command. Stretches with kills take turns with short ones without, so that the price of the kills is
-a ratio within one run on one machine. Memory, descriptors, shared memory and processes are sampled all the time; at the
-end the run is stopped by SIGTERM, its checkpoint verified, and what it left behind counted. Imports psutil and gvz.
+The run is the real command. Stretches with kills take turns with short ones without: the price of the kills is the
+ratio of a stretch to those beside it, within one run on one machine whose own speed drifts. Memory, descriptors, shared
+memory and processes are sampled all the time; at the end the run is stopped by SIGTERM, and what it left behind
+counted. Imports psutil and gvz.
 """
 
 import contextlib
@@ -46,9 +47,9 @@ class Soak:
     """of kills in all"""
     kill_every_s: float = 20.0
     """seconds between two kills; the actors take turns"""
-    stretches: int = 6
+    stretches: int = 20
     """the minutes are cut into so many, with an undisturbed one before, between and after them"""
-    undisturbed_minutes: float = 2.0
+    undisturbed_minutes: float = 1.0
     """length of an undisturbed stretch"""
     sample_s: float = 5.0
     """seconds between two samples"""
@@ -139,7 +140,7 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
                 for now in _ticks(seconds, options.sample_s):
                     run.check()
                     samples.append({"time_s": round(time.time() - begin, 1), **run.sample()})
-                    due = kind == "kills" and now >= options.kill_every_s * (_killed_since(kills, stretch) + 1)
+                    due = kind == "kills" and now >= options.kill_every_s * _killed_since(kills, stretch)
                     if due and (actors := run.actors()):
                         actors[0].kill()  # the one that has lived longest, so that they take turns
                         kills.append(round(time.time() - begin, 1))
@@ -174,7 +175,7 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
 
 
 def summary(made: dict[str, Any]) -> dict[str, float]:
-    """What the promises are about: medians of the last fifth over the first, of killed stretches over undisturbed."""
+    """What the promises are about: medians of the last fifth over the first, and the median of `kill_ratios`."""
     samples = made["samples"]
     fifth = max(1, len(samples["time_s"]) // 5)
     grown = {
@@ -182,11 +183,16 @@ def summary(made: dict[str, Any]) -> dict[str, float]:
         for name in samples
         if name != "time_s"
     }
-    killed, undisturbed = (
-        statistics.median(s["updates_per_s"] for s in made["stretches"] if s["kind"] == kind)
-        for kind in ("kills", "undisturbed")
-    )
-    return {**grown, "updates_per_s": killed / undisturbed}
+    return {**grown, "updates_per_s": statistics.median(kill_ratios(made))}
+
+
+def kill_ratios(made: dict[str, Any]) -> list[float]:
+    """Gradient steps/s of every stretch with kills over the mean of the undisturbed ones before and after it."""
+    rates = [stretch["updates_per_s"] for stretch in made["stretches"]]
+    return [
+        2 * killed / (before + after)
+        for before, killed, after in zip(rates[::2], rates[1::2], rates[2::2], strict=False)
+    ]
 
 
 def run_leftovers(pid: int) -> list[str]:

@@ -2,8 +2,9 @@
 
 The run is the real command with a shorter end. Beside it, in turns, the learner alone (full replay, no actors) and the
 actors alone (full network acting, drained, no learner). Work is a share of what the machine does of it alone: goal is
-that gradient steps and decisions of the run add up to 0.9 or more. The memory of all its processes, whose peak is its
-last checkpoint, is to be within 10% of the bill it prints.
+that gradient steps and decisions of the run add up to 0.9 or more; what a gradient step and a decision cost of the
+processors, together and alone, says where the rest goes. The memory of all its processes, whose peak is its last
+checkpoint, is to be within 10% of the bill it prints.
 """
 
 import contextlib
@@ -14,8 +15,10 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import threading
 import time
+from collections import defaultdict
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +30,8 @@ from benchmarks.rounds import Budget, Row, goal, measured, rates
 _RUN_TIMEOUT_S = 800.0
 _MEASURED_UPDATES, _LOG_PERIOD_UPDATES = 260, 20
 """gradient steps of a run, and how many there are from row to row of its metrics; rates count from the first row on"""
-_MEMORY_PERIOD_S = 0.25
+_MEMORY_PERIOD_S, _PROCESSOR_PERIOD_S = 0.25, 2.0
+"""seconds between two looks at what the processes of a run take"""
 
 
 def measure(budget: Budget) -> list[Row]:
@@ -37,20 +41,31 @@ def measure(budget: Budget) -> list[Row]:
     from gvz.assemble import assemble
 
     config = workload.four_task_config(budget)
-    num_runs, updates, period = (1, 4, 2) if budget.quick else (2, _MEASURED_UPDATES, _LOG_PERIOD_UPDATES)
+    num_runs, updates, period = (1, 400, 100) if budget.quick else (3, _MEASURED_UPDATES, _LOG_PERIOD_UPDATES)
+    processor_period_s = _MEMORY_PERIOD_S if budget.quick else _PROCESSOR_PERIOD_S
+    body_s = 4 * budget.body_s
     with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
         parts = assemble(config, workload.work_directory(directory))
         firsts, runs, learner_alone, actors_alone = [], [], [], []
+        costs: defaultdict[str, list[float]] = defaultdict(list)
         for number in range(num_runs):
-            firsts.append(_run(Path(directory) / f"first_{number}", budget, 1, 1, watch_memory=True))
-            runs.append(_run(Path(directory) / f"run_{number}", budget, updates, period))
+            firsts.append(_run(Path(directory) / f"first_{number}", budget, 1, 1, _MEMORY_PERIOD_S, tree_bytes))
+            runs.append(
+                _run(Path(directory) / f"run_{number}", budget, updates, period, processor_period_s, _processor)
+            )
             learner = workload.Learner(config, parts)
-            per_call = parts.num_updates_per_call
-            learner_alone.append(learner.updates_per_s(per_call, 3 * budget.body_s))
+            learn = partial(learner.updates_per_s, parts.num_updates_per_call)
+            learn(0.0)  # compiles
+            updates_per_s, cost = workload.processor_costs(partial(learn, body_s))
+            learner_alone.append(updates_per_s)
+            costs["gradient step, learner alone"].append(cost["learner's side"])
             params = learner.acting_params()
-            del learner  # its replay: the next run is to have the machine to itself
+            del learner, learn  # its replay: the next run is to have the machine to itself
             with workload.playing(parts.pool_config, params) as pool:
-                actors_alone.append(workload.decisions_per_s(pool, 3 * budget.body_s))
+                play = partial(workload.decisions_per_s, pool, body_s)
+                decisions_per_s, cost = workload.processor_costs(play)
+            actors_alone.append(decisions_per_s)
+            costs["decision, actors alone"].append(cost["Python"] + cost["engines"])
     together = [_rates(run["rows"]) for run in runs]
     updates_per_s, decisions_per_s = [u for u, _ in together], [d for _, d in together]
     shares = [
@@ -66,7 +81,11 @@ def measure(budget: Budget) -> list[Row]:
         for name, summed in (("mean", statistics.fmean), ("p95", statistics.median), ("max", max))
     }
     bill, batch_size = parts.bill.memory_bytes, config.learner.batch_size
-    peaks = [run["peak_bytes"] for run in firsts]
+    peaks = [max(run["seen"]) for run in firsts]
+    cores = [_cores(run) for run in runs]
+    for found, (u, d) in zip(cores, together, strict=True):
+        costs["gradient step, the run"].append(found["learner's side"] / u)
+        costs["decision, the run"].append((found["Python"] + found["engines"]) / d)
     on = "" if jax.default_backend() == "cpu" else f" on a {jax.default_backend()}"
     return [
         rates(
@@ -82,34 +101,54 @@ def measure(budget: Budget) -> list[Row]:
         measured("peak of the memory of all processes", "GB", [peak / 1e9 for peak in peaks]),
         measured("memory on the bill", "GB", [bill / 1e9]),
         goal(6, "peak memory off the bill", [abs(p / bill - 1) for p in peaks], at_most=0.1, unit="x"),
+        *(measured(f"processor time a {name}", "ms", [1e3 * cost for cost in found]) for name, found in costs.items()),
+        measured("cores at work in the run", "cores", [sum(found.values()) for found in cores]),
         *(measured(f"age of the acting parameters, {name}", "gradient steps", found) for name, found in ages.items()),
     ]
 
 
 def _run(
-    directory: Path, budget: Budget, updates: int, log_period: int, *, watch_memory: bool = False
+    directory: Path, budget: Budget, updates: int, log_period: int, look_period_s: float, look: Callable[[int], Any]
 ) -> dict[str, Any]:
-    """One run of the real command: rows of metrics, seconds from the command to its first row, the peak of its memory.
+    """One run of the real command: its rows of metrics, seconds from the command to the first, and what `look` saw.
 
-    Memory is watched from the first row on, if at all: to add up the pages of such a process takes a while.
+    `look` is called with the process's id, from the first row on: to look at such a process costs it time.
     """
     flags = ["--learner.total-updates", str(updates), "--log.period-updates", str(log_period)]
     flags += workload.quick_flags(budget)
     command = [sys.executable, "-m", "gvz.launch", "--config", "rainbow_4task.py", "--run-dir", str(directory), *flags]
-    start = time.time()
+    records, seen, start = directory / "metrics.jsonl", [], time.time()
     with tempfile.TemporaryFile() as output:
         process = subprocess.Popen(command, stdout=output, stderr=output)
         try:
-            with _peak_memory(process.pid, directory / "metrics.jsonl" if watch_memory else None) as peak:
-                code = process.wait(_RUN_TIMEOUT_S)
+            while process.poll() is None:
+                if time.time() - start > _RUN_TIMEOUT_S:
+                    raise TimeoutError(f"{' '.join(command)}: no end within {_RUN_TIMEOUT_S:.0f} s")
+                if records.exists():
+                    with contextlib.suppress(psutil.NoSuchProcess):
+                        seen.append(look(process.pid))
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(look_period_s)
         finally:
             end_run(process)
         output.seek(0)
-        if code != 0:
-            raise RuntimeError(f"{' '.join(command)}: exit code {code}: {output.read().decode()[-2000:]}")
-    rows = [json.loads(line) for line in (directory / "metrics.jsonl").read_text().splitlines()]
+        if process.returncode != 0:
+            raise RuntimeError(f"{' '.join(command)}: exit code {process.returncode}: {output.read().decode()[-2000:]}")
+    rows = [json.loads(line) for line in records.read_text().splitlines()]
     shutil.rmtree(directory)  # its checkpoint is as large as its replay
-    return {"rows": rows, "peak_bytes": peak[0], "first_row_s": rows[0]["time_s"] - start}
+    return {"rows": rows, "seen": seen, "first_row_s": rows[0]["time_s"] - start}
+
+
+def _processor(pid: int) -> tuple[float, dict[str, float]]:
+    """Now, as records say it, and the processor seconds of a run so far."""
+    return time.time(), workload.processor_s(pid)
+
+
+def _cores(run: dict[str, Any]) -> dict[str, float]:
+    """Processor seconds a second between the first and the last row of a run, by where they go."""
+    looks = [look for look in run["seen"] if look[0] <= run["rows"][-1]["time_s"]]
+    (begin_s, before), (end_s, after) = looks[0], looks[-1]
+    return {where: (after[where] - before[where]) / (end_s - begin_s) for where in before}
 
 
 def end_run(process: "subprocess.Popen[bytes]") -> None:
@@ -130,28 +169,6 @@ def _rates(rows: list[dict[str, Any]]) -> tuple[float, float]:
     seconds = last["time_s"] - first["time_s"]
     updates, decisions = (last[name] - first[name] for name in ("num_updates", "actors/env_steps"))
     return updates / seconds, decisions / seconds
-
-
-@contextlib.contextmanager
-def _peak_memory(pid: int, records: Path | None) -> Any:
-    """Yields a list of one number: the largest sum of proportional set sizes of a process and all below it, bytes.
-
-    Looks from when `records` exists; never without them.
-    """
-    peak, done = [0], threading.Event()
-
-    def watch() -> None:
-        while records is not None and not done.wait(_MEMORY_PERIOD_S):
-            if records.exists():
-                peak[0] = max(peak[0], tree_bytes(pid))
-
-    thread = threading.Thread(target=watch)
-    thread.start()
-    try:
-        yield peak
-    finally:
-        done.set()
-        thread.join()
 
 
 def tree_bytes(pid: int) -> int:

@@ -126,21 +126,30 @@ def processor_times(rounds: int, plays: Mapping[str, Callable[[], float]]) -> li
     found: dict[str, list[float]] = {}
     for _ in range(rounds):
         for name, play in plays.items():
-            before, start = processor_s(), time.perf_counter()
-            decisions = play() * (time.perf_counter() - start)
-            for where, seconds in processor_s().items():
-                found.setdefault(f"{name}: {where}", []).append((seconds - before[where]) / decisions * 1e6)
+            for where, seconds in processor_costs(play)[1].items():
+                found.setdefault(f"{name}: {where}", []).append(seconds * 1e6)
     return [measured(f"processor time a decision, {name}", "us", values) for name, values in found.items()]
 
 
-def processor_s() -> dict[str, float]:
-    """Seconds of processor time so far: of the games, of what plays them, and of this process, which drains them."""
+def processor_costs(work: Callable[[], float]) -> tuple[float, dict[str, float]]:
+    """(units of work a second, processor seconds a unit by where they go); `work` returns the former after a while."""
+    before, start = processor_s(), time.perf_counter()
+    units_per_s = work()
+    units = units_per_s * (time.perf_counter() - start)
+    return units_per_s, {where: (seconds - before[where]) / units for where, seconds in processor_s().items()}
+
+
+def processor_s(pid: int | None = None) -> dict[str, float]:
+    """Seconds of processor time so far: of the games, of what plays them, and of the process, which drains them.
+
+    `pid` is the process that all others are below; this one if it is not given.
+    """
     seconds = {"engines": 0.0, "Python": 0.0, "learner's side": 0.0}
-    this = psutil.Process()
-    for process in (this, *this.children(recursive=True)):
+    root = psutil.Process(pid)
+    for process in (root, *root.children(recursive=True)):
         with contextlib.suppress(psutil.NoSuchProcess):
             times = process.cpu_times()
-            where = "learner's side" if process is this else "engines" if process.name() == "vizdoom" else "Python"
+            where = "learner's side" if process is root else "engines" if process.name() == "vizdoom" else "Python"
             seconds[where] += times.user + times.system
     return seconds
 

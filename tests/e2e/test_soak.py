@@ -58,7 +58,10 @@ def test_what_is_no_record_is_refused(tmp_path, text):
         reliability.read(file)
 
 
-def test_growth_is_the_ratio_of_the_last_fifth_to_the_first():
-    stretches = [{"kind": "undisturbed", "updates_per_s": 4.0}, {"kind": "kills", "updates_per_s": 3.0}]
+def test_growth_is_of_the_last_fifth_and_the_price_of_kills_of_the_stretches_beside_them():
+    rates = [4.0, 3.0, 4.0, 2.0, 6.0, 7.0, 8.0]
+    kinds = ["undisturbed", "kills"] * 3 + ["undisturbed"]
+    stretches = [{"kind": k, "updates_per_s": rate} for k, rate in zip(kinds, rates, strict=True)]
     made = {"samples": {"time_s": [*range(10)], "all_bytes": [1, 1, 9, 9, 9, 9, 9, 9, 3, 3]}, "stretches": stretches}
+    assert soak.kill_ratios(json.loads(json.dumps(made))) == [0.75, 0.4, 1.0]
     assert soak.summary(json.loads(json.dumps(made))) == {"all_bytes": 3.0, "updates_per_s": 0.75}
