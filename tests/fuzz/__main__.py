@@ -58,11 +58,13 @@ class Fuzz:
                 return 130
             finally:
                 janitor.clean_dead_instances()
+        command = "python -m tests.fuzz " + " ".join(sys.argv[1:])
         if self.targets and self.out.exists():  # those of before stand beside
-            found = json.loads(self.out.read_text())["targets"] | found
+            before = json.loads(self.out.read_text())
+            found, command = before["targets"] | found, f"{before['command']}; {command}"
         record = {
             "schema": 1,
-            "command": "python -m tests.fuzz " + " ".join(sys.argv[1:]),
+            "command": command,
             **machine.hardware(),
             "versions": machine.versions(PACKAGES),
             "inputs": sum(target["inputs"] for target in found.values()),
