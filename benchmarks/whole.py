@@ -30,8 +30,8 @@ from benchmarks.rounds import Budget, Row, goal, measured, rates
 _RUN_TIMEOUT_S = 800.0
 _MEASURED_UPDATES, _LOG_PERIOD_UPDATES = 260, 20
 """gradient steps of a run, and how many there are from row to row of its metrics; rates count from the first row on"""
-_MEMORY_PERIOD_S, _PROCESSOR_PERIOD_S = 0.25, 2.0
-"""seconds between two looks at what the processes of a run take"""
+_MEMORY_PERIOD_S, _PROCESSOR_PERIOD_S, _QUICK_PERIOD_S = 0.25, 2.0, 0.05
+"""seconds between two looks at what the processes of a run take; a quick run is over in less than a second"""
 
 
 def measure(budget: Budget) -> list[Row]:
@@ -42,14 +42,16 @@ def measure(budget: Budget) -> list[Row]:
 
     config = workload.four_task_config(budget)
     num_runs, updates, period = (1, 400, 100) if budget.quick else (3, _MEASURED_UPDATES, _LOG_PERIOD_UPDATES)
-    processor_period_s = _MEMORY_PERIOD_S if budget.quick else _PROCESSOR_PERIOD_S
+    memory_period_s, processor_period_s = (
+        (_QUICK_PERIOD_S, _QUICK_PERIOD_S) if budget.quick else (_MEMORY_PERIOD_S, _PROCESSOR_PERIOD_S)
+    )
     body_s = 4 * budget.body_s
     with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
         parts = assemble(config, workload.work_directory(directory))
         firsts, runs, learner_alone, actors_alone = [], [], [], []
         costs: defaultdict[str, list[float]] = defaultdict(list)
         for number in range(num_runs):
-            firsts.append(_run(Path(directory) / f"first_{number}", budget, 1, 1, _MEMORY_PERIOD_S, tree_bytes))
+            firsts.append(_run(Path(directory) / f"first_{number}", budget, 1, 1, memory_period_s, tree_bytes))
             runs.append(
                 _run(Path(directory) / f"run_{number}", budget, updates, period, processor_period_s, _processor)
             )
