@@ -64,6 +64,7 @@ class Watched:
 
     def __init__(self, directory: Path, flags: Sequence[str]):
         self.directory = directory
+        self._before = _shared("ViZDoom")
         words = ["--config", "rainbow_4task.py", "--run-dir", str(directory), "--log.period-updates", "5", *flags]
         self.command = [sys.executable, "-m", "gvz.launch", *words]
         self._output = (directory.parent / "output.log").open("w+b")
@@ -107,11 +108,10 @@ class Watched:
 
     def sample(self) -> dict[str, float]:
         """What the run takes now: bytes of memory, counts of descriptors, processes and files in /dev/shm."""
-        mapped = [f for f in SHARED_MEMORY.iterdir() if f.name.startswith(("gvz-", "ViZDoom"))]
         sizes = []
-        for file in mapped:
+        for name in self.shared_memory():
             with contextlib.suppress(FileNotFoundError):
-                sizes.append(file.stat().st_size)
+                sizes.append((SHARED_MEMORY / name).stat().st_size)
         return {
             "learner_bytes": self._root.memory_info().rss,
             "all_bytes": tree_bytes(self.process.pid),
@@ -120,6 +120,20 @@ class Watched:
             "shared_memory_files": len(sizes),
             "shared_memory_bytes": sum(sizes),
         }
+
+    def shared_memory(self) -> set[str]:
+        """The run's segments, and whatever of engines has come into /dev/shm since its start."""
+        return _shared(f"gvz-{self.process.pid}-") | (_shared("ViZDoom") - self._before)
+
+    def left_behind(self) -> list[str]:
+        """Files of the ended run in /dev/shm that no process has mapped.
+
+        Another run beside it may be about to clear away what it has killed, so what is found is looked at for a minute.
+        """
+        deadline = time.monotonic() + _CLEARED_S
+        while (left := _unmapped(self.shared_memory())) and time.monotonic() < deadline:
+            time.sleep(1.0)
+        return left
 
 
 def soak(options: Soak, console: Console) -> dict[str, Any]:
@@ -170,7 +184,7 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
             "updates": rows[-1]["num_updates"],
             "exit_code": code,
             "damaged_rows": len(problems),
-            "left_behind": run_leftovers(run.process.pid),
+            "left_behind": run.left_behind(),
         }
 
 
@@ -195,25 +209,18 @@ def kill_ratios(made: dict[str, Any]) -> list[float]:
     ]
 
 
-def run_leftovers(pid: int) -> list[str]:
-    """Segments of a run that has ended, by its process id, and of engines that no process has mapped.
-
-    Another run beside it may be about to clear away what it has killed, so what is found is looked at for a minute.
-    """
-    deadline = time.monotonic() + _CLEARED_S
-    while (left := _unmapped(f"gvz-{pid}-", "ViZDoom")) and time.monotonic() < deadline:
-        time.sleep(1.0)
-    return left
+def _shared(prefix: str) -> set[str]:
+    """Names of files in /dev/shm."""
+    return {file.name for file in SHARED_MEMORY.iterdir() if file.name.startswith(prefix)}
 
 
-def _unmapped(*prefixes: str) -> list[str]:
-    """Files of shared memory that no process has mapped."""
-    left = [f.name for f in SHARED_MEMORY.iterdir() if f.name.startswith(prefixes)]
+def _unmapped(names: set[str]) -> list[str]:
+    """Those that no process has mapped."""
     mapped = ""
-    for process in psutil.process_iter():
+    for process in psutil.process_iter() if names else ():
         with contextlib.suppress(OSError):
             mapped += Path(f"/proc/{process.pid}/maps").read_text()
-    return sorted(name for name in left if f"/dev/shm/{name}" not in mapped)
+    return sorted(name for name in names if f"/dev/shm/{name}" not in mapped)
 
 
 def _plan(options: Soak) -> Iterator[tuple[str, float]]:

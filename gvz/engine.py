@@ -292,10 +292,9 @@ def _start(config: EngineConfig) -> "tuple[DoomGame, Path, Path]":
         game = _make_game(config)
         directory = engine_process.make_directory()
         log = config.log or directory / "engine.log"
-        game.set_vizdoom_path(str(engine_process.write_launcher(directory, Path(vizdoom.exe_path), log)))
         game.set_doom_config_path(str(directory / "vizdoom.ini"))
         try:
-            engine_process.start(game, directory, log, config.start_timeout_s)
+            engine_process.start(game, directory, Path(vizdoom.exe_path), log, config.start_timeout_s)
         except EngineError:
             if attempt == _START_ATTEMPTS:
                 raise

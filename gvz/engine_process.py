@@ -34,17 +34,15 @@ _WATCH_PERIOD_S = 0.5
 class Startable(Protocol):
     """A vizdoom.DoomGame, as far as this file is concerned."""
 
+    def set_vizdoom_path(self, file_path: str) -> None: ...
+
     def init(self) -> None: ...
 
     def close(self) -> None: ...
 
 
 def make_directory() -> Path:
-    """A new private directory for one engine, known to the janitor before it exists.
-
-    Raises:
-        EngineError: programs in the temporary directory may not be run.
-    """
+    """A new private directory for one engine, known to the janitor before it exists."""
     directory = Path(tempfile.gettempdir()) / (janitor.ENGINE_DIR_PREFIX + secrets.token_hex(8))
     janitor.record("engine", str(directory))
     directory.mkdir(mode=0o700)
@@ -75,39 +73,41 @@ def write_launcher(directory: Path, engine: Path, log: Path) -> Path:
     return launcher
 
 
-def start(game: Startable, directory: Path, log: Path, timeout_s: float) -> None:
-    """Runs `game.init()`, one of few at a time on this machine, with a deadline.
+def start(game: Startable, directory: Path, engine: Path, log: Path, timeout_s: float) -> None:
+    """Has the game launch this engine, and runs `game.init()`, one of few at a time on this machine, with a deadline.
 
     It runs in a thread of its own. Past the deadline that thread is left behind, engine and all: ending an engine
-    that is still starting would crash this process. Should it come up after all, it is closed at once.
+    that is still starting would crash this process. Should it come up after all, it is closed at once. Whatever else
+    goes wrong, nothing is left, the private directory included.
 
     Raises:
         ResourceError: not enough free shared memory.
-        EngineError: not started within `timeout_s`, or ViZDoom raised.
+        EngineError: not started within `timeout_s`, or ViZDoom raised, or programs in the directory may not be run.
     """
     deadline = time.monotonic() + timeout_s
+    attempt = _Attempt(game, directory)
+    try:
+        game.set_vizdoom_path(str(write_launcher(directory, engine, log)))
+        _require_shared_memory()
+        with one_of(_START_LOCKS, deadline):
+            finished = attempt.run(max(0.0, deadline - time.monotonic()))
+        if not finished:
+            raise EngineError(f"engine in {directory}: not started within {timeout_s:g} s{log_tail(log)}")
+        if attempt.error is not None:
+            tail = log_tail(log)
+            raise EngineError(f"engine in {directory}: did not start: {attempt.error!r}{tail}") from attempt.error
+    except BaseException:  # Ctrl-C while waiting, too
+        attempt.give_up()
+        raise
+
+
+def _require_shared_memory() -> None:
     free = shutil.disk_usage(janitor.SHM_DIR).free
     if free < _SHM_BYTES:
         raise ResourceError(
             f"{janitor.SHM_DIR}: {free / 2**20:.0f} MiB free, an engine needs {_SHM_BYTES / 2**20:.0f}; "
             "enlarge it (docker run --shm-size=1g, or mount -o remount,size=1g /dev/shm)"
         )
-    attempt = _Attempt(game, directory)
-    with one_of(_START_LOCKS, deadline):
-        attempt.thread.start()
-        try:
-            attempt.thread.join(max(0.0, deadline - time.monotonic()))
-        except BaseException:  # Ctrl-C while waiting
-            attempt.give_up()
-            raise
-        late = attempt.thread.is_alive()
-    tail = log_tail(log)
-    if late:
-        attempt.give_up()
-        raise EngineError(f"engine in {directory}: not started within {timeout_s:g} s{tail}")
-    if attempt.error is not None:
-        end(game, directory)
-        raise EngineError(f"engine in {directory}: did not start: {attempt.error!r}{tail}") from attempt.error
 
 
 class _Attempt:
@@ -115,28 +115,35 @@ class _Attempt:
 
     def __init__(self, game: Startable, directory: Path):
         self.error: Exception | None = None
-        self.thread = threading.Thread(target=self._run, name=f"start {directory.name}", daemon=True)
         self._game = game
         self._directory = directory
+        self._thread = threading.Thread(target=self._init, name=f"start {directory.name}", daemon=True)
         self._lock = threading.Lock()
-        self._finished = False
+        self._running = False
         self._given_up = False
 
-    def _run(self) -> None:
+    def run(self, timeout_s: float) -> bool:
+        """Returns whether it has come to an end in time."""
+        self._running = True
+        self._thread.start()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def give_up(self) -> None:
+        """Ends the engine and removes what it has; at once, or when it has come up."""
+        with self._lock:
+            self._given_up = True
+            if not self._running:
+                end(self._game, self._directory)
+
+    def _init(self) -> None:
         try:
             self._game.init()
         except Exception as error:  # handed to the waiting thread
             self.error = error
         with self._lock:
-            self._finished = True
+            self._running = False
             if self._given_up:
-                end(self._game, self._directory)
-
-    def give_up(self) -> None:
-        """Closes the engine, at once if it is up, else when it comes up."""
-        with self._lock:
-            self._given_up = True
-            if self._finished:
                 end(self._game, self._directory)
 
 

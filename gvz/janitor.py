@@ -14,6 +14,7 @@ import hashlib
 import json
 import os
 import re
+import secrets
 import shutil
 import signal
 import stat
@@ -21,13 +22,14 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Literal
 
 from gvz.errors import ResourceError, WaitTimeoutError
 
-Kind = Literal["engine", "segment"]
-"""engine: `name` is an engine's private directory; segment: `name` is a file of /dev/shm."""
+Kind = Literal["engine", "segment", "directory"]
+"""engine: `name` is an engine's private directory; segment: a file of /dev/shm; directory: a `temporary_directory`."""
 
 SHM_DIR = Path("/dev/shm")
 ENGINE_DIR_PREFIX = "gvz-engine-"
@@ -40,9 +42,13 @@ LAUNCHER_FILE = "launch"
 """likewise: what the client launches"""
 _LAUNCH_S = 0.05
 """from fork to the first line of a launcher, and ample"""
+_PARTIAL_S = 3600.0
+"""a record half written for so long will stay so"""
 KILL_TIMEOUT_S = 30.0
 """the kernel takes milliseconds over a SIGKILL, unless the process hangs in a driver or in a dead file system"""
 _ENGINE_SHM_PREFIXES = ("ViZDoomSM", "ViZDoomMQCtr", "ViZDoomMQDoom")
+_DIRECTORY = re.compile(r"gvz-[a-z]+-[0-9a-f]{16}")
+"""names of a `temporary_directory`"""
 _PR_SET_PDEATHSIG = 1
 _UNREADABLE = (OSError, ValueError, KeyError, TypeError, RecursionError)
 """what reading a damaged or forged record ends in"""
@@ -95,6 +101,23 @@ def forget(kind: Kind, name: str) -> None:
     _record_path(kind, name).unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def temporary_directory(purpose: str) -> Generator[Path, None, None]:
+    """A private directory that goes with the block; if this process is killed in it, with the next start.
+
+    Args:
+        purpose: becomes a part of its name; lower-case letters.
+    """
+    directory = Path(tempfile.gettempdir()) / f"gvz-{purpose}-{secrets.token_hex(8)}"
+    record("directory", str(directory))
+    try:
+        directory.mkdir(mode=0o700)
+        yield directory
+    finally:
+        shutil.rmtree(directory, ignore_errors=True)
+        forget("directory", str(directory))
+
+
 def clean_dead_instances() -> list[str]:
     """Removes what dead owners left: engines, shared memory, private directories.
 
@@ -102,12 +125,16 @@ def clean_dead_instances() -> list[str]:
         One line for each thing removed, and for each record that cannot be read (these are left alone).
     """
     done: list[str] = []
+    for partial in runtime_dir().glob("*.partial"):  # whose writer was killed: writing takes no millisecond
+        with contextlib.suppress(FileNotFoundError):
+            if time.time() - partial.stat().st_mtime > _PARTIAL_S:
+                partial.unlink()
     for path in _records():
         try:
             dead = _read_dead(path)
             if dead is not None:
                 kind, name = dead
-                done += clean_engine(Path(name)) if kind == "engine" else _unlink_shm(name)
+                done += _REMOVE[kind](name)
                 path.unlink(missing_ok=True)
         except FileNotFoundError:
             continue  # its owner, or another janitor, was faster
@@ -159,10 +186,7 @@ def clean_engine(directory: Path) -> list[str]:
             done.append(f"engine {instance_id} (pid {pid})")
         for prefix in _ENGINE_SHM_PREFIXES:
             done += _unlink_shm(prefix + instance_id)
-    if directory.is_dir():
-        shutil.rmtree(directory, ignore_errors=True)
-        done.append(f"directory {directory}")
-    return done
+    return done + _remove_directory(directory)
 
 
 def read_instance(directory: Path) -> tuple[int, int, str] | None:
@@ -277,11 +301,14 @@ def _check_name(kind: str, name: str) -> None:
     if kind == "engine":
         good = Path(name).is_absolute() and Path(name).name.startswith(ENGINE_DIR_PREFIX) and ".." not in name
         wanted = f"an absolute path that ends in {ENGINE_DIR_PREFIX}..."
+    elif kind == "directory":
+        good = Path(name).is_absolute() and ".." not in name and _DIRECTORY.fullmatch(Path(name).name) is not None
+        wanted = "an absolute path that ends in gvz-PURPOSE-0123456789abcdef"
     elif kind == "segment":
         good = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) is not None
         wanted = "a file name of letters, digits, '.', '_', '-'"
     else:
-        raise ValueError(f"record of kind {kind!r}: want engine or segment")
+        raise ValueError(f"record of kind {kind!r}: want engine, segment or directory")
     if not good:
         raise ValueError(f"record of kind {kind!r}: got name {name!r}, want {wanted}")
 
@@ -292,3 +319,18 @@ def _unlink_shm(name: str) -> list[str]:
     except FileNotFoundError:
         return []
     return [f"shared memory {name}"]
+
+
+def _remove_directory(directory: Path) -> list[str]:
+    if not directory.is_dir():
+        return []
+    shutil.rmtree(directory, ignore_errors=True)
+    return [f"directory {directory}"]
+
+
+_REMOVE: dict[str, Callable[[str], list[str]]] = {
+    "engine": lambda name: clean_engine(Path(name)),
+    "segment": _unlink_shm,
+    "directory": lambda name: _remove_directory(Path(name)),
+}
+"""by kind: removes what a record names, returns a line for each thing removed"""

@@ -10,7 +10,6 @@ import re
 import resource
 import subprocess
 import sys
-import tempfile
 import time
 import zlib
 from importlib.metadata import version
@@ -51,8 +50,8 @@ def probe_wad(wad: Path, map_name: str = "MAP01", timeout_s: float = 60.0) -> st
         raise EngineError(f"{wad}: not a scenario file: {error}") from error
     if map_name not in lumps:
         raise EngineError(f"{wad}: no map {map_name}, only {', '.join(lumps[:8])}; the engine would play another one")
-    with tempfile.TemporaryDirectory(prefix="gvz-probe-") as directory:
-        log = Path(directory) / "engine.log"
+    with janitor.temporary_directory("probe") as directory:
+        log = directory / "engine.log"
         command = [sys.executable, "-m", "gvz.probe", str(os.getpid()), str(wad), map_name, str(log), str(timeout_s)]
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)

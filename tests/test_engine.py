@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -234,10 +235,24 @@ def test_what_vizdoom_refuses_is_an_engine_error(tmp_path: Path):
         Engine(config(wad=tmp_path / "nowhere.wad"))
 
 
-def test_too_little_shared_memory_is_said_before_the_start(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(engine_process, "_SHM_BYTES", 2**60)
-    with pytest.raises(ResourceError, match=r"/dev/shm: \d+ MiB free, an engine needs \d+; enlarge it"):
+@pytest.mark.parametrize(
+    ("name", "value", "error", "message"),
+    [
+        ("_SHM_BYTES", 2**60, ResourceError, r"/dev/shm: \d+ MiB free, an engine needs \d+; enlarge it"),
+        # as on a file system mounted noexec
+        ("_LAUNCHER_MODE", 0o600, EngineError, "set TMPDIR to a directory where they may run"),
+    ],
+)
+def test_what_forbids_a_start_is_said_and_nothing_of_it_left(
+    name: str, value: int, error: type[Exception], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(engine_process, name, value)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    before = set(janitor.runtime_dir().glob("*.json"))
+    with pytest.raises(error, match=message):
         Engine(config())
+    assert list(tmp_path.iterdir()) == []
+    assert set(janitor.runtime_dir().glob("*.json")) == before
 
 
 def test_few_start_at_a_time_and_a_killed_holder_gives_its_place_back():
@@ -288,9 +303,3 @@ def test_what_vizdoom_does_not_have_is_a_config_error(changes: dict[str, object]
 
 def test_the_default_render_size_is_one_of_vizdooms():
     assert (256, 144) in screen_resolutions()
-
-
-def test_a_launcher_that_may_not_run_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(engine_process, "_LAUNCHER_MODE", 0o600)  # as on a file system mounted noexec
-    with pytest.raises(EngineError, match="set TMPDIR to a directory where they may run"):
-        engine_process.write_launcher(tmp_path, Path("/bin/true"), tmp_path / "log")

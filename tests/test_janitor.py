@@ -72,6 +72,28 @@ def test_records_are_private(registry: Path):
     janitor.forget("segment", "gvz-x")  # again, and of what was never recorded
 
 
+def test_a_temporary_directory_goes_with_its_block_or_with_the_next_start(registry: Path):
+    with janitor.temporary_directory("test") as directory:
+        (directory / "file").touch()
+        assert directory.stat().st_mode & 0o777 == 0o700
+        assert janitor.clean_dead_instances() == []
+    assert not directory.exists()
+    code = "from gvz import janitor\nwith janitor.temporary_directory('test') as d: print(d, flush=True); input()"
+    killed = Path(run_until_killed(code))
+    assert janitor.dead_instances() == [str(killed)]
+    assert janitor.clean_dead_instances() == [f"directory {killed}"]
+    assert not killed.exists()
+    assert list(registry.iterdir()) == []
+
+
+def test_a_record_half_written_long_ago_is_removed(registry: Path):
+    for name, age_s in (("new.partial", 60), ("old.partial", 7200)):
+        (registry / name).write_text("{")
+        os.utime(registry / name, times=(time.time() - age_s,) * 2)
+    assert janitor.clean_dead_instances() == []
+    assert [path.name for path in registry.iterdir()] == ["new.partial"]
+
+
 def test_what_a_living_owner_has_is_left_alone(registry: Path, segment: Path):
     janitor.record("segment", segment.name)
     assert janitor.clean_dead_instances() == []
@@ -115,6 +137,10 @@ def test_records_of_another_machine_are_left_alone(registry: Path, segment: Path
         ("engine", "/tmp/gvz-engine-x/../../home"),
         ("engine", "/home/someone"),
         ("directory", "/tmp/x"),
+        ("directory", "gvz-test-0123456789abcdef"),
+        ("directory", "/tmp/gvz-test-0123456789abcdef/.."),
+        ("directory", "/tmp/gvz-engine-x"),
+        ("file", "/tmp/gvz-test-0123456789abcdef"),
     ],
 )
 def test_forged_records_delete_nothing(registry: Path, segment: Path, kind: str, name: str):

@@ -1,18 +1,18 @@
 """How fast this machine trains and evaluates: measured by really doing it for a short while, and remembered.
 
-Imports gvz.{cache,config,experiments,machine,rundir}.
+Imports gvz.{cache,config,experiments,janitor,machine,rundir}.
 """
 
 import dataclasses
 import hashlib
 import json
 import platform
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from gvz import janitor
 from gvz.cache import cache_directory
 from gvz.config import config_to_dict, load_config
 from gvz.errors import GvzError
@@ -74,10 +74,10 @@ def measure(run: TrainingRun, scale: float, slot: Slot, show: Show) -> Rates:
     Raises:
         GvzError: it did not start, or did too little; has the end of its log.
     """
-    with tempfile.TemporaryDirectory(prefix="gvz-rates-") as folder:
+    with janitor.temporary_directory("rates") as folder:
         endless = dataclasses.replace(run, total_updates=10**9, num_checkpoints=1)
         many = Evaluation(tasks=run.tasks, episodes=1000)
-        job = RunJob(results=Path(folder), run=endless, evaluation=many, scale=scale)
+        job = RunJob(results=folder, run=endless, evaluation=many, scale=scale)
         directory = progress.run_directory(job.results, endless)
         # a full warm-up and replay would take minutes, and change no rate
         small = ("--learner.warmup-steps", "256", "--replay.capacity", "16384", "--log.period-updates", "2")

@@ -1,6 +1,7 @@
 """The soak's short form: a run of the real command under kills, its record, and the page made of the long form's."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import pytest
 from command import SMALL
 
 from benchmarks import reliability, soak
+from gvz import janitor
 from gvz.errors import ConfigError
 
 ROOT = Path(__file__).parent.parent.parent
@@ -28,7 +30,12 @@ def test_actors_are_killed_and_replaced_and_nothing_is_left(tmp_path):
     times = "--minutes 0.4 --kill-every-s 8 --stretches 1 --undisturbed-minutes 0.1 --sample-s 1".split()
     flags = without(without(SMALL, "--config"), "--log.period-updates")
     command = [sys.executable, "-m", "benchmarks.soak", *times, "--out", str(tmp_path / "soak.json"), "--", *flags]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    stranger = janitor.SHM_DIR / f"ViZDoomSMstranger{os.getpid()}"
+    stranger.touch()  # what another program has left is not the run's
+    try:
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    finally:
+        stranger.unlink()
     assert done.returncode == 0, done.stderr
     made = reliability.read(tmp_path / "soak.json")
     assert [stretch["kind"] for stretch in made["stretches"]] == ["undisturbed", "kills", "undisturbed"]
