@@ -15,6 +15,8 @@ ENDLESS_EPISODES = 2
 """a game that has played for so many time-outs and ended no episode does not end them"""
 EDGE_SHARE = 0.02
 """part of the values' range, at either end, that counts as its edge"""
+STALE = 10
+"""acting parameters that are older than records can wait by so many times are not taken by the actors"""
 _EVENLY_FILLED = 0.5
 """share of the replay from which on its records are weighed: before, a quick game is simply ahead"""
 
@@ -34,6 +36,8 @@ class Expected:
     """range of discounted returns"""
     distributional: bool
     """values are means over a support from v_min to v_max and cannot leave it"""
+    staleness_versions: float
+    """publications while a record waits in a full ring for a learner that is as far ahead as it may be"""
 
 
 def alarms(row: Mapping[str, float], tasks: Sequence[TaskStatus], expected: Expected) -> dict[str, str]:
@@ -44,7 +48,12 @@ def alarms(row: Mapping[str, float], tasks: Sequence[TaskStatus], expected: Expe
         tasks: recent play of each task.
         expected: of the run.
     """
-    return {**_crowded(row, expected), **_extreme_values(row, expected), **_idle_tasks(row, tasks, expected)}
+    return {
+        **_crowded(row, expected),
+        **_extreme_values(row, expected),
+        **_idle_tasks(row, tasks, expected),
+        **_stale_parameters(row, expected),
+    }
 
 
 def _crowded(row: Mapping[str, float], expected: Expected) -> dict[str, str]:
@@ -89,3 +98,15 @@ def _idle_tasks(row: Mapping[str, float], tasks: Sequence[TaskStatus], expected:
                 f"{expected.timeout_steps}"
             )
     return found
+
+
+def _stale_parameters(row: Mapping[str, float], expected: Expected) -> dict[str, str]:
+    """Actors that act by parameters which the learner has long replaced."""
+    versions = row["actors/staleness_p95_versions"]
+    if versions <= STALE * expected.staleness_versions:
+        return {}
+    return {
+        "stale": f"one decision in twenty was made by parameters {versions:.0f} or more publications old, where "
+        f"{expected.staleness_versions:.0f} can be explained by records that wait; actors may be starved of "
+        "processor time: lower actors.num_actors"
+    }

@@ -139,6 +139,7 @@ class Monitor:
 def _expected(config: RunConfig, parts: Parts) -> Expected:
     tasks, spec, agent = parts.pool_config.tasks, parts.agent.spec, config.agent
     v_min, v_max = agent.value_range(spec.v_min, spec.v_max)
+    waiting = config.num_actors * parts.pool_config.ring_capacity + 2 * config.learner.step_tolerance
     played = Counter(tasks[lane % len(tasks)] for lane in range(config.num_lanes))
     return Expected(
         games={task: played[task] for task in tasks},
@@ -147,4 +148,5 @@ def _expected(config: RunConfig, parts: Parts) -> Expected:
         v_min=v_min,
         v_max=v_max,
         distributional=agent.distributional,
+        staleness_versions=1 + waiting / config.learner.env_steps_per_update / config.learner.publish_period_updates,
     )

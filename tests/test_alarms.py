@@ -8,7 +8,13 @@ from gvz.alarms import Expected, alarms
 from gvz.progress import TaskStatus
 
 EXPECTED = Expected(
-    games={"a": 2, "b": 1, "c": 1}, timeout_steps=275, num_slots=1000, v_min=-2.0, v_max=8.0, distributional=True
+    games={"a": 2, "b": 1, "c": 1},
+    timeout_steps=275,
+    num_slots=1000,
+    v_min=-2.0,
+    v_max=8.0,
+    distributional=True,
+    staleness_versions=17.0,
 )
 ROW = {
     "replay/fill_share": 1.0,
@@ -20,6 +26,7 @@ ROW = {
     "learner/sample_share/c": 0.2,
     "learner/q_mean": 1.0,
     "learner/q_max": 7.0,
+    "actors/staleness_p95_versions": 170,
 }
 TASKS = tuple(TaskStatus(task=task, episodes=40, score=3.0, upper_bound=20.0) for task in "abc")
 
@@ -41,6 +48,7 @@ def test_of_a_run_that_is_well_nothing_is_said():
         ({"learner/sample_share/c": 0.9}, "learner/sample_share/c", "c makes 90% of the samples drawn; by its"),
         ({"learner/q_max": 7.9}, "values", "(largest), returns from -2 to 8; the end of the support cuts them off"),
         ({"learner/q_mean": -1.9}, "values", "values reach from -1.9 (mean)"),
+        ({"actors/staleness_p95_versions": 171}, "stale", "parameters 171 or more publications old, where 17 can be"),
     ],
 )
 def test_a_row_that_is_out_of_bounds_is_named(changes: dict[str, float], condition: str, text: str):

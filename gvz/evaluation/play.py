@@ -8,7 +8,6 @@ One game a process. A policy that decides for 4 or 8 games at once would save CP
 not done: rows would depend on the size of the batch, and games that end at different times take some of it back.
 """
 
-import ctypes
 import hashlib
 import multiprocessing
 import os
@@ -200,9 +199,7 @@ _worker = _Worker()
 
 
 def _begin_worker(parent_pid: int) -> None:
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG: end with the parent
-    if os.getppid() != parent_pid:
-        os._exit(1)
+    janitor.die_with_parent(parent_pid)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     os.environ |= {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false", "NPROC": "1"}
 

@@ -68,7 +68,10 @@ class Segment:
         try:
             file = os.open(_path(name), os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
         except OSError as error:
-            raise TransportError(f"segment {name}: cannot be attached: {error.strerror}; did its owner end?") from error
+            raise TransportError(
+                f"segment {name}: cannot be attached: {error.strerror}; its owner has ended, or systemd has removed "
+                "it at a logout of this user (RemoveIPC=yes in logind.conf)"
+            ) from error
         try:
             found, total = os.fstat(file), HEADER_BYTES + payload_bytes
             if found.st_uid != os.geteuid():
