@@ -1,6 +1,8 @@
 """Fuzz targets: checkpoints and policies, which are the same on the disk. Imports jax, learner.checkpoint."""
 
 import json
+import time
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -10,6 +12,9 @@ from gvz.errors import CheckpointError
 from learner import checkpoint
 from tests.fuzz.files import JSON_WORDS
 from tests.fuzz.target import Target
+
+_LATE_READS_S = 1.0
+"""a read of the disk by tensorstore is over by then, whatever orbax, which started it, has met in another array"""
 
 
 def _small_checkpoint(directory: Path) -> tuple[Path, dict[str, jax.ShapeDtypeStruct]]:
@@ -62,4 +67,10 @@ def checkpoint_files(directory: Path) -> Target:
         return True
 
     seeds = [bytes([index]) + content for index, content in enumerate(contents)]
-    return Target(run=run, seeds=seeds, words=[b"\x80", b"\xc1", b"\xdf\xff\xff\xff\xff", b"{}"], num_inputs=40)
+    return Target(
+        run=run,
+        seeds=seeds,
+        words=[b"\x80", b"\xc1", b"\xdf\xff\xff\xff\xff", b"{}"],
+        num_inputs=40,
+        close=partial(time.sleep, _LATE_READS_S),
+    )
