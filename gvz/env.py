@@ -47,8 +47,9 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
     - Termination: the agent died; the final observation is the moment of it. (The buffers are those before it.)
     - Truncation: the time-out, with its true final observation; or the engine crashed (`info["engine_crash"]`), then
       the last observation is given once more and the reward is 0.
-    - Info, each step: score, normalized_score (percent of upper_bound), upper_bound, reward_components, variables
-      (what the agent may see), kills (the engine's count, infighting included), player_kills, episode_frames,
+    - Info, each step: score (at most upper_bound), normalized_score (percent of upper_bound), upper_bound,
+      reward_components, variables (what the agent may see), kills (the engine's whole count: enemies that enemies
+      killed are in it), player_kills (what the agent killed itself), episode_frames,
       episode_seed, engine_crash (of `reset`: the engine had died and is replaced); with the last one solved_episode
       (a survival scenario's time-out was reached).
     - Seeds: `reset(seed=n)` seeds the sequence of episodes; each draws its own, `info["episode_seed"]`, and
@@ -285,7 +286,9 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
 
     def _info(self, components: dict[str, float], terminated: bool, truncated: bool) -> dict[str, Any]:
         variables, scenario = self._variables, self.task.scenario
-        score = float(self._frames) if scenario.metric == "frames_alive" else variables["KILLCOUNT"]
+        score = float(self._frames)
+        if scenario.metric == "kills":  # enemies that kill each other can take the count beyond the best possible score
+            score = min(variables["KILLCOUNT"], self._upper_bound)
         info = {
             "score": score,
             "normalized_score": 100.0 * score / self._upper_bound,

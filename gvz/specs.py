@@ -9,7 +9,7 @@ ActionSet = Literal["buttons", "combinations", "unified"]
 Profile = Literal["thesis", "levdoom"]
 Buffer = Literal["depth", "labels", "automap"]
 Interpolation = Literal["linear", "area"]
-SimplePlayer = Literal["random", "idle", "scripted"]
+SimplePlayer = Literal["random", "idle", "sweep", "scripted"]
 """who plays without training"""
 
 

@@ -1,5 +1,6 @@
 """A task as an environment: what comes out of it, when it ends, its seeds, its arguments, its window."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from gymnasium.error import ResetNeeded
 import gvz
 from gvz.env import DoomEnv, is_solved, make_env
 from gvz.errors import ConfigError, ResourceError, TaskError
+from gvz.tasks import parse_task
 from tests.episodes import TURN, fingerprint, idle_to_the_end, play
 
 pytestmark = pytest.mark.engine
@@ -116,6 +118,19 @@ def test_kills_are_the_score_where_the_scenario_says_so():
     *_, info = env.step(0)
     assert info["score"] == info["kills"]
     assert info["normalized_score"] == 100 * info["kills"] / 20
+    env.close()
+
+
+def test_kills_beyond_the_upper_bound_do_not_score():
+    task = parse_task("seek_and_kill/invulnerable")  # enemies kill each other
+    few = dataclasses.replace(task.scenario, upper_bounds={"thesis": 2, "levdoom": 2})
+    env = DoomEnv(dataclasses.replace(task, scenario=few), frame_skip=35)
+    env.reset(seed=1)
+    steps = [env.step(2) for _ in range(20)]
+    for *_, info in steps:
+        assert info["score"] == min(info["kills"], 2)
+        assert info["normalized_score"] == 50 * info["score"]
+    assert steps[-1][4]["kills"] > 2
     env.close()
 
 

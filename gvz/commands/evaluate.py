@@ -44,7 +44,8 @@ class Evaluate:
     ] = ()
     """run directories: their policies play greedily, noise off; by default the test tasks of their scenario"""
     player: SimplePlayer | None = None
-    """random: uniformly random buttons; idle: presses nothing; scripted: the scenario's simple script"""
+    """random: uniformly random buttons; idle: presses nothing; sweep: a fixed sequence of buttons; scripted: the
+    scenario's simple script, which is told what is in sight"""
     agent: Path | None = None
     """the Python file of the run's agent, if it is in a file of its own: playing executes it"""
     checkpoints: tuple[str, ...] = ("newest",)

@@ -1,4 +1,4 @@
-"""Who plays an evaluation episode: chance, nobody, a script, or any function of frames. Imports numpy,
+"""Who plays an evaluation episode: chance, nobody, a sweep, a script, or any function of frames. Imports numpy,
 actors.preprocess, gvz.evaluation.scripted. The policy of a training run is in gvz.evaluation.trained.
 """
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol, assert_never
 import numpy as np
 
 from actors.preprocess import push_frame, start_stack
-from gvz.evaluation.scripted import ScriptedPlayer
+from gvz.evaluation.scripted import ScriptedPlayer, SweepPlayer
 from gvz.specs import EnvConfig, SimplePlayer
 
 if TYPE_CHECKING:
@@ -87,6 +87,7 @@ class FramePlayer:
 SIMPLE_PLAYERS: Mapping[SimplePlayer, Callable[[], Player]] = {
     "random": RandomPlayer,
     "idle": IdlePlayer,
+    "sweep": SweepPlayer,
     "scripted": ScriptedPlayer,
 }
 
@@ -94,8 +95,8 @@ SIMPLE_PLAYERS: Mapping[SimplePlayer, Callable[[], Player]] = {
 def player_env(kind: SimplePlayer, env: EnvConfig) -> EnvConfig:
     """`env` as a player of this kind needs it.
 
-    Chance and nobody look at nothing: they get the smallest screen, which changes no score. The idle one needs the
-    action without a button, the scripted one labels on the default screen, by whose pixels it aims.
+    All but the scripted one look at nothing: they get the smallest screen, which changes no score. The idle one needs
+    the action without a button, the scripted one labels on the default screen, by whose pixels it aims.
     """
     blind = dataclasses.replace(env, render_width=160, render_height=120)
     match kind:
@@ -103,6 +104,8 @@ def player_env(kind: SimplePlayer, env: EnvConfig) -> EnvConfig:
             return blind
         case "idle":
             return dataclasses.replace(blind, action_set="combinations")
+        case "sweep":
+            return dataclasses.replace(blind, action_set="buttons")
         case "scripted":
             return dataclasses.replace(env, action_set="buttons", buffers=("labels",))
         case _:

@@ -1,10 +1,12 @@
-"""A simple scripted agent for each scenario: the floor that a trained agent is held against. Imports numpy.
+"""Simple players for each scenario, the floor that a trained agent is held against: a script, and a sweep, which looks
+at nothing. Imports numpy.
 
 A script is a generator: it looks at `Sight`, which changes between its steps, and yields the button to hold. It is
 told names and places of what is in sight (the labels buffer), so it knows enemies, kits and missiles without having
 to recognize them; it knows nothing of what is out of sight.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
@@ -76,8 +78,20 @@ STUCK_CHANGE = 2.5
 """grey levels; a screen that changes less in a step forward on average is that of one who walks against a wall"""
 STUCK_UNITS = 4.0
 """map units; likewise, of the way that the step led"""
-ACROSS = 16
-"""decisions in which the agent has crossed Dodge Projectiles' strip, at least"""
+
+SWEEPS: dict[str, tuple[tuple[str, int], ...]] = {
+    "defend_the_center": (("TURN_RIGHT", 3), ("ATTACK", 2)),
+    "health_gathering": (("MOVE_FORWARD", 18), ("TURN_RIGHT", 6)),
+    "seek_and_kill": (("MOVE_FORWARD", 5), ("TURN_RIGHT", 3), ("ATTACK", 1)),
+    "dodge_projectiles": (("MOVE_LEFT", 16), ("MOVE_RIGHT", 16)),
+}
+"""scenario -> (button, decisions it is held), again and again: how to play it without looking. Each scored most of 8 to
+25 such sequences, on 8 to 12 episodes of base seed 1: `default`, in Dodge Projectiles five of the test tasks."""
+
+
+def sweep(scenario: str) -> Iterator[str]:
+    """The buttons of the scenario's sweep, without end."""
+    return itertools.cycle(button for button, decisions in SWEEPS[scenario] for _ in range(decisions))
 
 
 def defend_the_center(sight: Sight) -> Iterator[str]:
@@ -144,19 +158,31 @@ def seek_and_kill(sight: Sight) -> Iterator[str]:
 
 
 def dodge_projectiles(_sight: Sight) -> Iterator[str]:
-    """Walks to and fro, a little longer than the strip is. It looks at nothing: missiles go where it was.
+    """The sweep: walks to and fro, a little longer than the strip is. It looks at nothing: missiles go where it was.
 
     Stepping aside from the nearest missile was tried, too: it lives a third as long.
     """
-    while True:
-        yield from ["MOVE_LEFT"] * ACROSS
-        yield from ["MOVE_RIGHT"] * ACROSS
+    return sweep("dodge_projectiles")
 
 
 SCRIPTS: dict[str, Script] = {
     script.__name__: script for script in (defend_the_center, health_gathering, seek_and_kill, dodge_projectiles)
 }
 """scenario -> its script"""
+
+
+class SweepPlayer:
+    """Plays each scenario by a fixed sequence of buttons, looking at nothing. Wants action_set="buttons"."""
+
+    def begin(self, env: "DoomEnv", observation: "Observation", info: dict[str, Any], seed: int) -> None:
+        self._actions = {held[0]: action for action, held in enumerate(env.action_meanings) if held}
+        self._script = sweep(env.task.scenario.id)
+
+    def act(self) -> int:
+        return self._actions[next(self._script)]
+
+    def observe(self, observation: "Observation", info: dict[str, Any]) -> None:
+        """It looks at nothing."""
 
 
 class ScriptedPlayer:

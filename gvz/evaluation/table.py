@@ -24,6 +24,8 @@ class Score:
     """in the task's metric; None of several tasks"""
     percent: Estimate
     """of the upper bound"""
+    own_kills: Estimate | None = None
+    """where the score is kills: those by the player itself"""
 
 
 def scores(rows: Sequence[Row], identity: Mapping[str, Any], tasks: Sequence[Task], episodes: int) -> list[Score]:
@@ -36,33 +38,55 @@ def scores(rows: Sequence[Row], identity: Mapping[str, Any], tasks: Sequence[Tas
         episodes: only episodes 0 .. episodes - 1.
     """
     chosen = [row for row in rows if identity.items() <= row.items() and row["episode"] < episodes]
-    found, by_task = [], []
+    found, percents, own = [], [], []
     for task in tasks:
         mine = [row for row in chosen if row["task"] == task.id]
         if mine:
-            by_task.append(np.array([row["normalized_score"] for row in mine]))
-            score, percent = bootstrap([np.array([row["score"] for row in mine])]), bootstrap(by_task[-1:])
-            found.append(Score(task=task, episodes=len(mine), score=score, percent=percent))
+            percents.append(np.array([row["normalized_score"] for row in mine]))
+            if task.scenario.metric == "kills":
+                own.append(np.array([row["player_kills"] for row in mine]))
+            found.append(
+                Score(
+                    task=task,
+                    episodes=len(mine),
+                    score=bootstrap([np.array([row["score"] for row in mine])]),
+                    percent=bootstrap(percents[-1:]),
+                    own_kills=bootstrap(own[-1:]) if task.scenario.metric == "kills" else None,
+                )
+            )
     if len(found) > 1:
-        together = bootstrap_runs([[by_task]], redraw=["episodes"])
-        found.append(Score(task=None, episodes=sum(map(len, by_task)), score=None, percent=together))
+        found.append(
+            Score(
+                task=None,
+                episodes=sum(map(len, percents)),
+                score=None,
+                percent=bootstrap_runs([[percents]], redraw=["episodes"]),
+                own_kills=bootstrap_runs([[own]], redraw=["episodes"]) if len(own) == len(percents) else None,
+            )
+        )
     return found
 
 
 def score_lines(found: Sequence[Score]) -> list[str]:
-    """A table of scores, the head first; the names, which can be long, come last."""
-    lines = [f"{'mean score [95%]':23}  {'% of the bound [95%]':20}  episodes  level  task"]
+    """A table of scores, the head first; the names, which can be long, come last.
+
+    Where the score of a task is kills, a column has those by the player itself.
+    """
+    kills = any(one.own_kills is not None for one in found)
+    own = f"{'own kills [95%]':20}  " if kills else ""
+    lines = [f"{'mean score [95%]':23}  {'% of the bound [95%]':20}  {own}episodes  level  task"]
     for one in found:
         name = f"mean of {len(found) - 1} tasks" if one.task is None else one.task.id
         level = "" if one.task is None else one.task.level
         score = "" if one.score is None else one.score
-        lines.append(f"{score!s:23}  {one.percent!s:20}  {one.episodes:8}  {level!s:>5}  {name}")
+        own = f"{'' if one.own_kills is None else one.own_kills!s:20}  " if kills else ""
+        lines.append(f"{score!s:23}  {one.percent!s:20}  {own}{one.episodes:8}  {level!s:>5}  {name}")
     return lines
 
 
 def score_row(one: Score) -> dict[str, Any]:
-    """A score as JSON types: task and level (None of several tasks), episodes, score and normalized_score with the ends
-    of their intervals.
+    """A score as JSON types: task and level (None of several tasks), episodes, and score, normalized_score and
+    player_kills (None where the score is not kills) with the ends of their intervals.
     """
     return {
         "task": None if one.task is None else one.task.id,
@@ -70,6 +94,7 @@ def score_row(one: Score) -> dict[str, Any]:
         "episodes": one.episodes,
         **_with_ends("score", one.score),
         **_with_ends("normalized_score", one.percent),
+        **_with_ends("player_kills", one.own_kills),
     }
 
 

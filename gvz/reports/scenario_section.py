@@ -48,6 +48,9 @@ def _section(results: Results, scenario: Scenario, out: Path) -> Section:
     if agents:
         scores = {agent: agent_scores(episodes, agent) for agent in agents}
         tables = [level_table(scenario, scores, tasks), task_table(scenario, scores, tasks, episodes)]
+        if scenario.metric == "kills":
+            own = {agent: agent_scores(episodes, agent, column="player_kills") for agent in agents}
+            tables.append(own_kills_table(scenario, own, tasks))
         if gaps := gap_table(results, scenario, scores, tasks):
             tables.append(gaps)
         final = episodes.filter("final")
@@ -125,6 +128,28 @@ def task_table(
         columns=("task", "level", *scores),
         rows=tuple(rows),
         notes=notes,
+    )
+
+
+def own_kills_table(scenario: Scenario, own: Mapping[str, Scores], tasks: Sequence[Task]) -> Table:
+    """Tasks and then levels as rows, agents as columns: the enemies that the agent killed itself."""
+    groups = [(task.name, task.level, [task.id]) for task in tasks]
+    by_level = [(level, [task.id for task in tasks if task.level == level]) for level in range(5)]
+    groups += [(f"mean of {len(ids)} tasks", level, ids) for level, ids in by_level if len(ids) > 1]
+    return Table(
+        id=f"{scenario.id}_own_kills",
+        caption=f"{scenario.title}, own kills: enemies killed by the agent itself, those beyond the upper bound, too. "
+        "The score also counts enemies that other enemies killed, and is at most the upper bound.",
+        columns=("task", "level", *own),
+        rows=tuple(
+            (
+                words(name),
+                words(str(level)),
+                *(estimate(one, ids) if one.played(ids) else missing() for one in own.values()),
+            )
+            for name, level, ids in groups
+        ),
+        notes=(_interval_note(own),),
     )
 
 

@@ -17,7 +17,9 @@ Seed = int | None
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Scores:
-    """Normalized scores (percent of the upper bound) of an agent's evaluation episodes, by training seed and task."""
+    """Normalized scores (percent of the upper bound), or another column, of an agent's evaluation episodes, by training
+    seed and task.
+    """
 
     runs: dict[Seed, dict[str, np.ndarray]]
     wanted_seeds: tuple[Seed, ...]
@@ -57,10 +59,10 @@ def pick(episodes: pl.DataFrame, *, column: str = "normalized_score") -> dict[Se
     return found
 
 
-def agent_scores(episodes: pl.DataFrame, agent: str) -> Scores:
-    """An agent's final scores: of the last quarter of its evaluated checkpoints."""
+def agent_scores(episodes: pl.DataFrame, agent: str, *, column: str = "normalized_score") -> Scores:
+    """An agent's final scores, or another column of its rows: of the last quarter of its evaluated checkpoints."""
     rows = episodes.filter(pl.col("final"), agent=agent)
-    runs = pick(rows)
+    runs = pick(rows, column=column)
     one_task_each = rows.group_by("run_dir").agg(pl.col("trained_on").list.len().max()).drop_nulls()
     return Scores(
         runs=runs,

@@ -8,7 +8,7 @@ Reward (eq. 3.5): [kill] - [death] - 0.1 [ammo fell] - 0.01 - 0.3 [health fell] 
 Start: one of 20 places (levdoom: 12) at a random angle, a pistol and 200 bullets. 20 Demons of 1 health stand
     about, unable to walk; one more comes every 30 tics.
 Termination: the agent dies. Truncation: after 1200 tics (levdoom: 1250).
-Metric: kills (KILLCOUNT, which also counts enemies that enemies killed), 20 counted as the most.
+Metric: kills (KILLCOUNT, which also counts enemies that enemies killed); a score is at most 20.
 Attributes: thesis B.3, below. `complete` takes blue and mixed_enemies. Tasks: thesis Table A.3.
 Known: about one enemy in a hundred appears in the walled-off notch at the map's north side, out of reach; so does
     a kit on the map of health_gathering/supreme. The author's maps have it too.

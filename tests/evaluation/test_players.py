@@ -6,7 +6,7 @@ import pytest
 from gvz.env import DoomEnv
 from gvz.evaluation.play import play_episode
 from gvz.evaluation.players import SIMPLE_PLAYERS, FramePlayer, IdlePlayer, player_env
-from gvz.evaluation.scripted import SCRIPTS
+from gvz.evaluation.scripted import SCRIPTS, SWEEPS
 from gvz.specs import EnvConfig
 from gvz.tasks import scenarios
 
@@ -19,8 +19,16 @@ def play(kind: str, task: str, **fields) -> dict:
         env.close()
 
 
-def test_every_scenario_has_a_script():
-    assert SCRIPTS.keys() == scenarios().keys()
+def test_every_scenario_has_a_script_and_a_sweep_of_its_buttons():
+    assert SCRIPTS.keys() == SWEEPS.keys() == scenarios().keys()
+    for scenario, held in SWEEPS.items():
+        assert {button for button, _ in held} <= set(scenarios()[scenario].buttons)
+
+
+@pytest.mark.engine
+def test_the_script_of_dodge_projectiles_is_the_sweep_episode_by_episode():
+    task = "dodge_projectiles/revenants"
+    assert play("sweep", task) == play("scripted", task)
 
 
 @pytest.mark.engine
@@ -37,7 +45,7 @@ def test_a_scripted_episode_can_be_played_again():
 
 
 @pytest.mark.engine
-@pytest.mark.parametrize("kind", ["random", "idle"])
+@pytest.mark.parametrize("kind", ["random", "idle", "sweep"])
 def test_who_looks_at_nothing_scores_the_same_at_any_render_size(kind):
     task = "defend_the_center/complete"
     assert play(kind, task) == play(kind, task, render_width=320, render_height=180, recycle_episodes=0)

@@ -6,7 +6,7 @@ from gvz.tasks import named_tasks
 
 
 def test_each_task_has_its_mean_interval_and_episodes():
-    default, blue = named_tasks("seek_and_kill")[:2]
+    default, blue = named_tasks("defend_the_center")[:2]
     rows = [{"player": "p", "task": default.id, "episode": n, "score": 4.0, "normalized_score": 20.0} for n in range(3)]
     rows.append({**rows[0], "player": "somebody else", "score": 9.0})
     rows.append({**rows[0], "episode": 3, "score": 9.0})  # beyond the episodes asked for
@@ -16,8 +16,27 @@ def test_each_task_has_its_mean_interval_and_episodes():
     assert line.index(default.id) == head.index("task")
 
 
-def test_the_last_line_is_the_mean_over_tasks():
+def test_own_kills_stand_beside_a_score_that_is_kills():
     default, blue = named_tasks("seek_and_kill")[:2]
+    (gore,) = named_tasks("defend_the_center", level=0)
+    rows = [
+        {"player": "p", "task": t.id, "episode": 0, "score": 8.0, "normalized_score": 40.0, "player_kills": own}
+        for t, own in ((default, 3.0), (blue, 6.0), (gore, 7.0))
+    ]
+    found = scores(rows, {"player": "p"}, [default, blue], episodes=1)
+    head, first, _, last = score_lines(found)
+    assert head.split()[8:10] == ["own", "kills"]
+    assert first.split()[6:9] == ["3.0", "[3.0,", "3.0]"]
+    assert last.split()[3:6] == ["4.5", "[4.5,", "4.5]"]
+    assert score_row(found[0])["player_kills_high"] == 3.0
+    mixed = scores(rows, {"player": "p"}, [default, gore], episodes=1)
+    assert [one.own_kills is None for one in mixed] == [False, True, True]
+    _, first, second, _ = score_lines(mixed)
+    assert first.index(default.id) == second.index(gore.id)
+
+
+def test_the_last_line_is_the_mean_over_tasks():
+    default, blue = named_tasks("defend_the_center")[:2]
     rows = [
         {"player": "p", "task": task.id, "episode": n, "score": percent / 5, "normalized_score": percent}
         for task, percent, episodes in ((default, 20.0, 4), (blue, 50.0, 1))
@@ -30,9 +49,10 @@ def test_the_last_line_is_the_mean_over_tasks():
 
 
 def test_a_score_as_json_has_the_ends_of_its_intervals():
-    (default, *_) = named_tasks("seek_and_kill")
+    (default, *_) = named_tasks("defend_the_center")
     score, percent = Estimate(value=4.0, low=3.0, high=5.5), Estimate(value=20.0, low=15.0, high=27.5)
     row = score_row(Score(task=default, episodes=3, score=score, percent=percent))
     assert (row["task"], row["level"], row["episodes"]) == (default.id, 0, 3)
     assert (row["score"], row["score_low"], row["score_high"]) == (4.0, 3.0, 5.5)
     assert (row["normalized_score"], row["normalized_score_low"], row["normalized_score_high"]) == (20.0, 15.0, 27.5)
+    assert row["player_kills"] is None

@@ -1,0 +1,30 @@
+"""The section of a scenario: own kills beside a score that is kills."""
+
+import json
+
+from gvz.reports.results import read_results
+from gvz.reports.scenario_section import scenario_sections
+from gvz.tasks import named_tasks
+
+DEFAULT, BLUE, RED = named_tasks("seek_and_kill")[:3]
+
+
+def test_own_kills_stand_below_the_scores_by_task_and_by_level(tmp_path):
+    own = {"idle": {DEFAULT: 0.0, BLUE: 0.0, RED: 0.0}, "scripted": {BLUE: 6.0, RED: 9.0}}
+    rows = [
+        {"player": player, "task": task.id, "episode": n, "seed": n, "score": 12.0, "player_kills": kills}
+        for player, by_task in own.items()
+        for task, kills in by_task.items()
+        for n in range(2)
+    ]
+    (tmp_path / "rows.jsonl").write_text("".join(json.dumps({"schema": 1, **row}) + "\n" for row in rows))
+    (section,) = scenario_sections(read_results([tmp_path]), tmp_path)
+    levels, tasks, own_kills = section.blocks[0].tables
+    assert (levels.id, tasks.id) == ("seek_and_kill_levels", "seek_and_kill_tasks")
+    assert own_kills.columns == ("task", "level", "idle", "scripted")
+    assert [[cell.text for cell in row] for row in own_kills.rows] == [
+        ["default", "0", "0.0 [0.0, 0.0]", "-"],
+        ["blue", "1", "0.0 [0.0, 0.0]", "6.0 [6.0, 6.0]"],
+        ["red", "1", "0.0 [0.0, 0.0]", "9.0 [9.0, 9.0]"],
+        ["mean of 2 tasks", "1", "0.0 [0.0, 0.0]", "7.5 [7.5, 7.5]"],
+    ]
