@@ -17,7 +17,7 @@ from typing import Any, Literal
 from actors.config import MAX_LANES, ActorsConfig
 from gvz.errors import ConfigError
 from gvz.scenarios.base import Scenario, Split
-from gvz.specs import EnvConfig
+from gvz.specs import EnvConfig, typed
 from gvz.tasks import Task, named_tasks, parse_task
 from learner.config import AgentConfig, LearnerConfig, ReplayConfig
 
@@ -295,42 +295,21 @@ class _Resolved:
     games_per_actor: int
 
 
-_LARGEST_EXACT = 2**53
-"""integers up to this are floating-point numbers, too"""
-
-
 def _from_plain(kind: Any, value: Any, where: str) -> Any:
     """Builds a value of type `kind` from JSON types, strictly."""
-    origin, args = typing.get_origin(kind), typing.get_args(kind)
-    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-        if not isinstance(value, dict):
-            raise ConfigError(f"{where}: got {type(value).__name__}, want a map")
-        hints = typing.get_type_hints(kind)
-        unknown = sorted(value.keys() - hints.keys())
-        if unknown:
-            near = difflib.get_close_matches(unknown[0], hints, n=1)
-            raise ConfigError(f"{where}.{unknown[0]}: unknown key" + (f", did you mean {near[0]}?" if near else ""))
-        needed = {f.name for f in dataclasses.fields(kind) if f.default is f.default_factory is dataclasses.MISSING}
-        if missing := sorted(needed - value.keys()):
-            raise ConfigError(f"{where}.{missing[0]}: missing")
-        return kind(**{key: _from_plain(hints[key], item, f"{where}.{key}") for key, item in value.items()})
-    if origin is tuple:
-        if not isinstance(value, list):
-            raise ConfigError(f"{where}: got {type(value).__name__}, want a list")
-        return tuple(_from_plain(args[0], item, where) for item in value)
-    if origin is Literal:
-        if not any(type(value) is type(arg) and value == arg for arg in args):  # True and 1.0 equal 1, and are not it
-            raise ConfigError(f"{where}: got {value!r}, want one of {list(args)}")
-        return value
-    if type(None) in args:  # an optional value
-        return None if value is None else _from_plain(next(a for a in args if a is not type(None)), value, where)
-    if kind is Path and isinstance(value, str):
-        return Path(value)
-    if kind is float and type(value) is int and abs(value) <= _LARGEST_EXACT:
-        return float(value)
-    if type(value) is not kind:
-        raise ConfigError(f"{where}: got {value!r}, want {getattr(kind, '__name__', kind)}")
-    return value
+    if not dataclasses.is_dataclass(kind) or not isinstance(kind, type):
+        return typed(kind, value, where)
+    if not isinstance(value, dict):
+        raise ConfigError(f"{where}: got {type(value).__name__}, want a map")
+    hints = typing.get_type_hints(kind)
+    unknown = sorted(value.keys() - hints.keys())
+    if unknown:
+        near = difflib.get_close_matches(unknown[0], hints, n=1)
+        raise ConfigError(f"{where}.{unknown[0]}: unknown key" + (f", did you mean {near[0]}?" if near else ""))
+    needed = {f.name for f in dataclasses.fields(kind) if f.default is f.default_factory is dataclasses.MISSING}
+    if missing := sorted(needed - value.keys()):
+        raise ConfigError(f"{where}.{missing[0]}: missing")
+    return kind(**{key: _from_plain(hints[key], item, f"{where}.{key}") for key, item in value.items()})
 
 
 # ---------------------------------------------------------------------------------------------------- resume

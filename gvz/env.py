@@ -21,7 +21,7 @@ from gvz.observation import Observation, observation_space, observe_buffers, obs
 from gvz.probe import ensure_loads
 from gvz.scenarios.base import BOOKKEEPING, Task
 from gvz.scenarios.compiler import compile_task, task_content
-from gvz.specs import EnvConfig
+from gvz.specs import EnvConfig, typed
 from gvz.tasks import parse_task
 from gvz.viewer import Window
 
@@ -83,14 +83,16 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
 
         Raises:
             TaskError: no such task.
-            ConfigError: an unknown field or reward component, a value out of range, an impossible render size.
+            ConfigError: an unknown field or reward component, a value of a wrong type or out of range, an impossible
+                render size.
             EngineError: the map does not load.
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode: got {render_mode!r}, want None or one of {self.metadata['render_modes']}")
+        recycle_episodes = typed(int | None, recycle_episodes, "recycle_episodes")
         if recycle_episodes is not None and recycle_episodes < 0:
-            raise ValueError(f"recycle_episodes: got {recycle_episodes}, want 0 or more")
-        self.task = parse_task(task) if isinstance(task, str) else task
+            raise ConfigError(f"recycle_episodes: got {recycle_episodes}, want 0 or more")
+        self.task = task if isinstance(task, Task) else parse_task(task)
         self.config = config = _with_fields(EnvConfig() if config is None else config, fields)
         self.render_mode = render_mode
         scenario = self.task.scenario

@@ -1,7 +1,13 @@
-"""The vocabulary of sizes that game, actors and learner share. Imports gvz.errors and the standard library only."""
+"""The vocabulary of sizes that game, actors and learner share, and the check of a field's type.
 
+Imports gvz.errors and the standard library only.
+"""
+
+import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from gvz.errors import ConfigError
 
@@ -43,6 +49,7 @@ class EnvConfig:
     """more than the screen: observations become a dict of `screen` and these"""
 
     def __post_init__(self) -> None:
+        check_types(self, "env")
         for name, low, high in (
             ("frame_height", 8, 1080),
             ("frame_width", 8, 1920),
@@ -53,11 +60,6 @@ class EnvConfig:
             value = getattr(self, name)
             if not low <= value <= high:
                 raise ConfigError(f"env.{name}: got {value}, want {low}..{high}")
-        for name, kind in (("action_set", ActionSet), ("profile", Profile), ("interpolation", Interpolation)):
-            if getattr(self, name) not in get_args(kind):
-                raise ConfigError(f"env.{name}: got {getattr(self, name)!r}, want one of {', '.join(get_args(kind))}")
-        if not set(self.buffers) <= set(get_args(Buffer)):
-            raise ConfigError(f"env.buffers: got {self.buffers!r}, want some of {', '.join(get_args(Buffer))}")
 
     @property
     def channels(self) -> int:
@@ -67,3 +69,57 @@ class EnvConfig:
     def frame_shape(self) -> tuple[int, int, int]:
         """(H, W, C) of one observation frame, uint8."""
         return (self.frame_height, self.frame_width, self.channels)
+
+
+_LARGEST_EXACT = 2**53
+"""integers up to this are floating-point numbers, too"""
+
+
+def typed(kind: Any, value: Any, where: str) -> Any:
+    """`value` as the type `kind`, which a field of a configuration is annotated with.
+
+    A number of numpy becomes Python's, an integer a float where a float is wanted, a list a tuple, a string a path.
+    Nothing else is converted: True is no 1, and 4.0 no 4.
+
+    Args:
+        kind: bool, int, float, str, Path, a Literal, a tuple of any length, or one of these or None.
+        value: anything.
+        where: the field, for the error.
+
+    Raises:
+        ConfigError: it is of another type, none of the Literal's values, or not finite.
+    """
+    origin, args = get_origin(kind), get_args(kind)
+    if type(None) in args:
+        return None if value is None else typed(next(a for a in args if a is not type(None)), value, where)
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise ConfigError(f"{where}: got {value!r}, want a list")
+        return tuple(typed(args[0], item, where) for item in value)
+    if origin is Literal:
+        if not any(type(value) is type(arg) and value == arg for arg in args):  # True and 1.0 equal 1, and are not it
+            raise ConfigError(f"{where}: got {value!r}, want one of {', '.join(map(str, args))}")
+        return value
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    is_number = issubclass(type(value), Real) and type(value) is not bool
+    is_integer = is_number and issubclass(type(value), Integral)
+    if kind is int and is_integer:
+        return int(value)
+    if kind is float and is_number:
+        if (is_integer and abs(value) > _LARGEST_EXACT) or not math.isfinite(value):
+            raise ConfigError(f"{where}: got {value}, want a finite float")
+        return float(value)
+    if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
+        raise ConfigError(f"{where}: got {value!r}, want {kind.__name__}")
+    return value
+
+
+def check_types(config: Any, prefix: str) -> None:
+    """Gives each field of a frozen dataclass the type that it is annotated with; for its `__post_init__`.
+
+    Raises:
+        ConfigError: as `typed`; names the field behind `prefix`.
+    """
+    for name, kind in get_type_hints(type(config)).items():
+        object.__setattr__(config, name, typed(kind, getattr(config, name), f"{prefix}.{name}"))

@@ -40,16 +40,19 @@ def parse_task(text: str) -> Task:
     Raises:
         TaskError: not of that form, an unknown name, or two attributes of one group; says what is possible.
     """
-    scenario_id, slash, name = text.partition("/")
+    scenario_id, slash, name = str(text).partition("/")  # whatever it is, the error below names it
     if not slash or not name:
         raise TaskError(
-            f"task {text!r}: want '<scenario>/<task>', for example 'defend_the_center/gore+mossy_bricks'; "
+            f"task: got {text!r}, want '<scenario>/<task>', for example 'defend_the_center/gore+mossy_bricks'; "
             f"scenarios: {', '.join(scenarios())}"
         )
     scenario = scenario_named(scenario_id)
-    if name == "default":
-        return Task(scenario)
-    return Task(scenario, scenario.complete if name == "complete" else tuple(name.split("+")))
+    whole_sets = {"default": (), "complete": scenario.complete}
+    names = tuple(name.split("+"))
+    for whole in whole_sets:
+        if whole in names and len(names) > 1:
+            raise TaskError(f"task: got {text!r}, but {whole!r} is a task and no attribute; want {scenario.choices()}")
+    return Task(scenario, whole_sets.get(name, names))
 
 
 def named_tasks(scenario: str | None = None, level: int | None = None, split: Split | None = None) -> tuple[Task, ...]:

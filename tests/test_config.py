@@ -168,8 +168,8 @@ def test_a_saved_configuration_with_an_unknown_key_is_refused():
         ("seed", True, "config.seed: got True, want int"),
         ("mode", "x", "config.mode: got 'x', want one of"),
         ("agent", 3, "config.agent: got int, want a map"),
-        ("tasks", 3, "config.tasks: got int, want a list"),
-        ("training_set", 4.0, "config.training_set: got 4.0, want one of [1, 4, 8]"),
+        ("tasks", 3, "config.tasks: got 3, want a list"),
+        ("training_set", 4.0, "config.training_set: got 4.0, want one of 1, 4, 8"),
         ("training_set", True, "config.training_set: got True, want one of"),
     ],
 )

@@ -2,12 +2,18 @@
 
 import dataclasses
 import doctest
+import functools
+import pickle
 from pathlib import Path
 
+import cloudpickle
+import gymnasium
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import gvz
 import gvz.scenarios
 from gvz.errors import TaskError
 from gvz.scenarios.base import Attribute, Content, Task, Textures
@@ -84,6 +90,37 @@ def test_any_set_with_at_most_one_attribute_a_group_is_a_task_in_any_order(chose
         assert content.textures is not None
 
 
+@pytest.mark.parametrize("pickler", [pickle, cloudpickle], ids=["pickle", "cloudpickle"])
+def test_tasks_and_scenarios_survive_pickling(pickler):
+    for scenario in scenarios().values():
+        assert pickle.loads(pickler.dumps(scenario)) == scenario
+    for task in named_tasks():
+        again = pickle.loads(pickler.dumps(task))
+        assert (again, hash(again), again.id) == (task, hash(task), task.id)
+        assert again.scenario.make_rewarder().weights == task.scenario.make_rewarder().weights
+    one, other = scenario_named("seek_and_kill"), scenario_named("health_gathering")
+    assert one != other
+    assert one != dataclasses.replace(one, timeouts={"thesis": 1, "levdoom": 1})
+
+
+@pytest.mark.engine
+def test_a_task_of_ones_own_plays_in_a_spawned_process():
+    centre = scenario_named("defend_the_center")
+    ice = Attribute(
+        name="ice", groups=("textures",), content=Content(textures=Textures("FLAT14", "FWATER1", "CEIL4_3"))
+    )
+    task = Task(dataclasses.replace(centre, attributes=(*centre.attributes, ice)), ("gore", "ice"))
+    make = functools.partial(gvz.make, task)
+    envs = gymnasium.vector.AsyncVectorEnv([make], context="spawn", shared_memory=False)
+    frames, _ = envs.reset(seed=1)
+    (there,) = envs.call("task")
+    envs.close()
+    here = make()
+    np.testing.assert_array_equal(frames[0], here.reset(seed=1)[0])
+    here.close()
+    assert there == task
+
+
 def test_ids_are_canonical():
     task = parse_task("defend_the_center/mossy_bricks+gore")
     assert task.id == "defend_the_center/gore+mossy_bricks"
@@ -126,7 +163,9 @@ def test_the_main_job_trains_on_default_gore_stone_wall_and_fast_enemies():
         ("defend_the_center/lava", "unknown attribute 'lava'; want .*textures: mossy_bricks, stone_wall"),
         ("health_gathering/lava+slime", "lava and slime are both of group textures"),
         ("health_gathering/lava+lava", "lava and lava are both of group textures"),
-        ("health_gathering/complete+lava", "unknown attribute 'complete'"),
+        ("health_gathering/complete+lava", "'complete' is a task and no attribute; want default, complete, or at most"),
+        ("defend_the_center/default+gore", r"'default' is a task and no attribute; want .* \(decorations: gore; "),
+        (None, "task: got None, want '<scenario>/<task>'"),
         ("dodge_projectiles/revenants+arachnotron", "both of group entity_type"),
         ("health_gathering/lava++slime", "unknown attribute ''"),
     ],

@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Literal
 
 from gvz.errors import TaskError
-from gvz.scenarios.rewards import Reward, Rewarder
+from gvz.scenarios.rewards import Reward, Rewarder, check_weights
 from gvz.specs import Profile
 from gvz.wad.udmf import UdmfMap
 
@@ -119,9 +119,12 @@ class Attribute:
     """the thesis's shorter names in combined tasks ("fast+flying")"""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Scenario:
-    """A map, an objective, a reward and buttons; the first extension point of the benchmark."""
+    """A map, an objective, a reward and buttons; the first extension point of the benchmark.
+
+    Scenarios can be pickled, and are equal if all that they hold is, whichever process made them.
+    """
 
     id: str
     title: str
@@ -159,6 +162,9 @@ class Scenario:
     return_range: Callable[[float], tuple[float, float]]
     """f(discount) -> (v_min, v_max): range of discounted returns with the default weights"""
 
+    def __hash__(self) -> int:
+        return hash(self.id)  # the other fields hold mappings
+
     def __repr__(self) -> str:
         return f"Scenario({self.id!r})"
 
@@ -176,18 +182,24 @@ class Scenario:
         """Best possible score, to normalize by."""
         return self.upper_bounds[profile]
 
-    def make_rewarder(self, weights: Mapping[str, float] | None = None, profile: Profile = "thesis") -> Rewarder:
-        """A rewarder for one game.
+    def reward_weights(
+        self, weights: Mapping[str, float] | None = None, profile: Profile = "thesis"
+    ) -> dict[str, float]:
+        """The weight of every reward component.
 
         Args:
             weights: component -> weight, in place of the profile's; those not named keep theirs.
             profile: whose weights.
 
         Raises:
-            ConfigError: a weight whose name is no component's.
+            ConfigError: a weight whose name is no component's, or that is no finite number.
         """
         defaults = {n: r.levdoom if profile == "levdoom" else r.weight for n, r in self.rewards.items()}
-        return Rewarder({n: r.event for n, r in self.rewards.items()}, {**defaults, **(weights or {})})
+        return defaults if weights is None else {**defaults, **check_weights(weights, defaults)}
+
+    def make_rewarder(self, weights: Mapping[str, float] | None = None, profile: Profile = "thesis") -> Rewarder:
+        """A rewarder for one game, with `reward_weights(weights, profile)`; raises as that does."""
+        return Rewarder({n: r.event for n, r in self.rewards.items()}, self.reward_weights(weights, profile))
 
     def attribute(self, name: str) -> Attribute:
         """The attribute called `name`, or by that alias.

@@ -12,7 +12,7 @@ Attributes: thesis B.1, below. `complete` takes mossy_bricks for its textures. T
 """
 
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform, words
-from gvz.scenarios.rewards import Reward, death, fell, rose
+from gvz.scenarios.rewards import Fell, Reward, Rose, death
 
 WAD = "defend_the_center.wad"
 
@@ -213,11 +213,11 @@ SCENARIO = Scenario(
     timeouts={"thesis": 1100, "levdoom": 2100},
     upper_bounds={"thesis": 1100, "levdoom": 2100},
     rewards={
-        "kill": Reward(event=rose("KILLCOUNT"), weight=1.0, levdoom=1.0),
-        "player_kill": Reward(event=rose("PLAYER_KILLS"), weight=0.0, levdoom=0.0),
+        "kill": Reward(event=Rose("KILLCOUNT"), weight=1.0, levdoom=1.0),
+        "player_kill": Reward(event=Rose("PLAYER_KILLS"), weight=0.0, levdoom=0.0),
         "death": Reward(event=death, weight=-1.0, levdoom=0.0),
-        "ammo_spent": Reward(event=fell("AMMO2"), weight=-0.1, levdoom=-0.01),
-        "health_lost": Reward(event=fell("HEALTH"), weight=-0.2, levdoom=-0.01),
+        "ammo_spent": Reward(event=Fell("AMMO2"), weight=-0.1, levdoom=-0.01),
+        "health_lost": Reward(event=Fell("HEALTH"), weight=-0.2, levdoom=-0.01),
     },
     return_range=return_range,
 )

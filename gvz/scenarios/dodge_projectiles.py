@@ -15,7 +15,7 @@ Differs: the enemies have their normal health, as in the author's maps; nobody h
 """
 
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform, Value, words
-from gvz.scenarios.rewards import Reward, fell, living
+from gvz.scenarios.rewards import Fell, Reward, living
 from gvz.wad.udmf import UdmfMap
 
 WAD = "defend_the_line.wad"
@@ -200,7 +200,7 @@ SCENARIO = Scenario(
     upper_bounds={"thesis": 2100, "levdoom": 2100},
     rewards={
         "living": Reward(event=living, weight=0.01, levdoom=0.0),
-        "health_lost": Reward(event=fell("HEALTH"), weight=-1.0, levdoom=-0.1),
+        "health_lost": Reward(event=Fell("HEALTH"), weight=-1.0, levdoom=-0.1),
     },
     return_range=return_range,
 )

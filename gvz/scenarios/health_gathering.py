@@ -12,7 +12,7 @@ Attributes: thesis B.2, below. `complete` takes water for its textures. Tasks: t
 """
 
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform, words
-from gvz.scenarios.rewards import Reward, death, living, rose
+from gvz.scenarios.rewards import Reward, Rose, death, living
 
 WAD = "health_gathering.wad"
 SUPREME_WAD = "health_gathering_supreme.wad"
@@ -339,8 +339,8 @@ SCENARIO = Scenario(
     rewards={
         "living": Reward(event=living, weight=0.01, levdoom=-0.01),
         "death": Reward(event=death, weight=-1.0, levdoom=0.0),
-        "poison_taken": Reward(event=rose("POISONS_TAKEN"), weight=-1.0, levdoom=0.0),
-        "health_gained": Reward(event=rose("HEALTH"), weight=1.0, levdoom=1.0),
+        "poison_taken": Reward(event=Rose("POISONS_TAKEN"), weight=-1.0, levdoom=0.0),
+        "health_gained": Reward(event=Rose("HEALTH"), weight=1.0, levdoom=1.0),
     },
     return_range=return_range,
 )

@@ -1,10 +1,12 @@
-"""Rewards as named events of one decision, each with a weight. Imports gvz.errors and the standard library."""
+"""Rewards as named events of one decision, each with a weight. Imports tier 0."""
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from gvz.errors import ConfigError
+from gvz.specs import typed
 
 Variables = Mapping[str, float]
 """What the game says after a decision: name of a game or bookkeeping variable -> value."""
@@ -40,14 +42,24 @@ def death(_history: Sequence[Variables], terminated: bool) -> float:
     return float(terminated)
 
 
-def rose(name: str) -> Event:
-    """1 if variable `name` is higher than one decision ago."""
-    return lambda history, _terminated: float(history[-1][name] > history[-2][name])
+@dataclass(frozen=True, slots=True)
+class Rose:
+    """1 if variable `name` is higher than one decision ago. An object, because a closure cannot be pickled."""
+
+    name: str
+
+    def __call__(self, history: Sequence[Variables], _terminated: bool) -> float:
+        return float(history[-1][self.name] > history[-2][self.name])
 
 
-def fell(name: str) -> Event:
+@dataclass(frozen=True, slots=True)
+class Fell:
     """1 if variable `name` is lower than one decision ago."""
-    return lambda history, _terminated: float(history[-1][name] < history[-2][name])
+
+    name: str
+
+    def __call__(self, history: Sequence[Variables], _terminated: bool) -> float:
+        return float(history[-1][self.name] < history[-2][self.name])
 
 
 def moved(history: Sequence[Variables], _terminated: bool) -> float:
@@ -57,15 +69,30 @@ def moved(history: Sequence[Variables], _terminated: bool) -> float:
     return (dx * dx + dy * dy) ** 0.5
 
 
+def check_weights(weights: Any, components: Collection[str]) -> dict[str, float]:
+    """Reward weights as somebody gave them, as a dict of floats.
+
+    Args:
+        weights: component -> weight.
+        components: names of the components there are.
+
+    Raises:
+        ConfigError: not a mapping, a name that is no component's, or a weight that is no finite number.
+    """
+    if not isinstance(weights, Mapping):
+        raise ConfigError(f"reward weights: got {weights!r}, want a mapping of component to weight")
+    if unknown := [name for name in weights if name not in components]:
+        raise ConfigError(f"reward weights: unknown components {unknown}, want some of {sorted(components)}")
+    return {name: typed(float, weight, f"reward weight {name}") for name, weight in weights.items()}
+
+
 class Rewarder:
     """Turns the variables of one game into rewards; remembers the last HISTORY_STEPS decisions of its episode."""
 
     def __init__(self, events: Mapping[str, Event], weights: Mapping[str, float]):
-        """Raises ConfigError for a weight whose name is no event's."""
-        if unknown := sorted(weights.keys() - events.keys()):
-            raise ConfigError(f"reward weights: unknown components {unknown}, want some of {sorted(events)}")
-        self.weights = {name: weights.get(name, 0.0) for name in events}
-        self._terms = [(name, self.weights[name], event) for name, event in events.items()]
+        """Takes events and their weights, both by component."""
+        self.weights = dict(weights)
+        self._terms = [(name, weights[name], event) for name, event in events.items()]
         self._history: deque[Variables] = deque(maxlen=HISTORY_STEPS + 1)
 
     def reset(self, variables: Variables) -> None:

@@ -15,7 +15,7 @@ Known: about one enemy in a hundred appears in the walled-off notch at the map's
 """
 
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform, words
-from gvz.scenarios.rewards import Reward, death, fell, living, moved, rose
+from gvz.scenarios.rewards import Fell, Reward, Rose, death, living, moved
 from gvz.wad.udmf import UdmfMap
 
 WAD = "health_gathering_supreme.wad"
@@ -279,12 +279,12 @@ SCENARIO = Scenario(
     timeouts={"thesis": 1200, "levdoom": 1250},
     upper_bounds={"thesis": 20, "levdoom": 20},
     rewards={
-        "kill": Reward(event=rose("KILLCOUNT"), weight=1.0, levdoom=1.0),
-        "player_kill": Reward(event=rose("PLAYER_KILLS"), weight=0.0, levdoom=0.0),
+        "kill": Reward(event=Rose("KILLCOUNT"), weight=1.0, levdoom=1.0),
+        "player_kill": Reward(event=Rose("PLAYER_KILLS"), weight=0.0, levdoom=0.0),
         "death": Reward(event=death, weight=-1.0, levdoom=0.0),
-        "ammo_spent": Reward(event=fell("AMMO2"), weight=-0.1, levdoom=0.0),
+        "ammo_spent": Reward(event=Fell("AMMO2"), weight=-0.1, levdoom=0.0),
         "living": Reward(event=living, weight=-0.01, levdoom=0.0),
-        "health_lost": Reward(event=fell("HEALTH"), weight=-0.3, levdoom=0.0),
+        "health_lost": Reward(event=Fell("HEALTH"), weight=-0.3, levdoom=0.0),
         "moved": Reward(event=moved, weight=0.005, levdoom=0.001),
     },
     return_range=return_range,

@@ -1,7 +1,9 @@
 """Rewards by hand, equation by equation, and the range of returns in real games."""
 
+import math
 import random
 
+import numpy as np
 import pytest
 
 from gvz.engine import Engine, EngineConfig
@@ -87,9 +89,27 @@ def test_weights_replace_defaults_by_name():
     assert merit == {"kill": 0, "player_kill": 2, "death": 0, "ammo_spent": -0.1, "health_lost": 0}
 
 
-def test_a_weight_of_no_component_is_refused():
-    with pytest.raises(ConfigError, match=r"unknown components \['kills'\], want some of \['ammo_spent', 'death'"):
-        scenario_named("defend_the_center").make_rewarder({"kills": 1.0})
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        ({"kills": 1.0}, r"s: unknown components \['kills'\], want some of \['ammo_spent', 'death'"),
+        ({"kill": math.nan}, " kill: got nan, want a finite float"),
+        ({"kill": math.inf}, " kill: got inf, want a finite float"),
+        ({"kill": 10**400}, " kill: got 1000+, want a finite float"),
+        ({"kill": "a"}, " kill: got 'a', want float"),
+        ({"kill": True}, " kill: got True, want float"),
+        ([("kill", 1.0)], r"s: got \[\('kill', 1.0\)\], want a mapping of component to weight"),
+    ],
+)
+def test_weights_that_mean_nothing_are_refused(weights, message: str):
+    with pytest.raises(ConfigError, match=f"reward weight{message}"):
+        scenario_named("defend_the_center").make_rewarder(weights)
+
+
+def test_weights_of_any_number_type_are_taken():
+    rewarder = scenario_named("defend_the_center").make_rewarder({"kill": 2, "death": np.float32(-0.5)})
+    assert (rewarder.weights["kill"], rewarder.weights["death"]) == (2.0, -0.5)
+    assert {type(weight) for weight in rewarder.weights.values()} == {float}
 
 
 POLICIES = {
