@@ -205,8 +205,9 @@ class Engine:
         self.kill()
 
     def close(self) -> None:
-        """Ends process, shared memory and private directory. May be called again."""
+        """Ends process, shared memory and private directory; `screen` is a private copy then. May be called again."""
         self._end()
+        self.screen = self.screen.copy()  # the mapping would keep 10 MiB of shared memory, although it is unlinked
 
     @contextlib.contextmanager
     def _answering(self, what: str) -> Generator[None, None, None]:

@@ -227,9 +227,12 @@ def _watch() -> None:
         time.sleep(_WATCH_PERIOD_S)
         if time.monotonic() - before_s > 4 * _WATCH_PERIOD_S:
             continue  # this process was stopped, so nobody took the engine's answer: it may be there by the next look
-        with _watched_lock:
-            watched = list(_watched)
-        for one in watched:
-            if one.deadline is not None and time.monotonic() > one.deadline:
-                one.kill_overdue()
-        del watched  # no strong references while asleep
+        _kill_overdue()
+
+
+def _kill_overdue() -> None:  # a function of its own: asleep, the thread must hold no reference to an engine
+    with _watched_lock:
+        watched = list(_watched)
+    for one in watched:
+        if one.deadline is not None and time.monotonic() > one.deadline:
+            one.kill_overdue()

@@ -56,7 +56,10 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
       `reset(options={"episode_seed": m})` plays that episode again, alone.
     """
 
-    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": TICS_PER_SECOND}  # noqa: RUF012  Gymnasium's
+    metadata = {  # noqa: RUF012  Gymnasium's; an instance's has the pictures per second of its own frame skip
+        "render_modes": ["rgb_array", "human"],
+        "render_fps": TICS_PER_SECOND / EnvConfig().frame_skip,
+    }
 
     def __init__(
         self,
@@ -95,6 +98,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         self.task = task if isinstance(task, Task) else parse_task(task)
         self.config = config = _with_fields(EnvConfig() if config is None else config, fields)
         self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": TICS_PER_SECOND / config.frame_skip}
         scenario = self.task.scenario
         self._compiled = compile_task(self.task, config.profile)
         self._timeout_frames = scenario.timeout_frames(config.profile)
@@ -207,7 +211,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         if self.render_mode != "rgb_array":
             return None
         if self._screen is None:
-            raise ResetNeeded("DoomEnv.render: nothing was rendered yet; call reset first")
+            raise ResetNeeded("DoomEnv.render: nothing was rendered, or the environment was closed; call reset first")
         return self._screen.copy()
 
     def labels(self) -> "Sequence[Label]":
@@ -221,8 +225,12 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         return () if self._state is None or self._state.labels is None else self._state.labels
 
     def close(self) -> None:
-        """Ends the engine and its window. May be called again; `reset` would start another one."""
+        """Ends the engine and its window; nothing of the engine's memory is kept.
+
+        May be called again. Afterwards `render` raises ResetNeeded, and `reset` would start another engine.
+        """
         self._stop_engine()
+        self._screen = None
         if self._window is not None:
             self._window.close()
             self._window = None
@@ -283,6 +291,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
     def _stop_engine(self) -> None:
         if self._engine is not None:
             self._engine.close()
+            self._screen = self._engine.screen
         self._engine = None
         self._engine_episodes = 0
 

@@ -116,6 +116,7 @@ def test_close_leaves_nothing_and_may_be_repeated(engine: Engine):
 def test_a_forgotten_engine_leaves_nothing():
     engine = Engine(config())
     instance_id, pid = engine.instance_id, engine.pid
+    time.sleep(1.5 * engine_process._WATCH_PERIOD_S)  # the watchdog has looked at it, and must hold no reference to it
     del engine
     assert janitor.process_start(pid) is None
     assert not list(janitor.SHM_DIR.glob(f"*{instance_id}"))

@@ -6,8 +6,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import cv2
+import gymnasium
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
@@ -191,7 +193,7 @@ def test_steps_outside_an_episode_are_refused(shared: DoomEnv):
     idle_to_the_end(shared)
     with pytest.raises(ResetNeeded, match="no episode is running"):
         shared.step(0)
-    with pytest.raises(ResetNeeded, match="nothing was rendered yet"):
+    with pytest.raises(ResetNeeded, match="nothing was rendered, or the environment was closed"):
         DoomEnv("defend_the_center/default", render_mode="rgb_array").render()
 
 
@@ -301,7 +303,37 @@ def test_plain_data_makes_an_environment():
     env.close()
 
 
+def engine_memory() -> list[str]:
+    """The mappings and descriptors of engines' shared memory that this process holds."""
+    mappings = [line for line in Path("/proc/self/maps").read_text().splitlines() if "ViZDoom" in line]
+    links = [str(link.readlink()) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
+    return mappings + [link for link in links if "ViZDoom" in link]
+
+
+def test_closed_environments_hold_no_memory_of_their_engines():
+    others = engine_memory()
+    fields = {"render_mode": "rgb_array", "render_width": 160, "render_height": 120, "buffers": ("labels",)}
+    envs = [DoomEnv("defend_the_center/default", **fields) for _ in range(2)]
+    for env in envs:
+        env.reset(seed=1)
+        assert len(engine_memory()) > len(others)
+        env.step(TURN)
+        env.close()
+        assert engine_memory() == others
+        with pytest.raises(ResetNeeded, match="nothing was rendered, or the environment was closed"):
+            env.render()
+
+
 # ------------------------------------------------------------------------------------------------ rendering
+
+
+def test_pictures_per_second_follow_the_frame_skip(shared: DoomEnv):
+    """What Gymnasium's RecordVideo takes, so that a video plays at the game's speed."""
+    assert shared.metadata["render_fps"] == 35 / 4
+    for frame_skip in (1, 7):
+        env = gymnasium.make("GViZDoom/DefendTheCenter-Gore-v0", frame_skip=frame_skip, render_mode="rgb_array")
+        assert env.metadata["render_fps"] == 35 / frame_skip
+    assert shared.metadata["render_fps"] == 35 / 4
 
 
 def test_human_mode_shows_a_window_at_game_speed(monkeypatch: pytest.MonkeyPatch):

@@ -12,14 +12,16 @@ pytestmark = pytest.mark.engine
 
 
 def test_a_crash_truncates_the_episode_and_the_next_one_is_whole():
-    env = DoomEnv("defend_the_center/default")
+    env = DoomEnv("defend_the_center/default", render_mode="rgb_array")
     whole = fingerprint(env, 7)
     env.reset(seed=1)
     before = env.step(TURN)
+    screen = env.render()
     assert env._engine is not None
     env._engine.kill()
     observation, reward, terminated, truncated, info = env.step(TURN)
     np.testing.assert_array_equal(observation, before[0])
+    np.testing.assert_array_equal(env.render(), screen)
     assert (reward, terminated, truncated) == (0.0, False, True)
     assert info["engine_crash"] is True
     assert "crash" in info["engine_error"]
