@@ -54,11 +54,15 @@ def test_tianshou_trains_and_tests(tmp_path):
 
 
 def test_gymnasium_records_a_video(tmp_path):
+    from moviepy import VideoFileClip
+
     task = "GViZDoom/DefendTheCenter-Gore-v0"
     out = run("vector_envs.py", "--mode", "sync", "--steps", "2", "--task", task, "--video", "videos", where=tmp_path)
     (video,) = (tmp_path / "videos").glob("*.mp4")
     assert video.name in out
     assert video.stat().st_size > 10_000
+    with VideoFileClip(str(video)) as clip:
+        assert clip.fps == 35 / 4, "it plays at the game's speed"
 
 
 def test_environments_are_checked_by_stable_baselines3():
