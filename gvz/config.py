@@ -92,7 +92,11 @@ class RunConfig:
         _check_finite("", self)
         if self.env.buffers:
             raise ConfigError(f"env.buffers: got {self.env.buffers}, want none: the trainer's agents see frames alone")
-        self.resolved_tasks()
+        weights = self.resolved_scenario().reward_weights(dict(self.env.reward_weights), self.env.profile)
+        if not any(weights.values()):
+            raise ConfigError(
+                f"env.reward_weights: got 0 for each of {', '.join(weights)}, want a reward to learn from"
+            )
         if self.learner.warmup_steps > self.replay.capacity:
             raise ConfigError(
                 f"learner.warmup_steps: got {self.learner.warmup_steps}, more than replay.capacity "

@@ -67,7 +67,6 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         config: EnvConfig | None = None,
         *,
         render_mode: Literal["rgb_array", "human"] | None = None,
-        reward_weights: Mapping[str, float] | None = None,
         recycle_episodes: int | None = None,
         **fields: Any,
     ):
@@ -78,11 +77,11 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             config: sizes, action set, profile.
             render_mode: rgb_array: `render()` gives the screen, uint8 [render_height, render_width, 3];
                 human: a window shows the game at its true speed.
-            reward_weights: component -> weight, in place of the scenario's.
             recycle_episodes: restart the engine after so many episodes (0: never). Default 0, but 1 for tasks with
                 fuzzy enemies: the engine's fuzz goes on from episode to episode, so only a fresh engine draws it
                 the same again. Nothing else that can be seen depends on it.
-            **fields: single fields of EnvConfig, in place of those of `config`.
+            **fields: single fields of EnvConfig, in place of those of `config`: `frame_skip=8`,
+                `reward_weights={"kill": 2.0}`.
 
         Raises:
             TaskError: no such task.
@@ -103,7 +102,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         self._compiled = compile_task(self.task, config.profile)
         self._timeout_frames = scenario.timeout_frames(config.profile)
         self._upper_bound = scenario.upper_bound(config.profile)
-        self._rewarder = scenario.make_rewarder(reward_weights, config.profile)
+        self._rewarder = scenario.make_rewarder(dict(config.reward_weights), config.profile)
         self.action_meanings = action_buttons(scenario, config.action_set)
         self._actions = [[button in held for button in scenario.buttons] for held in self.action_meanings]
         bookkeeping = {name: user for name, user in BOOKKEEPING.items() if name != "MAP_MAGIC"}

@@ -4,6 +4,7 @@ Imports gvz.errors and the standard library only.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Integral, Real
 from pathlib import Path
@@ -21,7 +22,9 @@ SimplePlayer = Literal["random", "idle", "sweep", "scripted"]
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class EnvConfig:
-    """How a task is rendered and stepped. Sizes in pixels, `frame_skip` in game tics.
+    """How a task is rendered, stepped and rewarded. Sizes in pixels, `frame_skip` in game tics.
+
+    `reward_weights` may also be a mapping. It is kept as pairs, sorted by name.
 
     Source: thesis 3.1.1 and 5.1 (84x84 RGB, frame skip 4). Differs: rendered at 256x144 instead of 640x480,
     the same 16:9 field of view of 108 degrees at a fifth of the cost.
@@ -47,9 +50,17 @@ class EnvConfig:
     """how the rendered screen is shrunk; linear is ten times cheaper and loses no enemy (see observation.py)"""
     buffers: tuple[Buffer, ...] = ()
     """more than the screen: observations become a dict of `screen` and these"""
+    reward_weights: tuple[tuple[str, float], ...] = ()
+    """reward components and their weights, in place of the profile's: kill 2 death 0"""
 
     def __post_init__(self) -> None:
+        if isinstance(self.reward_weights, Mapping):
+            object.__setattr__(self, "reward_weights", tuple(self.reward_weights.items()))
         check_types(self, "env")
+        object.__setattr__(self, "reward_weights", tuple(sorted(self.reward_weights)))
+        names = [name for name, _ in self.reward_weights]
+        if len(set(names)) < len(names):
+            raise ConfigError(f"env.reward_weights: got {' '.join(names)}, want each component once")
         for name, low, high in (
             ("frame_height", 8, 1080),
             ("frame_width", 8, 1920),
@@ -82,7 +93,7 @@ def typed(kind: Any, value: Any, where: str) -> Any:
     Nothing else is converted: True is no 1, and 4.0 no 4.
 
     Args:
-        kind: bool, int, float, str, Path, a Literal, a tuple of any length, or one of these or None.
+        kind: bool, int, float, str, Path, a Literal, a tuple, or one of these or None.
         value: anything.
         where: the field, for the error.
 
@@ -95,7 +106,11 @@ def typed(kind: Any, value: Any, where: str) -> Any:
     if origin is tuple:
         if not isinstance(value, list | tuple):
             raise ConfigError(f"{where}: got {value!r}, want a list")
-        return tuple(typed(args[0], item, where) for item in value)
+        if args[-1] is ...:
+            return tuple(typed(args[0], item, where) for item in value)
+        if len(value) != len(args):
+            raise ConfigError(f"{where}: got {value!r}, want {' and '.join(arg.__name__ for arg in args)}")
+        return tuple(typed(arg, item, f"{where}, {value!r}") for arg, item in zip(args, value, strict=True))
     if origin is Literal:
         if not any(type(value) is type(arg) and value == arg for arg in args):  # True and 1.0 equal 1, and are not it
             raise ConfigError(f"{where}: got {value!r}, want one of {', '.join(map(str, args))}")

@@ -19,6 +19,7 @@ from gvz.config import (
 )
 from gvz.errors import ConfigError
 from gvz.launch import main, parse
+from gvz.specs import EnvConfig
 
 ALL_CONFIGS = sorted(p.stem for p in configs_directory().glob("*.py") if p.stem != "__init__")
 
@@ -90,6 +91,17 @@ def test_flags_override_every_field():
     ]
 
 
+def test_reward_weights_are_one_field_in_every_form():
+    run = parse("--env.reward-weights kill 2 death -1.5".split()).run
+    weights = (("death", -1.5), ("kill", 2.0))
+    assert run.env.reward_weights == weights
+    assert run.env == EnvConfig(reward_weights={"kill": 2, "death": -1.5})  # pyright: ignore[reportArgumentType]
+    assert hash(run.env) == hash(EnvConfig(reward_weights=weights))
+    saved = config_to_dict(run)
+    assert saved["config"]["env"]["reward_weights"] == [["death", -1.5], ["kill", 2.0]]
+    assert config_from_dict(json.loads(json.dumps(saved))).env == run.env
+
+
 def test_tasks_may_be_named():
     run = parse(["--tasks", "defend_the_center/gore", "defend_the_center/gore+mossy_bricks"]).run
     assert [t.id for t in run.resolved_tasks()] == ["defend_the_center/gore", "defend_the_center/gore+mossy_bricks"]
@@ -113,6 +125,12 @@ BAD = {
     "--log.period-updates 0": "log.period_updates: got 0",
     "--env.buffers depth": "env.buffers: got ('depth',), want none",
     "--env.frame-skip 99": "env.frame_skip: got 99",
+    "--env.reward-weights kil 2": "env.reward_weights: unknown component 'kil' (did you mean 'kill'?)",
+    "--env.reward-weights living 1": "env.reward_weights: unknown component 'living'; want some of kill, player_kill",
+    "--env.reward-weights kill nan": "env.reward_weights, ('kill', nan): got nan, want a finite float",
+    "--env.reward-weights kill 1 kill 2": "env.reward_weights: got kill kill, want each component once",
+    "--env.reward-weights kill": "Error parsing --env.reward-weights",
+    "--env.reward-weights kill 0 death 0 ammo_spent 0 health_lost 0": "env.reward_weights: got 0 for each of kill,",
     "--name a/b": "name: got 'a/b'",
 }
 

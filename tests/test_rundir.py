@@ -47,6 +47,7 @@ def test_a_change_of_meaning_is_refused_field_by_field(tmp_path):
         other = dataclasses.replace(
             CONFIG,
             seed=3,
+            env=dataclasses.replace(CONFIG.env, reward_weights=(("kill", 2.0),)),
             learner=dataclasses.replace(CONFIG.learner, batch_size=64, total_updates=300_000),
             log=dataclasses.replace(CONFIG.log, period_updates=7),
         )
@@ -54,6 +55,7 @@ def test_a_change_of_meaning_is_refused_field_by_field(tmp_path):
             run.check_resumable(other)
     text = str(refusal.value)
     assert "seed: 1111 -> 3" in text
+    assert "env.reward_weights: () -> (('kill', 2.0),)" in text
     assert "learner.batch_size: 32 -> 64" in text
     assert "total_updates" not in text
     assert "log." not in text

@@ -2,6 +2,7 @@
 what plays once it is asked for.
 """
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -67,6 +68,8 @@ class Cast:
         found = find_checkpoints(self.run_dir, [self.checkpoint])
         if len(found) > 1:
             raise ConfigError(f"--checkpoint: got {self.checkpoint}, want one of {', '.join(map(str, found))}")
+        if task.scenario != config.resolved_scenario():  # a run's weights are of its own scenario's components
+            config = dataclasses.replace(config, env=dataclasses.replace(config.env, reward_weights=()))
         return trained_entrant(self.run_dir, config, found[0]), task
 
 

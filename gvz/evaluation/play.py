@@ -8,6 +8,7 @@ One game a process. A policy that decides for 4 or 8 games at once would save CP
 not done: rows would depend on the size of the batch, and games that end at different times take some of it back.
 """
 
+import dataclasses
 import hashlib
 import multiprocessing
 import os
@@ -50,7 +51,7 @@ class Entrant:
     make_player: Callable[[], Player]
     """makes the player in the process that plays; picklable for more than one"""
     env: EnvConfig
-    """what it plays in"""
+    """what it plays in; an evaluation counts rewards by the profile's weights, whatever its own are"""
     identity: Mapping[str, Any]
     """what every row says of it, `player` (its name) among it; tells its rows from others' in one file"""
     recycle_episodes: int | None = None
@@ -173,13 +174,14 @@ class _Worker:
         return play_episode(self._game(entrant, episode.task), self._player[1], episode.episode, episode.base_seed)
 
     def _game(self, entrant: Entrant, task: str) -> "DoomEnv":
-        wanted = (task, entrant.env, entrant.recycle_episodes)
+        env = dataclasses.replace(entrant.env, reward_weights=())
+        wanted = (task, env, entrant.recycle_episodes)
         if self._env is None or (self._env.task.id, self._env.config, self._recycle_episodes) != wanted:
             from gvz.env import DoomEnv
 
             self._close()
             self._recycle_episodes = entrant.recycle_episodes
-            self._env = DoomEnv(task, entrant.env, recycle_episodes=entrant.recycle_episodes)
+            self._env = DoomEnv(task, env, recycle_episodes=entrant.recycle_episodes)
         return self._env
 
     def _close(self) -> None:

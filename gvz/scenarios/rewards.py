@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Any
 
 from gvz.errors import ConfigError
@@ -80,10 +81,15 @@ def check_weights(weights: Any, components: Collection[str]) -> dict[str, float]
         ConfigError: not a mapping, a name that is no component's, or a weight that is no finite number.
     """
     if not isinstance(weights, Mapping):
-        raise ConfigError(f"reward weights: got {weights!r}, want a mapping of component to weight")
-    if unknown := [name for name in weights if name not in components]:
-        raise ConfigError(f"reward weights: unknown components {unknown}, want some of {sorted(components)}")
-    return {name: typed(float, weight, f"reward weight {name}") for name, weight in weights.items()}
+        raise ConfigError(f"env.reward_weights: got {weights!r}, want a mapping of component to weight")
+    for name in weights:
+        if name not in components:
+            near = get_close_matches(str(name), components, n=1)
+            hint = f" (did you mean {near[0]!r}?)" if near else ""
+            raise ConfigError(
+                f"env.reward_weights: unknown component {name!r}{hint}; want some of {', '.join(components)}"
+            )
+    return {name: typed(float, weight, f"env.reward_weights, {name}") for name, weight in weights.items()}
 
 
 class Rewarder:

@@ -21,7 +21,7 @@ from gvz.transport.messages import EpisodeStats, Fault, Message, StepBlock
 
 pytestmark = pytest.mark.engine
 
-ENV = EnvConfig(frame_height=32, frame_width=40, render_width=160, render_height=120)
+ENV = EnvConfig(frame_height=32, frame_width=40, render_width=160, render_height=120, reward_weights=(("death", -3.0),))
 
 
 def config(work_dir: Path, *, num_actors: int) -> PoolConfig:
@@ -59,6 +59,7 @@ def test_a_resumed_game_goes_on_bit_for_bit(tmp_path: Path):
         wanted_steps, wanted_frames = gather(pool.drain(300))
         wanted_messages = pool.poll()
     assert {m.lane for m in before if isinstance(m, EpisodeStats)} == {0, 1}
+    assert {m.reward_components["death"] for m in before if isinstance(m, EpisodeStats)} == {-3.0}
     assert all(game["actions"] for game in state["loop"]["games"])
     with InlinePool(pool_config, state) as pool:
         steps, frames = gather(pool.drain(300))
@@ -116,6 +117,7 @@ def test_killed_engines_and_actors_are_replaced_and_leave_nothing(tmp_path: Path
         assert not any(janitor.process_start(victim.pid) for victim in victims), "engines died with their actor"
         assert num_cuts <= 2
     assert len(faults("died")) == 1
+    assert {m.reward_components["death"] for m in messages if isinstance(m, EpisodeStats) and m.terminated} == {-3.0}
     assert not psutil.Process().children(recursive=True)
     mine = {path for path in set(Path("/dev/shm").iterdir()) - before if f"gvz-{os.getpid()}-" in path.name}
     assert not mine

@@ -28,7 +28,8 @@ def forge_host_state(checkpoint: Path, host: dict) -> None:
 
 def test_a_run_trains_to_its_end_and_goes_on_when_asked_for_more(tmp_path):
     run = tmp_path / "run"
-    code, err = finish(launch(run, "--learner.total-updates", "200"))
+    weights = "--env.reward-weights death -3 kill 0".split()
+    code, err = finish(launch(run, "--learner.total-updates", "200", *weights))
     assert code == 0, err
     assert "replay" in err
     assert "processes: 1 learner, 2 actors, 4 engines" in err
@@ -48,21 +49,24 @@ def test_a_run_trains_to_its_end_and_goes_on_when_asked_for_more(tmp_path):
         assert row["reward"] == pytest.approx(sum(row["reward_components"].values()), abs=1e-3)
         assert row["normalized_score"] == pytest.approx(row["score"] / 11)
         assert row["terminated"] != row["truncated"]
+    assert {row["reward_components"]["kill"] for row in episodes} == {0.0}
+    assert {row["reward_components"]["death"] for row in episodes if row["terminated"]} == {-3.0}
     assert list((run / "tensorboard").glob("events*"))
 
-    code, err = finish(launch(run, "--learner.total-updates", "240"))
+    code, err = finish(launch(run, "--learner.total-updates", "240", *weights))
     assert code == 0, err
     assert "goes on from update 200" in err
     assert rows(run, "metrics.jsonl")[-1]["num_updates"] == 240
 
     forge_host_state(run / "checkpoints" / "240", {"records": {}})
-    code, err = finish(launch(run, "--learner.total-updates", "250"))
+    code, err = finish(launch(run, "--learner.total-updates", "250", *weights))
     assert code == 1
     assert "checkpoints/240: its host state is not one of a run (KeyError('counts')); move it aside" in err
 
     code, err = finish(launch(run, "--learner.total-updates", "240", "--seed", "7"))
     assert code == 2
     assert "seed: 1111 -> 7" in err
+    assert "env.reward_weights: (('death', -3.0), ('kill', 0.0)) -> ()" in err
     code, err = finish(launch(run, "--learner.total-updates", "20", "--fresh"))
     assert code == 0, err
     assert len(list(tmp_path.iterdir())) == 2

@@ -17,7 +17,7 @@ EPISODE = Episode("defend_the_center/complete", 3, 1)
 
 @pytest.mark.engine
 def test_what_is_shown_is_what_is_evaluated():
-    entrant = simple_entrant("random", EnvConfig())
+    entrant = simple_entrant("random", EnvConfig(reward_weights=(("death", -2.0),)))
     with closing(DoomEnv(EPISODE.task, entrant.env)) as env:
         row = play_episode(env, RandomPlayer(), EPISODE.episode, EPISODE.base_seed)
     decisions, rewards, actions = [], [0.0], {}
@@ -38,6 +38,7 @@ def test_what_is_shown_is_what_is_evaluated():
     assert (moment.terminated, moment.truncated) == (row["terminated"], row["truncated"])
     assert moment.reward == pytest.approx(row["reward"])
     assert moment.reward_components == pytest.approx(row["reward_components"])
+    assert moment.reward_components["death"] == -2.0
 
 
 class Meddler(RandomPlayer):

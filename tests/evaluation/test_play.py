@@ -1,5 +1,6 @@
 """Evaluation episodes: their seeds, the same rows however they are shared out, engines that die."""
 
+import dataclasses
 import multiprocessing
 import os
 import time
@@ -46,6 +47,16 @@ def test_rows_do_not_depend_on_how_episodes_are_shared_out():
         assert row["terminated"] != row["truncated"]
         assert row["reward"] == pytest.approx(sum(row["reward_components"].values()))
         assert 4 * row["length_steps"] >= row["length_frames"] > 4 * (row["length_steps"] - 1)
+
+
+@pytest.mark.engine
+def test_rewards_are_counted_by_the_profiles_weights_whatever_the_players_are():
+    entrants = [
+        simple_entrant("random", dataclasses.replace(SMALL, reward_weights=weights))
+        for weights in ((), (("kill", 9.0),))
+    ]
+    (_, default), (_, other) = play([(entrant, Episode(TASK, 0)) for entrant in entrants], num_workers=0)
+    assert other == default
 
 
 class Assassin:

@@ -13,6 +13,7 @@ from gvz.assemble import run_agent
 from gvz.config import RunConfig, config_to_dict
 from gvz.env import DoomEnv
 from gvz.errors import CheckpointError, ConfigError
+from gvz.evaluation.cast import Cast
 from gvz.evaluation.trained import TrainedPlayer, check_tasks, find_checkpoints, read_run_config, trained_entrant
 from gvz.rundir import RunDir
 from gvz.specs import EnvConfig
@@ -120,6 +121,16 @@ def test_a_run_cannot_play_another_scenario_unless_its_buttons_are_unified():
     with pytest.raises(ConfigError, match="seek_and_kill/default: the run was trained on defend_the_center"):
         check_tasks(CONFIG, tasks)
     check_tasks(dataclasses.replace(CONFIG, env=EnvConfig(action_set="unified")), tasks)
+
+
+def test_the_reward_weights_of_a_run_are_shown_in_its_own_scenario_alone(run):
+    env = EnvConfig(action_set="unified", reward_weights=(("kill", 2.0),))
+    config = dataclasses.replace(CONFIG, env=env)
+    (run / "config.json").write_text(json.dumps(config_to_dict(config)))
+    write_policy(run, config, 5)
+    its_own, _ = Cast(run_dir=run, checkpoint="5").resolve()
+    other, _ = Cast(run_dir=run, checkpoint="5", task="health_gathering/default").resolve()
+    assert (its_own.env, other.env) == (env, dataclasses.replace(env, reward_weights=()))
 
 
 def test_what_is_no_run_is_an_error(tmp_path, run):

@@ -92,17 +92,21 @@ def test_weights_replace_defaults_by_name():
 @pytest.mark.parametrize(
     ("weights", "message"),
     [
-        ({"kills": 1.0}, r"s: unknown components \['kills'\], want some of \['ammo_spent', 'death'"),
-        ({"kill": math.nan}, " kill: got nan, want a finite float"),
-        ({"kill": math.inf}, " kill: got inf, want a finite float"),
-        ({"kill": 10**400}, " kill: got 1000+, want a finite float"),
-        ({"kill": "a"}, " kill: got 'a', want float"),
-        ({"kill": True}, " kill: got True, want float"),
-        ([("kill", 1.0)], r"s: got \[\('kill', 1.0\)\], want a mapping of component to weight"),
+        (
+            {"kills": 1.0},
+            r": unknown component 'kills' \(did you mean 'kill'\?\); want some of kill, player_kill, death",
+        ),
+        ({"jump": 1.0}, ": unknown component 'jump'; want some of kill, player_kill, death"),
+        ({"kill": math.nan}, ", kill: got nan, want a finite float"),
+        ({"kill": math.inf}, ", kill: got inf, want a finite float"),
+        ({"kill": 10**400}, ", kill: got 1000+, want a finite float"),
+        ({"kill": "a"}, ", kill: got 'a', want float"),
+        ({"kill": True}, ", kill: got True, want float"),
+        ([("kill", 1.0)], r": got \[\('kill', 1.0\)\], want a mapping of component to weight"),
     ],
 )
 def test_weights_that_mean_nothing_are_refused(weights, message: str):
-    with pytest.raises(ConfigError, match=f"reward weight{message}"):
+    with pytest.raises(ConfigError, match=f"env.reward_weights{message}"):
         scenario_named("defend_the_center").make_rewarder(weights)
 
 
