@@ -6,13 +6,14 @@
 from typing import TYPE_CHECKING, Any
 
 from gvz.registration import register_with_gymnasium
+from gvz.specs import LABEL_CLASSES
 
 if TYPE_CHECKING:
     from gvz.env import DoomEnv
     from gvz.scenarios.base import Task
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "make"]
+__all__ = ["LABEL_CLASSES", "__version__", "make"]
 
 
 def make(task: "str | Task", **options: Any) -> "DoomEnv":

@@ -267,6 +267,9 @@ def _make_game(config: EngineConfig) -> "DoomGame":
     game.set_depth_buffer_enabled(config.depth)
     game.set_labels_buffer_enabled(config.labels)
     game.set_automap_buffer_enabled(config.automap)
+    if config.automap:  # the whole map, north up, as large as fits; by default it is cut off round the agent
+        game.set_automap_mode(vizdoom.AutomapMode.WHOLE)
+        game.add_game_args("+viz_am_center 1 +am_followplayer 0")
     game.set_objects_info_enabled(config.objects)
     game.set_window_visible(False)
     game.set_render_hud(True)

@@ -41,7 +41,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
     """One game of a task.
 
     - Observation: uint8 [H, W, C], the screen as the player sees it; with `config.buffers` a dict of `screen` and of
-      `depth`, `labels` [H, W, 1] and `automap` [H, W, C].
+      `depth` [H, W, 1], `labels` [H, W, 1] (numbers of gvz.LABEL_CLASSES) and `automap` [H, W, C] (the whole map).
     - Actions: `action_meanings`, each held for `config.frame_skip` game tics.
     - Reward: the sum of `info["reward_components"]`.
     - Termination: the agent died; the final observation is the moment of it. (The buffers are those before it.)

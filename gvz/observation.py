@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from gymnasium import spaces
 
-from gvz.specs import EnvConfig
+from gvz.specs import LABEL_CLASSES, EnvConfig
 
 if TYPE_CHECKING:
     from gvz.engine import GameState
@@ -19,6 +19,23 @@ Observation = np.ndarray | dict[str, np.ndarray]
 # wall by 40 grey levels with linear and 29 with area, and by 6.3 (at worst 3.0) and 7.0 (4.5) times the wall's own
 # variation: coarser walls, stronger enemies, none lost.
 _INTERPOLATIONS = {"linear": cv2.INTER_LINEAR, "area": cv2.INTER_AREA}
+
+_CLASS_OF_NAME = {
+    "Poison": "poison",  # a class of our own, derived from Health as kits are
+    "BulletPuff": "effect",  # these two are Explosive to ViZDoom, as missiles are
+    "RevenantTracerSmoke": "effect",
+}
+_CLASS_OF_CATEGORY = {
+    "Self": "weapon",
+    "Monster": "enemy",
+    "Explosive": "projectile",
+    "Health": "kit",
+    "Decoration": "scenery",
+    "Gore": "scenery",
+    "LightSource": "scenery",
+    "Gibs": "effect",
+}
+"""category of vizdoom.Label -> class"""
 
 
 def observation_space(config: EnvConfig) -> spaces.Space[Any]:
@@ -41,12 +58,15 @@ def observe_screen(screen: np.ndarray, config: EnvConfig) -> np.ndarray:
 
 
 def observe_buffers(state: "GameState", config: EnvConfig) -> dict[str, np.ndarray]:
-    """The buffers that `config` asks for, each in the observation's size; new arrays with each call."""
+    """The buffers that `config` asks for, each in the observation's size; new arrays with each call.
+
+    `labels` holds numbers of LABEL_CLASSES.
+    """
     found = {}
     if state.depth_buffer is not None:
         found["depth"] = _values(state.depth_buffer, config)
     if state.labels_buffer is not None:
-        found["labels"] = _values(state.labels_buffer, config)
+        found["labels"] = _class_numbers(state)[_values(state.labels_buffer, config)]
     if state.automap_buffer is not None:
         found["automap"] = observe_screen(state.automap_buffer, config)
     return found
@@ -56,3 +76,17 @@ def _values(pixels: np.ndarray, config: EnvConfig) -> np.ndarray:
     """u8[H W] -> u8[frame_height frame_width 1], without making new values up."""
     size = (config.frame_width, config.frame_height)
     return cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST)[:, :, None]
+
+
+def label_class(category: str, name: str) -> str:
+    """The class of LABEL_CLASSES of a thing, by `object_category` and `object_name` of its vizdoom.Label."""
+    return _CLASS_OF_NAME.get(name) or _CLASS_OF_CATEGORY.get(category, "other")
+
+
+def _class_numbers(state: "GameState") -> np.ndarray:
+    """u8[256]: value in the engine's labels buffer -> number in LABEL_CLASSES. The values are drawn for each frame."""
+    numbers = np.full(256, LABEL_CLASSES.index("other"), np.uint8)
+    numbers[:2] = LABEL_CLASSES.index("wall"), LABEL_CLASSES.index("plane")  # the only values that are fixed
+    for label in state.labels or ():
+        numbers[label.value] = LABEL_CLASSES.index(label_class(label.object_category, label.object_name))
+    return numbers

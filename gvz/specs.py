@@ -16,6 +16,13 @@ ActionSet = Literal["buttons", "combinations", "unified"]
 Profile = Literal["thesis", "levdoom"]
 Buffer = Literal["depth", "labels", "automap"]
 Interpolation = Literal["linear", "area"]
+LABEL_CLASSES = (
+    *("wall", "plane", "weapon", "enemy", "projectile"),
+    *("kit", "poison", "scenery", "effect", "other"),
+)
+"""What a pixel of the buffer `labels` shows, by number: 0 walls and the HUD; 1 floors and ceilings; 2 the agent's
+own weapon; 3 living enemies; 4 their missiles and fire; 5 what heals; 6 vials of poison; 7 decorations, lights and
+corpses; 8 puffs, smoke and blood; 9 anything that is in none of our scenarios. A number never changes its meaning."""
 SimplePlayer = Literal["random", "idle", "sweep", "scripted"]
 """who plays without training"""
 
