@@ -200,14 +200,14 @@ def test_kills_are_the_score_where_the_scenario_says_so():
 
 def test_kills_beyond_the_upper_bound_do_not_score():
     task = parse_task("seek_and_kill/invulnerable")  # enemies kill each other
-    few = dataclasses.replace(task.scenario, upper_bounds={"thesis": 2, "levdoom": 2})
+    few = dataclasses.replace(task.scenario, upper_bounds={"thesis": 1, "levdoom": 1})
     env = DoomEnv(dataclasses.replace(task, scenario=few), frame_skip=35)
     env.reset(seed=1)
     steps = [env.step(2) for _ in range(20)]
     for *_, info in steps:
-        assert info["score"] == min(info["kills"], 2)
-        assert info["normalized_score"] == 50 * info["score"]
-    assert steps[-1][4]["kills"] > 2
+        assert info["score"] == min(info["kills"], 1)
+        assert info["normalized_score"] == 100 * info["score"]
+    assert steps[-1][4]["kills"] > 1
     env.close()
 
 
