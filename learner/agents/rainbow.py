@@ -82,15 +82,19 @@ class Rainbow:
         return Evaluation(jnp.argmax(q, axis=-1), q, jax.nn.softmax(logits), self.atoms)
 
     def loss(self, online_params: Params, target_params: Params, key: PRNGKeyArray, batch: Transitions) -> AgentLoss:
-        """One noise sample a batch for the online network, a fresh one for the target (Fortunato et al. 2018)."""
-        key_online, key_target = jax.random.split(key)
+        """Three noise samples a batch: for the online network, for the target, for the choice of the next action.
+
+        Source: Fortunato et al. 2018, section 3.1, the loss of NoisyNet-Dueling (epsilon, epsilon' and epsilon'').
+        """
+        key_online, key_target, key_selector = jax.random.split(key, 3)
         online = add_noise(online_params, key_online, self.config.noisy)
         target = add_noise(target_params, key_target, self.config.noisy)
         logits_tm1 = self.logits(online, batch.obs_tm1, batch.task)
         logits_t = self.logits(target, batch.obs_t, batch.task)
         q_t_selector = None
         if self.config.double:
-            q_t_selector = self.q_values(self.logits(online, batch.obs_t, batch.task))
+            selector = add_noise(online_params, key_selector, self.config.noisy)
+            q_t_selector = self.q_values(self.logits(selector, batch.obs_t, batch.task))
         q_tm1, q_t = self.q_values(logits_tm1), self.q_values(logits_t)
         td = losses.q_learning_td(q_tm1, batch.a_tm1, batch.r_t, batch.discount_t, q_t, q_t_selector)
         if self.config.distributional:

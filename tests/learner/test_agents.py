@@ -147,7 +147,7 @@ def test_dqn_loss_is_algorithm_1_with_the_huber_loss():
 
 
 @pytest.mark.parametrize(("double", "distributional"), [(True, True), (False, True), (True, False)])
-def test_rainbow_loss_is_its_equations_with_one_noise_for_online_and_a_fresh_one_for_target(
+def test_rainbow_loss_is_its_equations_with_a_noise_each_for_online_target_and_choice(
     double: bool, distributional: bool
 ):
     config = replace(RAINBOW, double=double, distributional=distributional)
@@ -157,10 +157,11 @@ def test_rainbow_loss_is_its_equations_with_one_noise_for_online_and_a_fresh_one
 
     @jax.jit
     def by_hand(params, target):
-        key_online, key_target = jax.random.split(jax.random.key(7))
+        key_online, key_target, key_selector = jax.random.split(jax.random.key(7), 3)
         # A network whose means are the noisy weights, evaluated without noise, is the noisy network.
         online = add_noise(params, key_online, "factorized")
-        at_tm1, online_t = (agent.evaluate(online, obs, b.task) for obs in (b.obs_tm1, b.obs_t))
+        at_tm1 = agent.evaluate(online, b.obs_tm1, b.task)
+        online_t = agent.evaluate(add_noise(params, key_selector, "factorized"), b.obs_t, b.task)
         target_t = agent.evaluate(add_noise(target, key_target, "factorized"), b.obs_t, b.task)
         selector, rest = online_t.q_values if double else None, (b.a_tm1, b.r_t, b.discount_t)
         td = losses.q_learning_td(at_tm1.q_values, *rest, target_t.q_values, selector)
@@ -173,6 +174,42 @@ def test_rainbow_loss_is_its_equations_with_one_noise_for_online_and_a_fresh_one
     np.testing.assert_allclose(result.td_error, td, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(result.loss, wanted, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(result.priority, priority, rtol=1e-3, atol=1e-4)
+
+
+def test_online_target_and_choice_of_the_next_action_have_independent_noise():
+    """Where Q is nothing but the output biases' noise, a loss shows the three draws. Margins are five deviations."""
+    agent = make_agent(replace(RAINBOW, dueling=False, distributional=False), SPEC)
+    nothing = jax.tree.map(np.zeros_like, made_up_params(agent, 0))["params"]
+    output, ones = nothing["q_output"], np.ones(A, np.float32)
+    noise_alone = {"params": nothing | {"q_output": output | {"bias_sigma": ones}}}
+    names_its_actions = {"params": nothing | {"q_output": output | {"bias": np.arange(A, dtype=np.float32)}}}
+    zeros = jnp.zeros((A, *SPEC.obs_shape), jnp.uint8)
+    every_action = Transitions(
+        obs_tm1=zeros,
+        a_tm1=jnp.arange(A),
+        r_t=jnp.zeros(A),
+        discount_t=jnp.ones(A),
+        obs_t=zeros,
+        task=jnp.zeros(A, int),
+    )
+
+    @jax.jit
+    @jax.vmap
+    def draws(key):
+        into_names = agent.loss(noise_alone, names_its_actions, key, every_action)
+        into_noise = agent.loss(noise_alone, noise_alone, key, every_action)
+        targets = [(result.td_error + result.q_tm1)[0] for result in (into_names, into_noise)]
+        return into_noise.q_tm1, jnp.round(targets[0]).astype(int), targets[1]
+
+    K = 900
+    online, chosen, target = map(np.asarray, draws(jax.random.split(jax.random.key(0), K)))
+    share_error = 5 * np.sqrt(1 / A * (1 - 1 / A) / K)
+    np.testing.assert_allclose(np.bincount(chosen, minlength=A) / K, 1 / A, atol=share_error)
+    assert (online.argmax(1) == chosen).mean() == pytest.approx(1 / A, abs=share_error)
+    # of the chosen action, the target's noise is as often above 0 as below, and goes with no other noise
+    assert target.mean() == pytest.approx(0.0, abs=5 * target.std() / np.sqrt(K))
+    for other in (online[np.arange(K), chosen], *online.T):
+        assert np.corrcoef(target, other)[0, 1] == pytest.approx(0.0, abs=5 / np.sqrt(K))
 
 
 def test_gradient_of_the_whole_rainbow_loss_equals_finite_differences():
