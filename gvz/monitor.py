@@ -35,6 +35,8 @@ class Counts:
     """of the newest parameters on the broadcast queue"""
     published_updates: int = 0
     """gradient steps of that version"""
+    published_env_steps: int = 0
+    """decisions counted when it was published"""
     logged_updates: int = 0
     saved_updates: int = 0
 

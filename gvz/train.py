@@ -179,11 +179,13 @@ class Trainer:
         self._counts.updates += per_call
 
     def _broadcast(self) -> None:
-        """Parameters -> actors."""
-        if self._counts.updates >= self._counts.published_updates + self._config.learner.publish_period_updates:
+        """Parameters -> actors, every period, and once when warm-up ends: actors then act by the agent."""
+        counts, learner = self._counts, self._config.learner
+        warmed_up = counts.published_env_steps < learner.warmup_steps <= counts.env_steps
+        if warmed_up or counts.updates >= counts.published_updates + learner.publish_period_updates:
             self._acting = np.asarray(self._flatten(self._state.params))
-            self._counts.version += 1
-            self._counts.published_updates = self._counts.updates
+            counts.version += 1
+            counts.published_updates, counts.published_env_steps = counts.updates, counts.env_steps
             self._send()
 
     def _send(self) -> None:
@@ -196,11 +198,16 @@ class Trainer:
         self._pool.publish(self._acting, header)
 
     def _epsilon(self) -> float:
-        """Linear from start to end over the decisions after warm-up; 0 for an agent that explores by noise."""
+        """1 during warm-up, whatever the agent. Then 0 with noise, else linear from start to end.
+
+        It is a function of the decisions at the last publication, so a resumed run sends what was sent before.
+        """
         agent = self._config.agent
+        since_warmup = self._counts.published_env_steps - self._config.learner.warmup_steps
+        if since_warmup < 0:
+            return 1.0
         if agent.noisy != "off":
             return 0.0
-        since_warmup = max(0, self._counts.env_steps - self._config.learner.warmup_steps)
         progress = min(1.0, since_warmup / agent.epsilon_decay_steps)
         return agent.epsilon_start + progress * (agent.epsilon_end - agent.epsilon_start)
 

@@ -44,6 +44,8 @@ class AgentConfig:
     """smallest atom; default from the scenario's reward range"""
     v_max: float | None = None
     """largest atom; default from the scenario's reward range"""
+    initial_value: float = 0.0
+    """Q(s, a) of a fresh network, for every state and action; inside the atoms' range if distributional"""
     noisy_sigma: float = 0.017
     """initial sigma of the noisy layers"""
     hidden_units: int = 512
@@ -63,7 +65,7 @@ class AgentConfig:
     stack_size: int = 4
     """frames in an observation"""
     epsilon_start: float = 1.0
-    """epsilon before decay; used when noisy is off"""
+    """epsilon after warm-up, before decay; used when noisy is off"""
     epsilon_end: float = 0.001
     """epsilon after decay"""
     epsilon_decay_steps: int = 50_000
@@ -141,7 +143,7 @@ class LearnerConfig:
     total_updates: int = 200_000
     """gradient steps of the whole run"""
     warmup_steps: int = 10_000
-    """decisions gathered before the first update"""
+    """decisions gathered before the first update, by uniformly random actions"""
     env_steps_per_update: float = 4.0
     """decisions (all games together) per gradient step after warm-up; Rainbow's published ratio"""
     step_tolerance: int = 256

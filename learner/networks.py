@@ -4,6 +4,7 @@ One module with switches serves every agent. Parameters are float32; activations
 float32. Noise is explicit: `add_noise` moves the parameters, or the network is given what `draw_noise` drew.
 """
 
+from functools import cache
 from typing import Any
 
 import flax.linen as nn
@@ -34,25 +35,29 @@ class NoisyDense(nn.Module):
 
     Differs: sigma starts at `sigma` in both forms (the paper has 0.017 for independent noise and 0.5 / sqrt(inputs)
     for factorized, 0.009 and 0.022 for this network's layers of 3136 and 512 inputs; the thesis asks for 0.017), and
-    the means start He-uniform (thesis 4.1.5).
+    the means start He-uniform (thesis 4.1.5) unless `outputs` are given.
 
     Attributes:
         features: number of outputs.
         noisy: whether the layer has noisy weights at all.
         sigma: initial value of every noisy weight and bias.
+        outputs: what the layer answers at first, whatever its input: its biases, and its kernel starts at 0.
     """
 
     features: int
     noisy: bool
     sigma: float
+    outputs: tuple[float, ...] | None = None
 
     @nn.compact
     def __call__(self, x: Float[Array, "B P"], noise: Float[Array, "B P+Q"] | None = None) -> Float[Array, "B Q"]:
         """Applies the layer: by its means, or with each row's own f(e_in), f(e_out) side by side in `noise`."""
         shape = (self.features, x.shape[-1])
-        he_uniform = nn.initializers.he_uniform(in_axis=-1, out_axis=-2)
-        kernel = self.param("kernel", he_uniform, shape).astype(x.dtype)
-        bias = self.param("bias", nn.initializers.zeros, shape[:1]).astype(x.dtype)[None]
+        kernel_init, bias_init = nn.initializers.he_uniform(in_axis=-1, out_axis=-2), nn.initializers.zeros
+        if self.outputs is not None:
+            kernel_init, bias_init = nn.initializers.zeros, nn.initializers.constant(jnp.asarray(self.outputs))
+        kernel = self.param("kernel", kernel_init, shape).astype(x.dtype)
+        bias = self.param("bias", bias_init, shape[:1]).astype(x.dtype)[None]
         y = (kernel @ x.T).T + bias
         if not self.noisy:
             return y
@@ -115,15 +120,21 @@ class QNetwork(nn.Module):
     Architecture: thesis 4.1.5 (convolutions, rectifiers, one hidden dense layer), Figure 4.2 and eq. 4.10 (dueling:
     a hidden layer per stream; the advantage's mean is taken off, per atom if distributional, as in Rainbow).
 
+    Differs: output layers start with kernel 0 (thesis 4.1.5: He-uniform), so that every Q(s, a) is at first
+    `config.initial_value` but for noise. A return distribution starts as the one of the largest entropy with this
+    mean; it is the value stream's where there are two.
+
     Attributes:
         config: the agent's configuration; reads the network's fields only.
         num_actions: A.
         num_tasks: length of the one-hot task vector appended to the features if `task_conditioned`.
+        value_range: v_min and v_max; needed if distributional.
     """
 
     config: AgentConfig
     num_actions: int
     num_tasks: int
+    value_range: tuple[float, float] | None = None
 
     @nn.compact
     def __call__(
@@ -142,21 +153,49 @@ class QNetwork(nn.Module):
         if config.task_conditioned:
             x = jnp.concatenate([x, jax.nn.one_hot(task, self.num_tasks, dtype=dtype)], axis=-1)
         noise = {} if noise is None else noise
-        num_atoms = config.num_atoms if config.distributional else 1
+        first = (config.initial_value,)
+        if config.distributional:
+            if self.value_range is None:
+                raise ValueError("QNetwork.value_range: got None, want (v_min, v_max) for a distributional network")
+            first = initial_logits(*self.value_range, config.num_atoms, config.initial_value)
+        num_atoms = len(first)
         if not config.dueling:
-            q = self._stream("q", x, self.num_actions * num_atoms, noise)
+            q = self._stream("q", x, first * self.num_actions, noise)
             return q.reshape(-1, self.num_actions, num_atoms).astype(jnp.float32)
-        value = self._stream("value", x, num_atoms, noise)[:, None, :]  # [B, 1, N]
-        advantage = self._stream("advantage", x, self.num_actions * num_atoms, noise)
+        value = self._stream("value", x, first, noise)[:, None, :]  # [B, 1, N]
+        advantage = self._stream("advantage", x, (0.0,) * (self.num_actions * num_atoms), noise)
         advantage = advantage.reshape(-1, self.num_actions, num_atoms)  # [B, A, N]
         return (value + advantage - advantage.mean(axis=1, keepdims=True)).astype(jnp.float32)
 
-    def _stream(self, name: str, x: Array, num_outputs: int, noise: dict[str, Array]) -> Array:
-        """Hidden layer, rectifier, output layer."""
+    def _stream(self, name: str, x: Array, first: tuple[float, ...], noise: dict[str, Array]) -> Array:
+        """Hidden layer, rectifier, output layer, which answers `first` until it has learnt."""
         config, noisy = self.config, self.config.noisy != "off"
         hidden = NoisyDense(config.hidden_units, noisy, config.noisy_sigma, name=f"{name}_hidden")
-        output = NoisyDense(num_outputs, noisy, config.noisy_sigma, name=f"{name}_output")
+        output = NoisyDense(len(first), noisy, config.noisy_sigma, first, name=f"{name}_output")
         return output(nn.relu(hidden(x, noise.get(f"{name}_hidden"))), noise.get(f"{name}_output"))
+
+
+@cache
+def initial_logits(v_min: float, v_max: float, num_atoms: int, mean: float) -> tuple[float, ...]:
+    """Logits of the distribution of the largest entropy among those on the atoms with this mean.
+
+    They are a straight line over the atoms (Jaynes 1957): as few nats apart as a mean demands, and none of -inf, so no
+    atom needs long to be found again. In float64; the slope is found by bisection.
+
+    Args:
+        v_min: smallest atom.
+        v_max: largest atom.
+        num_atoms: N.
+        mean: strictly between the two.
+    """
+    atoms = np.linspace(-0.5, 0.5, num_atoms)
+    wanted = (mean - v_min) / (v_max - v_min) - 0.5
+    slope, low, high = 0.0, -1e6, 1e6
+    for _ in range(100):
+        slope = (low + high) / 2
+        masses = np.exp(slope * atoms - abs(slope) / 2)
+        low, high = (slope, high) if masses @ atoms < wanted * masses.sum() else (low, slope)
+    return tuple((slope * atoms).tolist())
 
 
 def check_fits(config: AgentConfig, height: int, width: int) -> None:

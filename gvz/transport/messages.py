@@ -220,6 +220,6 @@ class ParamsHeader:
     num_updates: int
     """gradient steps that these parameters have seen"""
     epsilon: float = 0.0
-    """probability of a uniformly random action (0 for agents that explore by noise)"""
+    """probability of a uniformly random action (1 during warm-up; then 0 for agents that explore by noise)"""
     layout_hash: int = field(default=0)
     """hash of the parameter tree's paths, shapes and dtypes: writer and reader must agree"""

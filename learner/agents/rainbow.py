@@ -20,7 +20,7 @@ from learner.replay import Transitions
 
 @dataclass(frozen=True, slots=True)
 class Rainbow:
-    """Raises ConfigError: v_min not below v_max, or the frames are too small for the convolutions."""
+    """Raises ConfigError: v_min not below v_max, initial_value not between them, or frames too small to convolve."""
 
     config: AgentConfig
     spec: AgentSpec
@@ -29,6 +29,11 @@ class Rainbow:
         v_min, v_max = self._value_range()
         if not v_min < v_max:
             raise ConfigError(f"agent.v_min, v_max: got {v_min}, {v_max}, want v_min < v_max")
+        if self.config.distributional and not v_min < self.config.initial_value < v_max:
+            raise ConfigError(
+                f"agent.initial_value: got {self.config.initial_value}, want more than v_min {v_min} and less than "
+                f"v_max {v_max}: it is the mean of the first distribution on the atoms between them"
+            )
         check_fits(self.config, *self.spec.obs_shape[:2])
 
     @property
@@ -44,8 +49,7 @@ class Rainbow:
         noise: dict[str, Float[Array, "B _"]] | None = None,
     ) -> Float[Array, "B A N"]:
         """Logits of the return distributions; Q values (N = 1) if not distributional. `noise` is each row's own."""
-        network = QNetwork(self.config, self.spec.num_actions, self.spec.num_tasks)
-        return jnp.asarray(network.apply(params, obs, task, noise))
+        return jnp.asarray(self._network().apply(params, obs, task, noise))
 
     def q_values(self, logits: Float[Array, "B A N"]) -> Float[Array, "B A"]:
         if not self.config.distributional:
@@ -53,8 +57,8 @@ class Rainbow:
         return losses.expectation(jax.nn.softmax(logits), self.atoms)
 
     def init(self, key: PRNGKeyArray) -> Params:
-        network = QNetwork(self.config, self.spec.num_actions, self.spec.num_tasks)
-        return network.init(key, jnp.zeros((1, *self.spec.obs_shape), jnp.uint8), jnp.zeros((1,), jnp.int32))
+        obs = jnp.zeros((1, *self.spec.obs_shape), jnp.uint8)
+        return self._network().init(key, obs, jnp.zeros((1,), jnp.int32))
 
     def act(
         self,
@@ -105,6 +109,9 @@ class Rainbow:
             loss, priority = losses.huber(td), jnp.abs(td)
         priority, td_error = jax.lax.stop_gradient((priority, td))
         return AgentLoss(loss, priority, losses.take_action(q_tm1, batch.a_tm1), td_error)
+
+    def _network(self) -> QNetwork:
+        return QNetwork(self.config, self.spec.num_actions, self.spec.num_tasks, self._value_range())
 
     def _value_range(self) -> tuple[float, float]:
         return self.config.value_range(self.spec.v_min, self.spec.v_max)

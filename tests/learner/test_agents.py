@@ -100,6 +100,7 @@ def test_every_agent_keeps_the_contract(agent_name: str):
     evaluation = evaluate(params, b.obs_t, b.task)
     assert evaluation.q_values.shape == (B, A)
     np.testing.assert_array_equal(evaluation.action, np.asarray(evaluation.q_values).argmax(-1))
+    np.testing.assert_allclose(evaluation.q_values, 0.0, atol=2e-6)  # agent.initial_value
     result = loss(params, target, jax.random.key(3), b)
     for value in result:
         assert value.shape == (B,)
@@ -253,6 +254,23 @@ def test_distribution_masses_sum_to_one_and_their_mean_is_q():
     probabilities = np.asarray(result.probabilities)
     np.testing.assert_allclose(probabilities.sum(-1), 1.0, rtol=1e-5)
     np.testing.assert_allclose(probabilities @ np.asarray(result.atoms), result.q_values, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "config", [RAINBOW, replace(RAINBOW, dueling=False), replace(ALL_OFF, name="dqn")], ids=["rainbow", "flat", "dqn"]
+)
+def test_a_fresh_agent_gives_every_state_and_action_the_initial_value(config: AgentConfig):
+    """2.5 is far from the middle of the atoms, 0.5. That the default is 0 is a part of the agents' contract."""
+    agent, _, evaluate, _ = jitted(replace(config, initial_value=2.5))
+    fresh = evaluate(jax.jit(agent.init)(jax.random.key(1)), batch().obs_t, batch().task)
+    np.testing.assert_allclose(fresh.q_values, 2.5, atol=2e-6)
+
+
+def test_an_initial_value_that_no_distribution_has_is_refused():
+    for value in (-2.0, 3.0, 5.0):
+        with pytest.raises(ConfigError, match=rf"initial_value: got {value}, want more than v_min -2\.0 and less than"):
+            make_agent(replace(RAINBOW, initial_value=value), SPEC)
+    make_agent(replace(RAINBOW, initial_value=5.0, distributional=False), SPEC)
 
 
 def test_configured_value_range_overrides_the_scenario_range():

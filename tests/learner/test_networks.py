@@ -10,7 +10,7 @@ import pytest
 
 from gvz.errors import ConfigError
 from learner.config import AgentConfig
-from learner.networks import NoisyDense, QNetwork, add_noise, check_fits, draw_noise
+from learner.networks import NoisyDense, QNetwork, add_noise, check_fits, draw_noise, initial_logits
 
 DQN = AgentConfig(name="dqn", double=False, dueling=False, noisy="off", distributional=False)
 TINY = replace(
@@ -20,7 +20,7 @@ OBS = (10, 10, 2)
 
 
 def shapes(config: AgentConfig, obs_shape: tuple[int, ...] = (84, 84, 12), num_tasks: int = 1) -> dict[str, dict]:
-    network = QNetwork(config, num_actions=3, num_tasks=num_tasks)
+    network = QNetwork(config, num_actions=3, num_tasks=num_tasks, value_range=(-1.0, 1.0))
     obs, task = jax.ShapeDtypeStruct((1, *obs_shape), jnp.uint8), jax.ShapeDtypeStruct((1,), jnp.int32)
     params = jax.eval_shape(network.init, jax.random.key(0), obs, task)["params"]
     return {layer: {name: leaf.shape for name, leaf in leaves.items()} for layer, leaves in params.items()}
@@ -34,7 +34,7 @@ def count(tree: dict[str, dict]) -> int:
 def tiny(config: AgentConfig):
     """A small network: made-up parameters, apply(params, obs, task, noise=None), observations and tasks."""
     rng = np.random.default_rng(0)
-    network = QNetwork(config, num_actions=3, num_tasks=2)
+    network = QNetwork(config, num_actions=3, num_tasks=2, value_range=(-1.0, 1.0))
     obs = rng.integers(0, 256, (4, *OBS), dtype=np.uint8)
     task = np.array([0, 1, 0, 1])
     shapes = jax.eval_shape(network.init, jax.random.key(0), obs, task)
@@ -87,14 +87,39 @@ def test_without_task_conditioning_the_task_is_ignored():
     np.testing.assert_array_equal(apply(params, obs, jnp.zeros(4, int)), apply(params, obs, jnp.ones(4, int)))
 
 
-def test_weights_start_he_uniform_and_biases_zero():
+def test_weights_start_he_uniform_and_biases_zero_below_the_output():
     obs = jnp.zeros((1, 84, 84, 12), jnp.uint8)
     params = jax.jit(QNetwork(DQN, 3, 1).init)(jax.random.key(0), obs, jnp.zeros(1, int))
-    for name, fan_in in (("conv_0", 768), ("conv_1", 512), ("conv_2", 576), ("q_hidden", 3136), ("q_output", 512)):
+    for name, fan_in in (("conv_0", 768), ("conv_1", 512), ("conv_2", 576), ("q_hidden", 3136)):
         kernel, bound = np.asarray(params["params"][name]["kernel"]), np.sqrt(6 / fan_in)
         assert np.abs(kernel).max() <= bound
         assert abs(kernel.std() / (bound / np.sqrt(3)) - 1) < 0.03, name
         assert not np.any(params["params"][name]["bias"])
+    assert not np.any(params["params"]["q_output"]["kernel"])
+
+
+@pytest.mark.parametrize(
+    ("v_min", "v_max", "mean"),
+    [(-6.95, 14.07, 0.0), (-7.48, 60.67, 0.0), (-16.09, 1.0, 0.0), (-2.0, 2.0, 0.0), (-1.0, 1.0, 0.999)],
+)
+def test_initial_logits_are_the_line_whose_distribution_has_the_mean(v_min: float, v_max: float, mean: float):
+    logits, atoms = np.array(initial_logits(v_min, v_max, 51, mean)), np.linspace(v_min, v_max, 51)
+    masses = np.exp(logits - logits.max())
+    masses /= masses.sum()
+    assert masses @ atoms == pytest.approx(mean, abs=1e-9)
+    np.testing.assert_allclose(np.diff(logits, 2), 0.0, atol=1e-9)  # no distribution of this mean has more entropy
+    assert logits.sum() == pytest.approx(0.0, abs=1e-6)
+
+
+def test_two_atoms_share_the_mass_by_the_mean():
+    low, high = np.exp(initial_logits(-1.0, 3.0, 2, 0.0))
+    assert high / (low + high) == pytest.approx(0.25)
+
+
+def test_a_distributional_network_without_a_range_is_refused():
+    network, obs = QNetwork(replace(TINY, distributional=True), 3, 1), jnp.zeros((1, *OBS), jnp.uint8)
+    with pytest.raises(ValueError, match=r"QNetwork\.value_range: got None, want \(v_min, v_max\)"):
+        jax.eval_shape(network.init, jax.random.key(0), obs, jnp.zeros(1, int))
 
 
 def test_dueling_takes_off_the_mean_advantage():
