@@ -1,6 +1,6 @@
 """Thesis 5.2.3: DQN against Rainbow, trained on four tasks, tested on tasks of levels 2 to 4."""
 
-from gvz.experiments.base import Experiment
+from gvz.experiments.base import RECIPE_NOTE, Experiment
 from gvz.tasks import scenario_named
 
 _LEVDOOM_SCORES = {
@@ -42,5 +42,6 @@ EXPERIMENT = Experiment(
         "those curves from random placeholders.",
         "LevDoom (2022) trained for 1.0M gradient steps on all eight tasks of levels 0 and 1, with time-outs of 2100 "
         "frames (1250 for kills); its numbers are percent of its own upper bounds.",
+        RECIPE_NOTE,
     ),
 )

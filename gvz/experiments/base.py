@@ -29,6 +29,13 @@ Published = Mapping[str, Mapping[str, tuple[float, ...]]]
 """who published -> scenario id -> percent of the upper bound, by column of the table"""
 
 
+RECIPE_NOTE = (
+    "The thesis also weights tasks by their KPI and puts the newest transitions into every batch. rainbow_4task has "
+    "neither; rainbow_4task_thesis has both (docs/AGENTS.md)."
+)
+"""of an experiment of the thesis that trains rainbow_4task"""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TrainingRun:
     """One cell of the grid. Equal ones are trained once, however many experiments have them."""

@@ -1,6 +1,6 @@
 """Thesis 5.2.4: Rainbow, trained on four tasks, on all tasks by level."""
 
-from gvz.experiments.base import Experiment
+from gvz.experiments.base import RECIPE_NOTE, Experiment
 
 EXPERIMENT = Experiment(
     name="rainbow_evaluation",
@@ -19,5 +19,5 @@ EXPERIMENT = Experiment(
             "dodge_projectiles": (79.37, 63.07, 52.85, 24.68, 22.40),
         }
     },
-    notes=("The runs are those of training_set_size and algorithm_comparison with four training tasks.",),
+    notes=("The runs are those of training_set_size and algorithm_comparison with four training tasks.", RECIPE_NOTE),
 )

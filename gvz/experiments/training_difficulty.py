@@ -1,6 +1,6 @@
 """Thesis 5.2.1: every task trained alone, by level."""
 
-from gvz.experiments.base import EACH_TASK, Experiment
+from gvz.experiments.base import EACH_TASK, RECIPE_NOTE, Experiment
 
 EXPERIMENT = Experiment(
     name="training_difficulty",
@@ -24,5 +24,6 @@ EXPERIMENT = Experiment(
     notes=(
         "The thesis averages the scores of training, every 5,000 gradient steps; here all checkpoints are evaluated, "
         "greedily and on the same episodes as everything else. The curves of training itself are of episodes.jsonl.",
+        RECIPE_NOTE,
     ),
 )

@@ -1,6 +1,6 @@
 """Thesis 5.2.2: one, four and eight training tasks, tested on tasks of levels 2 to 4."""
 
-from gvz.experiments.base import Experiment
+from gvz.experiments.base import RECIPE_NOTE, Experiment
 
 EXPERIMENT = Experiment(
     name="training_set_size",
@@ -19,5 +19,5 @@ EXPERIMENT = Experiment(
             "dodge_projectiles": (35.21, 42.30, 36.42),
         }
     },
-    notes=("The thesis does not name its training sets; ours are the training sets of gvz.tasks.",),
+    notes=("The thesis does not name its training sets; ours are the training sets of gvz.tasks.", RECIPE_NOTE),
 )

@@ -17,7 +17,7 @@ from gvz import janitor
 from gvz.rundir import read_records
 
 SMALL = (
-    "--config rainbow_4task.py --actors.num-actors 2 --actors.games-per-actor 2 --env.frame-height 36 "
+    "--actors.num-actors 2 --actors.games-per-actor 2 --env.frame-height 36 "
     "--env.frame-width 44 --env.grayscale --agent.conv-channels 8 8 --agent.conv-kernels 8 4 --agent.conv-strides 4 2 "
     "--agent.hidden-units 32 --replay.capacity 4000 --learner.warmup-steps 300 --learner.batch-size 8 "
     "--log.period-updates 20 --checkpoint.period-updates 100 --learner.target-period-updates 50"
@@ -31,12 +31,16 @@ _PATCHED = "import sys, gvz.train; {patch}; from gvz.launch import main; sys.exi
 
 
 def launch(
-    run: Path, *extra: str, environment: Mapping[str, str] | None = None, patch: str | None = None
+    run: Path,
+    *extra: str,
+    config: str = "rainbow_4task",
+    environment: Mapping[str, str] | None = None,
+    patch: str | None = None,
 ) -> subprocess.Popen[str]:
     """Starts `python -m gvz.launch`; with a `patch` (such as gvz.train.SAVE_RETRY_S = 0) that is done before it."""
     program = ["-m", "gvz.launch"] if patch is None else ["-c", _PATCHED.format(patch=patch)]
     process = subprocess.Popen(
-        [sys.executable, *program, *SMALL, "--run-dir", str(run), *extra],
+        [sys.executable, *program, "--config", config, *SMALL, "--run-dir", str(run), *extra],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -11,6 +11,7 @@ import msgpack
 import numpy as np
 import pytest
 from command import alive, arrays_of, descendants, finish, launch, num_updates, rows, wait_until
+from scipy import stats
 
 from learner.checkpoint import checkpoint_steps, verify
 
@@ -70,6 +71,29 @@ def test_a_run_trains_to_its_end_and_goes_on_when_asked_for_more(tmp_path):
     code, err = finish(launch(run, "--learner.total-updates", "20", "--fresh"))
     assert code == 0, err
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_run_by_the_thesis_recipe_acts_at_random_in_warm_up_and_by_its_agent_from_then_on(tmp_path):
+    """Without noise and learning, all values stay equal, so that by its agent each game presses one button only."""
+    flags = (
+        "--mode sync --seed 2222 --agent.noisy-sigma 0 --learner.learning-rate 1e-12 --learner.warmup-steps 1200 "
+        "--learner.step-tolerance 8 --learner.env-steps-per-update 16 --learner.total-updates 20 "
+        "--learner.publish-period-updates 1000"
+    ).split()
+    code, err = finish(launch(tmp_path / "run", *flags, config="rainbow_4task_thesis"))
+    assert code == 0, err
+    assert np.isfinite(rows(tmp_path / "run", "metrics.jsonl")[-1]["learner/loss"])
+    arrays = arrays_of(tmp_path / "run" / "checkpoints" / "20")
+    assert len(arrays["['replay'].newest"]) == 3
+    warm_up = np.zeros(3, int)
+    for i, head in enumerate(arrays["['replay'].heads"]):
+        action, last = (arrays[f"['replay'].{name}"].reshape(4, -1)[i, :head] for name in ("action", "last"))
+        decisions = action[~last]
+        # 300 of warm-up a game, give or take what the tolerance and the last records of episodes move between games
+        warm_up += np.bincount(decisions[:290], minlength=3)
+        assert len(decisions) > 350
+        assert len(set(decisions[310:])) == 1
+    assert stats.chisquare(warm_up).pvalue > 0.001
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

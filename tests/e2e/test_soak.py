@@ -28,7 +28,7 @@ def without(flags: list[str], name: str) -> list[str]:
 @pytest.mark.timeout(900)
 def test_actors_are_killed_and_replaced_and_nothing_is_left(tmp_path):
     times = "--minutes 0.4 --kill-every-s 8 --stretches 1 --undisturbed-minutes 0.1 --sample-s 1".split()
-    flags = without(without(SMALL, "--config"), "--log.period-updates")
+    flags = without(SMALL, "--log.period-updates")
     command = [sys.executable, "-m", "benchmarks.soak", *times, "--out", str(tmp_path / "soak.json"), "--", *flags]
     stranger = janitor.SHM_DIR / f"ViZDoomSMstranger{os.getpid()}"
     stranger.touch()  # what another program has left is not the run's

@@ -1,10 +1,12 @@
 """The defaults are the thesis's tables, and every ready configuration is Rainbow less what its name says."""
 
+import re
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import pytest
 
-from gvz.config import RunConfig, load_config
+from gvz.config import RunConfig, configs_directory, load_config
 from gvz.errors import ConfigError
 from learner.config import AgentConfig, LearnerConfig, ReplayConfig
 
@@ -37,7 +39,8 @@ def test_defaults_are_tables_5_1_and_5_2():
         "replay.min_priority": 0.01,
         "agent.num_atoms": 51,
     }
-    for name, wanted in {**table_5_1, **table_5_2}.items():
+    off_by_default = {"learner.kpi_weighting": False, "replay.num_newest": 0}  # 4.3.2, 4.1.1: rainbow_4task_thesis
+    for name, wanted in {**table_5_1, **table_5_2, **off_by_default}.items():
         assert values[name] == wanted, name
     assert RunConfig(name="defaults").env.frame_skip == 4
     assert load_config("dqn_4task").replay.capacity == 50_000
@@ -65,6 +68,7 @@ DQN = {
         ("rainbow_no_n_step", {"agent.n_steps": 1}),
         ("rainbow_no_prioritized", {"replay.prioritized": False}),
         ("rainbow_hidden_4096", {"agent.hidden_units": 4096}),
+        ("rainbow_4task_thesis", {"learner.kpi_weighting": True, "replay.num_newest": 3}),
         ("dqn_4task", DQN),
     ],
 )
@@ -74,6 +78,23 @@ def test_a_ready_configuration_differs_from_rainbow_by_what_its_name_says(name: 
     assert {field: after[field] for field in after if after[field] != before[field]} == changes
     same = {part: getattr(rainbow, part) for part in ("name", "agent", "replay", "learner")}
     assert replace(config, **same) == rainbow
+
+
+def test_the_page_says_what_each_configuration_has_of_the_recipe():
+    page = (Path(__file__).parents[2] / "docs" / "AGENTS.md").read_text()
+    written = {name: row.split(" | ") for name, row in re.findall(r"^\| `(\w+)` \| ((?:yes|no) .*) \|$", page, re.M)}
+    names = sorted(file.stem for file in configs_directory().glob("*.py") if file.stem != "__init__")
+    assert list(written) == names
+
+    def word(value: object) -> str:
+        return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
+
+    for name in names:
+        config = load_config(name)
+        agent, replay = config.agent, config.replay
+        parts = agent.double, agent.dueling, agent.noisy == "factorized", agent.distributional, agent.n_steps
+        more = replay.prioritized, config.learner.kpi_weighting, replay.num_newest, agent.hidden_units
+        assert written[name] == [word(value) for value in (*parts, *more)], name
 
 
 @pytest.mark.parametrize(
