@@ -28,7 +28,8 @@ class ActorsConfig:
     restart_window_s: float = 600.0
     """length of the window in which restarts are counted"""
     recycle_episodes: int = 1000
-    """a game's engine is restarted after so many episodes (0: never); ViZDoom has leaked memory over hours"""
+    """a game's engine is restarted after so many episodes at most (ViZDoom has leaked memory over hours); 0: only where
+    the task needs it. A task with fuzzy enemies needs it after every episode, so that each can be replayed alone"""
 
     def __post_init__(self) -> None:
         for name, low, high in (

@@ -82,6 +82,8 @@ class PoolConfig:
 
     def actor_specs(self, names: str, first_episodes: list[int]) -> list[ActorSpec]:
         """One spec an actor. `names` begins the names of its segments; `first_episodes` has an entry a lane."""
+        # to the environment 0 means never, even where only a fresh engine plays an episode the same again
+        recycle_episodes = None if self.actors.recycle_episodes == 0 else self.actors.recycle_episodes
         specs = []
         for actor in range(self.num_actors):
             lanes = list(range(actor * self.games_per_actor, (actor + 1) * self.games_per_actor))
@@ -94,7 +96,7 @@ class PoolConfig:
                     first_episodes=[first_episodes[lane] for lane in lanes],
                     seed=self.seed,
                     env_entry_point=self.env_entry_point,
-                    env_config={**self.env_config, "recycle_episodes": self.actors.recycle_episodes},
+                    env_config={**self.env_config, "recycle_episodes": recycle_episodes},
                     frame_shape=list(self.frame_shape),
                     stack_size=self.stack_size,
                     num_actions=self.num_actions,

@@ -77,9 +77,10 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             config: sizes, action set, profile.
             render_mode: rgb_array: `render()` gives the screen, uint8 [render_height, render_width, 3];
                 human: a window shows the game at its true speed.
-            recycle_episodes: restart the engine after so many episodes (0: never). Default 0, but 1 for tasks with
-                fuzzy enemies: the engine's fuzz goes on from episode to episode, so only a fresh engine draws it
-                the same again. Nothing else that can be seen depends on it.
+            recycle_episodes: restart the engine after at most so many episodes; default: where the task needs it. A
+                task with fuzzy enemies gets a fresh engine for every episode, whatever the number: the engine's fuzz
+                goes on from episode to episode, so only a fresh engine draws it the same again. Nothing else that can
+                be seen depends on it. 0 never restarts, not even there: for players that do not look.
             **fields: single fields of EnvConfig, in place of those of `config`: `frame_skip=8`,
                 `reward_weights={"kill": 2.0}`.
 
@@ -126,7 +127,9 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         self.action_space = Discrete(num_actions(scenario, config.action_set))
         self.observation_space = observation_space(config)
         fuzzy = "STYLE_Fuzzy" in task_content(self.task, config.profile).entity.values()
-        self._recycle_episodes = int(fuzzy) if recycle_episodes is None else recycle_episodes
+        if recycle_episodes is None or (fuzzy and recycle_episodes > 0):
+            recycle_episodes = int(fuzzy)
+        self._recycle_episodes = recycle_episodes
         self._window: Window | None = None
         self._show_at_s = 0.0
         self._engine: Engine | None = None

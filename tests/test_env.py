@@ -305,15 +305,21 @@ def test_without_fresh_engines_fuzzy_enemies_replay_the_same_game_but_for_their_
         assert 0 < (frames != played[0][0]).any(-1).mean() < 0.02, "fresh engines would not be needed, or do not help"
 
 
-def test_engines_are_recycled_after_so_many_episodes():
-    env = DoomEnv("defend_the_center/default", recycle_episodes=2)
-    engines = []
-    for _ in range(5):
-        env.reset()
-        assert env._engine is not None
-        engines.append(env._engine.pid)
-    env.close()
-    assert engines[0] == engines[1] != engines[2] == engines[3] != engines[4]
+def test_engines_are_recycled_after_so_many_episodes_and_with_fuzzy_enemies_after_each():
+    def engines(task: str, episodes: int) -> list[int]:
+        env = DoomEnv(task, recycle_episodes=2)
+        pids = []
+        for _ in range(episodes):
+            env.reset()
+            assert env._engine is not None
+            pids.append(env._engine.pid)
+        env.close()
+        return pids
+
+    pids = engines("defend_the_center/default", 5)
+    assert pids[0] == pids[1] != pids[2] == pids[3] != pids[4]
+    pids = engines("defend_the_center/fuzzy_enemies", 2)
+    assert pids[0] != pids[1], "a bound from outside does not take from the task what it needs"
 
 
 def test_a_seed_gives_a_sequence_of_episodes(shared: DoomEnv):

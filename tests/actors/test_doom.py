@@ -26,7 +26,7 @@ ENV = EnvConfig(frame_height=32, frame_width=40, render_width=160, render_height
 
 def config(work_dir: Path, *, num_actors: int) -> PoolConfig:
     return PoolConfig(
-        tasks=("defend_the_center/default", "defend_the_center/gore"),
+        tasks=("defend_the_center/default", "defend_the_center/fuzzy_enemies"),
         num_actors=num_actors,
         games_per_actor=2,
         seed=1,
@@ -50,7 +50,10 @@ def gather(blocks: list[StepBlock]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_a_resumed_game_goes_on_bit_for_bit(tmp_path: Path):
-    """The cut lies in the middle of episodes that are not the first; the resumed pool has engines of its own."""
+    """The cut lies in the middle of episodes that are not the first, and the resumed pool has engines of its own.
+
+    An engine's fuzz goes on from episode to episode: fuzzy enemies come back only if each episode has a fresh engine.
+    """
     pool_config = config(tmp_path, num_actors=1)
     with InlinePool(pool_config) as pool:
         pool.drain(301)
