@@ -107,10 +107,10 @@ class RunConfig:
                 f"learner.batch_size: got {self.learner.batch_size}, more than the {self.learner.warmup_steps} "
                 "decisions of learner.warmup_steps; no batch could be drawn"
             )
-        if self.replay.num_newest > self.learner.batch_size:
+        if self.replay.num_newest >= self.learner.batch_size:
             raise ConfigError(
-                f"replay.num_newest: got {self.replay.num_newest}, more than learner.batch_size "
-                f"{self.learner.batch_size}"
+                f"replay.num_newest: got {self.replay.num_newest}, want less than learner.batch_size "
+                f"{self.learner.batch_size}: a batch also holds drawn transitions; lower the one or raise the other"
             )
         if self.num_lanes > MAX_LANES:
             raise ConfigError(
@@ -122,6 +122,14 @@ class RunConfig:
             raise ConfigError(
                 f"replay.capacity: got {self.replay.capacity}, want at least {smallest} for {self.num_lanes} games "
                 "(each keeps a stream of its own)"
+            )
+        # a game can hold n_steps records and no complete transition; the first update comes after one decision more
+        fewest = self.num_lanes * self.agent.n_steps
+        if self.learner.warmup_steps < fewest:
+            raise ConfigError(
+                f"learner.warmup_steps: got {self.learner.warmup_steps}, want at least {fewest}, which is "
+                f"agent.n_steps ({self.agent.n_steps}) for each of {self.num_lanes} games; with fewer decisions there "
+                "may be no complete transition to draw; raise it, or lower actors.num_actors or actors.games_per_actor"
             )
 
     def resolved_tasks(self) -> tuple[Task, ...]:

@@ -309,15 +309,17 @@ def records_per_task(spec: ReplaySpec, state: ReplayState) -> Int[Array, "num_ta
 def check_can_sample(spec: ReplaySpec, state: ReplayState) -> None:
     """Refuses, on the host, a replay without a complete transition. Waits for the device.
 
-    More than num_lanes * n_steps decisions always hold one.
+    More than num_lanes * n_steps decisions always hold one, unless streams broke off after their first record: a lane
+    without one is in its first episode and has at most n_steps records.
 
     Raises:
-        ValueError: there is nothing to draw.
+        ConfigError: there is nothing to draw.
     """
     if not float(sum_tree.total(state.tree)) > 0:
-        raise ValueError(
+        raise ConfigError(
             f"replay: no complete transition among {int(records_per_task(spec, state).sum())} records, nothing can be "
-            "drawn; raise learner.warmup_steps above (number of games) * agent.n_steps"
+            f"drawn; want learner.warmup_steps of at least {spec.num_lanes * spec.n_steps} ({spec.num_lanes} games "
+            f"times agent.n_steps {spec.n_steps}), and actors that do not die at the start of an episode"
         )
 
 

@@ -102,6 +102,12 @@ def test_reward_weights_are_one_field_in_every_form():
     assert config_from_dict(json.loads(json.dumps(saved))).env == run.env
 
 
+def test_the_fewest_warmup_decisions_are_n_steps_a_game():
+    flags = "--actors.num-actors 16 --actors.games-per-actor 4 --learner.warmup-steps"
+    assert parse([*flags.split(), "192"]).run.num_lanes == 64
+    assert parse([*flags.split(), "64", "--agent.n-steps", "1"]).run.num_lanes == 64
+
+
 def test_tasks_may_be_named():
     run = parse(["--tasks", "defend_the_center/gore", "defend_the_center/gore+mossy_bricks"]).run
     assert [t.id for t in run.resolved_tasks()] == ["defend_the_center/gore", "defend_the_center/gore+mossy_bricks"]
@@ -114,7 +120,10 @@ BAD = {
     "--learner.warmup-steps 20": "learner.batch_size: got 32, more than the 20 decisions",
     "--replay.capacity 70 --learner.warmup-steps 64": "replay.capacity: got 70, want at least",
     "--learner.learning-rate nan": "learner.learning_rate: got nan",
-    "--replay.num-newest 33": "replay.num_newest: got 33",
+    "--replay.num-newest 32": "replay.num_newest: got 32, want less than learner.batch_size 32",
+    "--actors.num-actors 16 --actors.games-per-actor 4 --learner.warmup-steps 191": (
+        "learner.warmup_steps: got 191, want at least 192, which is agent.n_steps (3) for each of 64 games"
+    ),
     "--tasks defend_the_center/gor": "gore",
     "--tasks defend_the_center/gore health_gathering/lava": "want one scenario",
     "--tasks defend_the_center/gore defend_the_center/gore": "one task twice",

@@ -80,7 +80,7 @@ def measure(run: TrainingRun, scale: float, slot: Slot, show: Show) -> Rates:
         job = RunJob(results=folder, run=endless, evaluation=many, scale=scale)
         directory = progress.run_directory(job.results, endless)
         # a full warm-up and replay would take minutes, and change no rate
-        small = ("--learner.warmup-steps", "256", "--replay.capacity", "16384", "--log.period-updates", "2")
+        small = ("--learner.warmup-steps", "2048", "--replay.capacity", "16384", "--log.period-updates", "2")
         train = Command(step="train", arguments=(*job.train_arguments(), *small), total=0)
         updates_per_s = _rate(job, train, slot, lambda: progress.last_update(directory), show)
         evaluate = Command(

@@ -20,8 +20,8 @@ MIN_UPDATES = 20
 MIN_EPISODES = 2
 MIN_CHECKPOINT_PERIOD_UPDATES = 1_000
 """nearer checkpoints are not worth their evaluation; but two there are always"""
-MIN_WARMUP_STEPS = 128
-"""four batches"""
+MIN_WARMUP_STEPS = 2_048
+"""three decisions in each of 682 games; a warm-up that depended on the machine could not be resumed on another"""
 MIN_TARGET_PERIOD_UPDATES = 10
 MIN_REPLAY_CAPACITY = 16_384
 """room for the games of some 500 actors; a capacity that depended on the machine could not be resumed on another"""

@@ -20,7 +20,7 @@ def test_a_tenth_has_a_tenth_of_updates_and_episodes_and_keeps_grid_and_checkpoi
     assert (tenth.total_updates, tenth.episodes, tenth.num_checkpoints, tenth.table_checkpoints) == (20_000, 10, 20, 5)
     assert len(tenth.runs()) == len(FULL.runs())
     settings = scaled_settings(load_config("rainbow_4task"), 20_000, 0.1)
-    assert settings["learner.warmup_steps"] == 1_000
+    assert settings["learner.warmup_steps"] == 2_048  # not below the floor
     assert settings["learner.target_period_updates"] == 300
     assert settings["agent.epsilon_decay_steps"] == 5_000
     assert settings["replay.capacity"] == 16_384  # not below the floor
@@ -38,7 +38,7 @@ def test_a_check_of_the_pipeline_has_one_scenario_one_task_a_level_two_checkpoin
     assert (check.total_updates, check.num_checkpoints, check.table_checkpoints, check.episodes) == (500, 2, 2, 2)
     settings = scaled_settings(load_config("rainbow_4task"), 500, 0.001)
     assert (settings["env.frame_height"], settings["agent.hidden_units"]) == (36, 32)
-    assert settings["learner.warmup_steps"] == 128
+    assert settings["learner.warmup_steps"] == 2_048
 
 
 def _last_two() -> list[str]:

@@ -14,6 +14,7 @@ from gvz.errors import ConfigError
 from gvz.transport.messages import StepBlock
 from learner import replay, sum_tree
 from learner.ingest import Ingest
+from learner.limiter import RateLimiter
 from learner.replay import ReplaySpec
 from tests.oracles import Record, ReplayOracle, play, step_block
 
@@ -269,8 +270,8 @@ def test_the_newest_transitions_stand_at_the_tail_of_the_batch():
 def test_an_empty_replay_refuses_to_be_sampled():
     replayed = Replay(make_spec())
     replayed.add([record(first=t == 0) for t in range(3)])
-    message = r"no complete transition among 3 records, nothing can be drawn; raise learner.warmup_steps above"
-    with pytest.raises(ValueError, match=message):
+    message = r"no complete transition among 3 records, nothing can be drawn; want learner.warmup_steps of at least 9"
+    with pytest.raises(ConfigError, match=message):
         replay.check_can_sample(replayed.spec, replayed.state)
     assert np.isnan(replayed.sample()[1].weights).all(), "inside a jit the weights must spoil the loss"
     replayed.add([record()])
@@ -288,6 +289,25 @@ def test_more_decisions_than_lanes_times_n_steps_always_hold_a_transition():
             if decisions > spec.num_lanes * spec.n_steps:
                 break
         replay.check_can_sample(replayed.spec, replayed.state)
+
+
+def test_the_smallest_warmup_that_is_accepted_ends_with_a_transition_and_may_not_be_smaller():
+    """The worst case: every game holds n_steps records, and any of them delivers the decision after them."""
+    spec = make_spec(num_lanes=4, capacity=400, n_steps=3)
+    smallest = spec.num_lanes * spec.n_steps
+    limiter = RateLimiter(0.001, smallest, 1)
+    for lane in range(spec.num_lanes):
+        replayed = Replay(spec)
+        replayed.add([record(other, first=t == 0) for other in range(spec.num_lanes) for t in range(spec.n_steps)])
+        with pytest.raises(ConfigError, match="no complete transition among 12 records"):
+            replay.check_can_sample(spec, replayed.state)
+        replayed.add([record(lane)])
+        replay.check_can_sample(spec, replayed.state)
+        assert np.isfinite(replayed.sample()[1].weights).all()
+    limiter.insert(smallest)
+    assert limiter.num_updates_allowed() == 0, "however little an update costs"
+    limiter.insert(1)
+    assert limiter.num_updates_allowed() > 0
 
 
 def test_memory_bill_is_exact():
