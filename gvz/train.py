@@ -102,6 +102,7 @@ class Trainer:
             NonFiniteError: the learner's numbers went wrong; the checkpoints before it stand.
             CheckpointError: the last checkpoint could not be written.
         """
+        self._monitor.look(self._counts, self._pool.statistics(), self._ingest.take_staleness)  # rates count from here
         try:
             with Watchdog("the learner", LONGEST_ROUND_S) as watchdog:
                 while self._counts.updates < self._config.learner.total_updates and not stop.requested:
@@ -170,6 +171,7 @@ class Trainer:
         if self._limiter.num_updates_allowed() < per_call:
             return
         if per_call not in self._train_steps:
+            replay.check_can_sample(self._parts.replay_spec, self._replay)
             self._train_steps[per_call] = train_step.make_train_step(
                 self._parts.agent, self._parts.replay_spec, self._config.learner, self._config.replay, per_call
             )
@@ -214,17 +216,25 @@ class Trainer:
     # ------------------------------------------------------------------- records, checkpoints, the end
 
     def _record(self) -> None:
-        """Counters -> panel; metrics -> records every log period, the only wait for the device."""
-        counts = self._counts
-        if counts.updates >= counts.logged_updates + self._config.log.period_updates:
-            counts.logged_updates = counts.updates
-            tasks = self._parts.pool_config.tasks
-            means, self._state = train_step.read_metrics(self._state, tasks, self._run.path)
-            stored = np.asarray(replay.records_per_task(self._parts.replay_spec, self._replay))
-            shares = dict(zip(tasks, (stored / stored.sum()).tolist(), strict=True))
-            self._monitor.log(counts, self._pool.statistics(), self._ingest.take_staleness(), means, shares)
+        """Counters -> panel; metrics -> records every log period and at the last update."""
+        counts, period = self._counts, self._config.log.period_updates
+        due = counts.updates // period > counts.logged_updates // period  # at its multiples, also after an interruption
+        if due or counts.updates == self._config.learner.total_updates:
+            self._record_row()
         elif counts.updates == 0:
             self._monitor.look(counts, self._pool.statistics(), self._ingest.take_staleness)
+
+    def _record_row(self) -> None:
+        """A row of what came since the last one, if anything did. Waits for the device."""
+        counts = self._counts
+        if counts.updates == counts.logged_updates:
+            return
+        counts.logged_updates = counts.updates
+        tasks = self._parts.pool_config.tasks
+        means, self._state = train_step.read_metrics(self._state, tasks, self._run.path)
+        stored = np.asarray(replay.records_per_task(self._parts.replay_spec, self._replay))
+        shares = dict(zip(tasks, (stored / stored.sum()).tolist(), strict=True))
+        self._monitor.log(counts, self._pool.statistics(), self._ingest.take_staleness(), means, shares)
 
     def _save(self) -> None:
         """Whole state -> checkpoint, every period; a failed one is reported and tried again."""
@@ -237,7 +247,10 @@ class Trainer:
             self._begin_save()
 
     def _save_last(self) -> None:
-        """The last checkpoint, waited for; if it fails it is tried once more.
+        """The last checkpoint, waited for; if it fails it is tried once more. Then the last row of metrics.
+
+        The row of an interrupted run stands after what its checkpoint vouches for: a resumed run sets it aside, and its
+        next row has the whole log period.
 
         Raises:
             CheckpointError: it failed again. WaitTimeoutError: the disk does not answer.
@@ -247,9 +260,11 @@ class Trainer:
         for attempt in range(3):
             if attempt > 0:
                 self._begin_save()
+                self._record_row()  # before the wait, which is no part of its rates
             self._checkpointer.wait()
             failure = self._report_save()
             if self._counts.saved_updates == self._counts.updates and not self._failed_saves:
+                self._record_row()
                 return
         newest = max(checkpoint_steps(self._run.checkpoints), default=0)
         raise CheckpointError(
