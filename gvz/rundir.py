@@ -21,6 +21,7 @@ from types import TracebackType
 from typing import Any
 
 from gvz.config import RunConfig, config_from_dict, config_to_dict, differences
+from gvz.durable import fsync
 from gvz.errors import ConfigError, GvzError, ResumeError
 
 RECORDS_SCHEMA = 1
@@ -96,10 +97,12 @@ class RunDir:
             )
 
     def write_config(self, config: RunConfig) -> None:
-        """Writes config.json atomically."""
+        """Writes config.json atomically: after a power cut too it is the old one or the new one."""
         temporary = self.path / "config.json.tmp"
         temporary.write_text(json.dumps(config_to_dict(config), indent=2) + "\n")
+        fsync(temporary)
         temporary.replace(self.path / "config.json")
+        fsync(self.path)
 
     def append(self, name: str, row: dict[str, Any]) -> None:
         """Adds a row to a record file. On a full disk rows wait in memory, and are written with the next one.
@@ -239,12 +242,3 @@ def read_records(file: Path) -> tuple[list[dict[str, Any]], list[str]]:
     except (OSError, EOFError, zlib.error) as error:
         problems.append(f"{file}, after {len(rows)} rows: cannot be read on ({error})")
     return rows, problems
-
-
-def fsync_directory(path: Path) -> None:
-    """Makes a rename inside `path` survive a power cut."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -4,8 +4,9 @@ learner.memory.
     checkpoints/<updates>/  arrays/ (orbax)  host.msgpack  manifest.json   the whole state, `keep` of them
     policies/<updates>/     the same, parameters only, never pruned         what evaluation reads
 
-Writing: snapshot to host memory now, write into a hidden sibling in a thread, hash every file into the manifest,
-fsync, rename. A directory without a manifest that agrees with its files is damaged and named, never used; nothing in
+Writing: snapshot to host memory now, write into a hidden sibling in a thread, hash every file into the manifest, fsync
+every file and directory, rename, fsync the parent. So a name without a dot stands for a whole checkpoint also after a
+power cut. A directory without a manifest that agrees with its files is damaged and named, never used; nothing in
 a checkpoint is unpickled, so one from a stranger can be read.
 """
 
@@ -25,6 +26,7 @@ import msgpack
 import numpy as np
 import orbax.checkpoint as ocp
 
+from gvz.durable import fsync, fsync_tree
 from gvz.errors import CheckpointError, WaitTimeoutError
 from learner.memory import release_freed_memory
 
@@ -118,13 +120,12 @@ def write(directory: Path, arrays: Any, host: dict[str, Any]) -> None:
             "leaves": _leaf_specs(arrays),
             "files": {str(f.relative_to(writing)): [f.stat().st_size, _digest(f)] for f in _files(writing)},
         }
-        with (writing / "manifest.json").open("w") as stream:
-            json.dump(manifest, stream)
-            stream.flush()
-            os.fsync(stream.fileno())
+        (writing / "manifest.json").write_text(json.dumps(manifest))
+        fsync_tree(writing)
         if directory.exists():
             shutil.rmtree(directory)
         writing.rename(directory)
+        fsync(directory.parent)
     except Exception as error:  # orbax and tensorstore raise many unrelated classes for one full disk
         shutil.rmtree(writing, ignore_errors=True)
         raise CheckpointError(
@@ -233,6 +234,7 @@ class Checkpointer:
         self._outcome: str | None = None
         for folder in (self._checkpoints, self._policies):
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        fsync(run_path)
         self._remove_unfinished()
 
     @property

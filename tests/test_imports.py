@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-TIER_0 = ("gvz", "gvz.errors", "gvz.janitor", "gvz.specs", "gvz.registry", "gvz.cache", "gvz.transport")
+TIER_0 = ("gvz", "gvz.errors", "gvz.janitor", "gvz.specs", "gvz.registry", "gvz.cache", "gvz.durable", "gvz.transport")
 TIER_3 = (
     "configs",
     "gvz.alarms",

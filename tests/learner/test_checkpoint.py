@@ -185,6 +185,39 @@ def test_a_failed_save_is_reported_and_leaves_the_old_checkpoint(tmp_path):
     assert checkpoint.checkpoint_steps(tmp_path / "checkpoints") == [1]
 
 
+def test_every_file_is_on_the_disk_before_the_rename_and_the_rename_before_the_end(tmp_path, monkeypatch):
+    """Else a power cut may leave a name that stands for a whole checkpoint, with files that are empty."""
+    done: list[tuple[str, str]] = []
+    fsync, rename = os.fsync, os.rename
+
+    def recorded_fsync(descriptor: int) -> None:
+        fsync(descriptor)
+        done.append(("fsync", str(Path(f"/proc/self/fd/{descriptor}").readlink())))
+
+    def recorded_rename(source: Path, target: Path) -> None:
+        rename(source, target)
+        done.append(("rename", str(target)))
+
+    monkeypatch.setattr(os, "fsync", recorded_fsync)
+    monkeypatch.setattr(os, "rename", recorded_rename)
+    save(tmp_path, 7)
+    for kind in ("policies", "checkpoints"):
+        final = tmp_path / kind / "7"
+        renamed = done.index(("rename", str(final)))
+        hidden = final.with_name(f".writing-7-{os.getpid()}")
+        synced = [
+            Path(path) for action, path in done[:renamed] if action == "fsync" and Path(path).is_relative_to(hidden)
+        ]
+        everything = [hidden / path.relative_to(final) for path in (final, *final.rglob("*"))]
+        assert len(everything) > 3
+        assert set(everything) <= set(synced)
+        for path in everything[1:]:
+            assert synced.index(path) < synced.index(path.parent), "what a directory names is there before the name is"
+        assert done[renamed + 1] == ("fsync", str(tmp_path / kind))
+    before = done.index(("fsync", str(tmp_path / "checkpoints")))
+    assert ("fsync", str(tmp_path)) in done[:before], "the folders themselves have their names"
+
+
 def test_what_a_killed_run_was_writing_is_removed(tmp_path):
     left = tmp_path / "checkpoints" / ".writing-5-123"
     left.mkdir(parents=True)
