@@ -5,16 +5,21 @@ import subprocess
 import sys
 import time
 
+import pytest
+
 from gvz.watchdog import Watchdog
 
 STUCK = """
-import threading, time
+import ctypes, threading, time
 from gvz.watchdog import Watchdog
 
 def wait_for_the_device():
     lock = threading.Lock()
     lock.acquire()
     lock.acquire()
+
+def hold_the_interpreter():
+    ctypes.PyDLL(None).sleep(600)
 
 with Watchdog("the learner", 1.0) as watchdog:
     print("begun", flush=True)
@@ -30,12 +35,21 @@ def begin(body: str) -> subprocess.Popen[str]:
     return process
 
 
-def test_a_stuck_process_is_ended_and_shows_where_it_hangs():
-    with begin("wait_for_the_device()") as process:
+@pytest.mark.parametrize("where", ["wait_for_the_device", "hold_the_interpreter"])
+def test_a_stuck_process_is_ended_and_shows_where_it_hangs(where):
+    """Also in C code that lets no other Python thread run."""
+    with begin(f"{where}()") as process:
         _, err = process.communicate(timeout=60)
-    assert process.returncode == 1
+    assert process.returncode == -signal.SIGVTALRM
     assert err.startswith("error: the learner gave no sign of life for 1 s and is ended; the stacks of its threads")
-    assert "in wait_for_the_device" in err
+    assert f"in {where}" in err
+
+
+def test_the_watchdog_of_a_killed_process_ends_with_it():
+    with begin("wait_for_the_device()") as process:
+        process.kill()
+        _, err = process.communicate(timeout=60)  # until nobody can write to it any more
+    assert err == ""
 
 
 def test_one_that_beats_is_left_alone():
