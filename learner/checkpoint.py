@@ -6,8 +6,10 @@ learner.memory.
 
 Writing: snapshot to host memory now, write into a hidden sibling in a thread, hash every file into the manifest, fsync
 every file and directory, rename, fsync the parent. So a name without a dot stands for a whole checkpoint also after a
-power cut. A directory without a manifest that agrees with its files is damaged and named, never used; nothing in
-a checkpoint is unpickled, so one from a stranger can be read.
+power cut. Hashing and fsync release the interpreter's lock: training goes on meanwhile.
+
+A directory without a manifest that agrees with its files is damaged and named, never used; nothing in a checkpoint is
+unpickled, so one from a stranger can be read.
 """
 
 import hashlib
