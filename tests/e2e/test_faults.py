@@ -184,7 +184,7 @@ def test_a_killed_launcher_takes_everything_along_and_the_doctor_cleans_up_after
     for engine in engines(dead)[:2]:
         engine.suspend()
     children = descendants(dead)
-    assert len(children) == 6
+    assert len(children) == 7  # 2 actors, 4 engines, the watchdog
     kill_and_wait(dead, children)
 
     monkeypatch.setattr(doctor, "CHECKS", (doctor.check_leftovers,))
