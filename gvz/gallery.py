@@ -50,15 +50,16 @@ class Moment:
     """None: as the episode starts"""
 
 
-# Found by a search over seeds, poses and tics for enemies, kits or missiles in sight in every task of the map.
+# Found by a search over seeds, poses and tics for frames that show what every attribute of the map's tasks changes;
+# tests/test_gallery.py says what has to be in sight.
 MOMENTS: Mapping[tuple[str, str], Moment] = {
     ("defend_the_center", "defend_the_center.wad"): Moment(seed=4, tics=100, pose=Pose(0, 0, 40)),
-    ("dodge_projectiles", "defend_the_line.wad"): Moment(seed=8, tics=78),
-    ("health_gathering", "health_gathering.wad"): Moment(seed=7, tics=20, pose=Pose(608, 608, 0)),
-    ("health_gathering", "health_gathering_supreme.wad"): Moment(seed=3, tics=20, pose=Pose(640, 1100, 270)),
+    ("dodge_projectiles", "defend_the_line.wad"): Moment(seed=8, tics=80, pose=Pose(-480, 160, 0)),
+    ("health_gathering", "health_gathering.wad"): Moment(seed=7, tics=20, pose=Pose(672, 608, 30)),
+    ("health_gathering", "health_gathering_supreme.wad"): Moment(seed=196, tics=20, pose=Pose(1376, 928, 240)),
     ("seek_and_kill", "health_gathering_supreme.wad"): Moment(seed=5, tics=2, pose=Pose(700, 1100, 180)),
 }
-"""(scenario, base map) -> moment; what is not here has `Moment()`"""
+"""(scenario, base map) -> moment"""
 
 MOVING: Mapping[str, tuple[int, tuple[str, ...]]] = {
     "defend_the_center": (32, ("default", "stone_wall", "gore+mossy_bricks", "fast+resized+gore", "complete")),
@@ -70,16 +71,21 @@ MOVING: Mapping[str, tuple[int, tuple[str, ...]]] = {
 
 
 def task_frame(task: Task) -> np.ndarray:
-    """What the agent sees in a task at its scenario's moment.
+    """What the agent sees in a task at its map's moment: uint8[FRAME_HEIGHT, FRAME_WIDTH, 3]."""
+    return task_sight(task)[0]
 
-    Returns: uint8[FRAME_HEIGHT, FRAME_WIDTH, 3].
+
+def task_sight(task: Task, moment: Moment | None = None) -> tuple[np.ndarray, dict[str, int]]:
+    """What the agent sees in a task at a moment, by default that of the task's map.
+
+    Returns: the screen, uint8[FRAME_HEIGHT, FRAME_WIDTH, 3]; and the pixels that each class of things takes of it.
 
     Raises:
         EngineError: the engine failed.
     """
     base_wad = task_content(task, "thesis").base_wad
     assert base_wad is not None, "every task has a map"
-    moment = MOMENTS.get((task.scenario.id, base_wad), Moment())
+    moment = MOMENTS[task.scenario.id, base_wad] if moment is None else moment
     compiled = compile_task(task)
     ensure_loads(compiled.wad_path, compiled.map_name)
     engine = Engine(
@@ -91,6 +97,7 @@ def task_frame(task: Task) -> np.ndarray:
             width=FRAME_WIDTH,
             height=FRAME_HEIGHT,
             render_weapon=task.scenario.render_weapon,
+            labels=True,
             start_tic=10,
         )
     )
@@ -101,7 +108,13 @@ def task_frame(task: Task) -> np.ndarray:
             engine.command(f"warp {pose.x:g} {pose.y:g}")
             engine.advance([engine.variables()[0] - pose.angle], 1)
             engine.advance([0], 1)
-        return engine.screen.copy()
+        state = engine.state()
+        assert state is not None, "the agent lives"
+        assert state.labels is not None
+        pixels = dict.fromkeys((label.object_name for label in state.labels), 0)
+        for label in state.labels:
+            pixels[label.object_name] += int(np.count_nonzero(state.labels_buffer == label.value))
+        return engine.screen.copy(), pixels
     finally:
         engine.close()
 

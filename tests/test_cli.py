@@ -70,7 +70,7 @@ def test_tasks_prints_a_table(capsys):
     assert len(lines) == 7
     assert lines[0].split() == ["2", "test", "seek_and_kill/blue+shadows"]
     assert lines[-1].split() == [
-        *("4", "test", "seek_and_kill/complete", "=", "blue+mixed_enemies+obstacles+resized_enemies+shadows")
+        *("4", "test", "seek_and_kill/complete", "=", "mixed_enemies+obstacles+red+resized_enemies+shadows")
     ]
     assert {len(line) > 80 for line in lines[:-1]} == {False}
 

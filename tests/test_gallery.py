@@ -14,13 +14,60 @@ from gvz.gallery import (
     MOVING,
     scripted_frames,
     task_frame,
+    task_sight,
     tiled,
     write_contact_sheet,
 )
+from gvz.scenarios.base import Task
 from gvz.scenarios.compiler import task_content
 from gvz.tasks import named_tasks, parse_task, scenarios
 
 IMAGES = Path(__file__).parent.parent / "docs" / "images"
+
+KITS, COLUMNS_AND_TORCHES = "Medikit CustomMedikit", "HeartColumn TallGreenColumn TallRedColumn BlueTorch GreenTorch"
+STRONG = "Arachnotron Fatso PainElemental Archvile Revenant"
+SHOWN = {
+    "gore": (("HeadCandles HeadsOnAStick LiveStick", 100),),
+    "flying_enemies": (("LostSoul", 60),),
+    "obstacles": ((COLUMNS_AND_TORCHES, 100),),
+    "stimpacks": (("Stimpack", 80), (KITS, 80)),
+    "poison": (("Poison", 40),),
+    "mixed_enemies": (("Zombieman MarineChainsawVzd DoomImp Cacodemon LostSoul", 300),),
+    "invulnerable": ((STRONG, 300),),
+    "flaming_skulls": (("FloatingSkull", 1000),),
+    "mancubus": (("Fatso", 100), ("FatShot", 40)),
+    "barons": (("BaronOfHell", 100), ("BaronBall", 10)),
+    "cacodemons": (("Cacodemon", 200), ("CacodemonBall", 20)),
+    "revenants": (("Revenant", 100), ("RevenantTracer", 40)),
+    "arachnotron": (("Arachnotron", 50), ("ArachnotronPlasma", 40)),
+    "revenants_and_arachnotron": (("Revenant", 80), ("Arachnotron", 50), ("RevenantTracer", 40)),
+}
+"""attribute -> (classes of things, pixels that they take at least of a tile)"""
+ENEMIES = {
+    "defend_the_center": ("Demon MarineChainsawVzd", 150),
+    "health_gathering": (KITS, 150),
+    "seek_and_kill": ("Demon", 300),
+    "dodge_projectiles": ("DoomImp", 200),
+}
+"""what a task shows whose attributes change no kind of thing"""
+
+
+def shown(task: Task) -> list[tuple[str, int]]:
+    """What a task's tile has to show."""
+    if task.id == "health_gathering/complete":  # shaded: a small kit would not be seen
+        return [(KITS, 2000), *SHOWN["poison"], *SHOWN["obstacles"]]
+    kinds = {a.name for a in task.scenario.attributes if "entity_type" in a.groups}
+    things = [] if kinds & set(task.attributes) else [ENEMIES[task.scenario.id]]
+    return things + [thing for name in task.attributes for thing in SHOWN.get(name, ())]
+
+
+def tiles() -> list:
+    """Every named task; those of one engine start each that hid something before are not left to the slow lane."""
+    found = []
+    for task in named_tasks():
+        hid = {"stimpacks", "arachnotron"} & set(task.attributes) or task.id == "health_gathering/complete"
+        found.append(pytest.param(task, id=task.id, marks=() if hid else pytest.mark.slow))
+    return found
 
 
 def test_every_map_has_its_moment():
@@ -53,6 +100,14 @@ def test_a_frame_is_the_same_each_time_and_differs_from_task_to_task():
     np.testing.assert_array_equal(default, again)
     changed = (default != gore).any(axis=-1).mean()
     assert 0.001 < changed < 0.1  # decorations only: walls, floor, HUD are where they were, so the pose is the same
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("task", tiles())
+def test_a_tile_shows_what_the_attributes_change(task):
+    _, pixels = task_sight(task)
+    for classes, least in shown(task):
+        assert sum(pixels.get(name, 0) for name in classes.split()) >= least, (classes, pixels)
 
 
 @pytest.mark.engine

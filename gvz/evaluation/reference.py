@@ -3,7 +3,7 @@
     python -m gvz.evaluation.reference [RECORDS ...]
 
 packs record files of `gvz evaluate` into results/reference/ (if any are given) and writes the tables anew from what is
-there. Imports numpy, gvz.evaluation.{metrics,play}, gvz.rundir, gvz.tasks.
+there. Imports numpy, gvz.evaluation.{metrics,play}, gvz.experiments, gvz.rundir, gvz.tasks.
 """
 
 import gzip
@@ -19,6 +19,7 @@ import numpy as np
 from gvz.errors import ConfigError
 from gvz.evaluation.metrics import Estimate, bootstrap, mean
 from gvz.evaluation.play import Row
+from gvz.experiments.base import experiment_named
 from gvz.rundir import RECORDS_SCHEMA, read_records
 from gvz.scenarios.base import Scenario, Task
 from gvz.tasks import named_tasks, scenarios
@@ -88,12 +89,25 @@ def estimate(scores: Scores, player: str, tasks: Sequence[Task], column: str = "
 
 def tables(scores: Scores) -> str:
     """All tables as Markdown."""
-    parts = [_level_table(scores)]
+    parts = [_test_table(scores), _level_table(scores)]
     for scenario in scenarios().values():
         parts.append(_task_table(scores, scenario))
         if scenario.metric == "kills":
             parts.append(_own_kills_table(scores, scenario))
     return "\n\n".join(parts)
+
+
+def _test_table(scores: Scores) -> str:
+    """Percent of the upper bound on the test tasks of each scenario, beside the thesis's agent."""
+    head = ["scenario", *PLAYERS, "thesis: Rainbow, 4 training tasks"]
+    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
+    published = experiment_named("training_set_size").published["thesis"]
+    for scenario in scenarios().values():
+        tasks, scale = named_tasks(scenario.id, split="test"), 100 / scenario.upper_bound("thesis")
+        cells = [str(estimate(scores, player, tasks, scale=scale)) for player in PLAYERS]
+        lines.append(f"| {scenario.title} | {' | '.join(cells)} | {published[scenario.id][1]:.2f} |")
+    title = "Percent of the upper bound on the test set: mean over its 7 tasks [95% interval]; thesis Table 5.4."
+    return "\n".join([title, "", *lines])
 
 
 def _level_table(scores: Scores) -> str:
