@@ -93,7 +93,7 @@ def test_a_run_by_the_thesis_recipe_acts_at_random_in_warm_up_and_by_its_agent_f
         warm_up += np.bincount(decisions[:290], minlength=3)
         assert len(decisions) > 350
         assert len(set(decisions[310:])) == 1
-    assert stats.chisquare(warm_up).pvalue > 0.001
+    assert stats.chisquare(warm_up).pvalue > 0.001  # 0.13, the same on every machine: the keys draw integers
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
