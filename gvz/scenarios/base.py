@@ -12,8 +12,8 @@ from types import MappingProxyType
 from typing import Literal
 
 from gvz.errors import TaskError
-from gvz.scenarios.rewards import Reward, Rewarder, check_weights
-from gvz.specs import Profile
+from gvz.scenarios.rewards import Reward, Rewarder, check_weights, return_range
+from gvz.specs import EnvConfig, Profile
 from gvz.wad.udmf import UdmfMap
 
 
@@ -159,8 +159,6 @@ class Scenario:
     upper_bounds: Mapping[Profile, float]
     """best possible score"""
     rewards: Mapping[str, Reward]
-    return_range: Callable[[float], tuple[float, float]]
-    """f(discount) -> (v_min, v_max): range of discounted returns with the default weights"""
 
     def __hash__(self) -> int:
         return hash(self.id)  # the other fields hold mappings
@@ -200,6 +198,19 @@ class Scenario:
     def make_rewarder(self, weights: Mapping[str, float] | None = None, profile: Profile = "thesis") -> Rewarder:
         """A rewarder for one game, with `reward_weights(weights, profile)`; raises as that does."""
         return Rewarder({n: r.event for n, r in self.rewards.items()}, self.reward_weights(weights, profile))
+
+    def return_range(self, env: EnvConfig, discount: float) -> tuple[float, float]:
+        """(v_min, v_max): the range of discounted returns in this scenario's tasks.
+
+        Args:
+            env: its profile, frame skip and reward weights.
+            discount: of one decision.
+
+        Raises:
+            ConfigError: a weight whose name is no component's.
+        """
+        weights = self.reward_weights(dict(env.reward_weights), env.profile)
+        return return_range(self.rewards, weights, env, discount)
 
     def attribute(self, name: str) -> Attribute:
         """The attribute called `name`, or by that alias.

@@ -12,7 +12,7 @@ Attributes: thesis B.1, below. `complete` takes mossy_bricks for its textures. T
 """
 
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform, words
-from gvz.scenarios.rewards import Fell, Reward, Rose, death
+from gvz.scenarios.rewards import Fell, Pace, Reward, Rose, death
 
 WAD = "defend_the_center.wad"
 
@@ -93,22 +93,6 @@ def _gore() -> tuple[Thing, ...]:
         29: ((224, 416), (480, -224), (-128, -608), (-352, 416), (-608, -128)),  # candles and skulls
     }
     return tuple(Thing(kind, x, y) for kind, spots in places.items() for x, y in spots)
-
-
-def return_range(discount: float) -> tuple[float, float]:
-    """Range of discounted returns, per decision of four tics.
-
-    Upper: an enemy a shot (1 - 0.1) with every one of 26 bullets, as fast as enemies come back: five in 90 tics,
-    that is one in 18 tics or 4.5 decisions (a held trigger fires every 14). Lower: a whole clip of misses on the
-    way (-0.1 each) and dying under blows that come at every other decision. A blow takes 10 of 100 health on
-    average; with damage factor 0.3 (fast_enemies) that is some 33 blows of -0.2, then -1.
-    """
-    per_shot = discount**4.5
-    high = sum(0.9 * per_shot**shot for shot in range(26))
-    blows, misses = 33, 26
-    low = -sum(0.2 * discount ** (2 * blow) for blow in range(blows)) - discount ** (2 * blows)
-    low -= sum(0.1 * per_shot**shot for shot in range(misses))
-    return low, high
 
 
 SCENARIO = Scenario(
@@ -213,11 +197,25 @@ SCENARIO = Scenario(
     timeouts={"thesis": 1100, "levdoom": 2100},
     upper_bounds={"thesis": 1100, "levdoom": 2100},
     rewards={
-        "kill": Reward(event=Rose("KILLCOUNT"), weight=1.0, levdoom=1.0),
-        "player_kill": Reward(event=Rose("PLAYER_KILLS"), weight=0.0, levdoom=0.0),
-        "death": Reward(event=death, weight=-1.0, levdoom=0.0),
-        "ammo_spent": Reward(event=Fell("AMMO2"), weight=-0.1, levdoom=-0.01),
-        "health_lost": Reward(event=Fell("HEALTH"), weight=-0.2, levdoom=-0.01),
+        # A kill costs a bullet. Five enemies are back 90 tics after their deaths: one in 18 tics.
+        "kill": Reward(
+            event=Rose("KILLCOUNT"),
+            weight=1.0,
+            levdoom=1.0,
+            paces=(Pace(tics=6, times=2, needs="ammo_spent"), Pace(tics=20, times=24, needs="ammo_spent")),
+        ),
+        "player_kill": Reward(
+            event=Rose("PLAYER_KILLS"),
+            weight=0.0,
+            levdoom=0.0,
+            paces=(Pace(tics=6, times=2), Pace(tics=20, times=24)),
+        ),
+        "death": Reward(event=death, weight=-1.0, levdoom=0.0, paces=(Pace(times=1),)),
+        # A held trigger fires every 14 tics. Decisions of four tics round that down now and then.
+        "ammo_spent": Reward(event=Fell("AMMO2"), weight=-0.1, levdoom=-0.01, paces=(Pace(tics=13, times=26),)),
+        # Five enemies strike, each blow weakened by the damage factor of fast_enemies.
+        "health_lost": Reward(
+            event=Fell("HEALTH"), weight=-0.2, levdoom=-0.01, paces=(Pace(tics=2, times=4), Pace(tics=5, times=32))
+        ),
     },
-    return_range=return_range,
 )

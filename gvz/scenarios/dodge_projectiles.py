@@ -15,7 +15,7 @@ Differs: the enemies have their normal health, as in the author's maps; nobody h
 """
 
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform, Value, words
-from gvz.scenarios.rewards import Fell, Reward, living
+from gvz.scenarios.rewards import Fell, Pace, Reward, living
 from gvz.wad.udmf import UdmfMap
 
 WAD = "defend_the_line.wad"
@@ -101,16 +101,6 @@ def _enemies(
 
 SKULLS = ((-192, 416), (-224, 320), (-256, 256), (-288, 96), (-288, 480), (-320, 192), (-288, 384))
 """floating skulls (editor number 42); missiles pass over them"""
-
-
-def return_range(discount: float) -> tuple[float, float]:
-    """Range of discounted returns, per decision of four tics.
-
-    Upper: 0.01 for ever, unhurt. Lower: 25 hits of -1, one every fourth decision: an agent that stands still dies
-    after some 100 decisions at the earliest under weak hits (5 of 100 health: Arachnotron) and after some 60
-    under 11 harder ones (Imps).
-    """
-    return -sum(discount ** (4 * hit) for hit in range(25)), 0.01 / (1 - discount)
 
 
 SCENARIO = Scenario(
@@ -200,7 +190,13 @@ SCENARIO = Scenario(
     upper_bounds={"thesis": 2100, "levdoom": 2100},
     rewards={
         "living": Reward(event=living, weight=0.01, levdoom=0.0),
-        "health_lost": Reward(event=Fell("HEALTH"), weight=-1.0, levdoom=-0.1),
+        # The Arachnotron's hits are the most and the weakest. The agent stands still.
+        "health_lost": Reward(
+            event=Fell("HEALTH"),
+            weight=-1.0,
+            levdoom=-0.1,
+            paces=(Pace(tics=2, times=3), Pace(tics=10, times=10), Pace(tics=16, times=12)),
+            levdoom_paces=(Pace(tics=2, times=4), Pace(tics=10, times=16), Pace(tics=14, times=16)),
+        ),
     },
-    return_range=return_range,
 )

@@ -12,7 +12,7 @@ Attributes: thesis B.2, below. `complete` takes water for its textures. Tasks: t
 """
 
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform, words
-from gvz.scenarios.rewards import Reward, Rose, death, living
+from gvz.scenarios.rewards import Pace, Reward, Rose, death, living
 
 WAD = "health_gathering.wad"
 SUPREME_WAD = "health_gathering_supreme.wad"
@@ -163,17 +163,6 @@ OBSTACLES = {
     },
 }
 """base map -> editor number (green column, red column, heart column) -> places"""
-
-
-def return_range(discount: float) -> tuple[float, float]:
-    """Range of discounted returns, per decision of four tics.
-
-    Upper: 0.01 for ever, and a kit (+1) whenever it can heal: nine stimpacks, 4 decisions apart, to recover from
-    near death, then one for each blow of the floor, every 8 decisions. Lower: four vials (-1 each) and death.
-    """
-    burst = sum(discount ** (4 * kit) for kit in range(9))
-    sustained = discount**36 / (1 - discount**8)
-    return -5.0, 0.01 / (1 - discount) + burst + sustained
 
 
 SCENARIO = Scenario(
@@ -338,9 +327,20 @@ SCENARIO = Scenario(
     upper_bounds={"thesis": 2100, "levdoom": 2100},
     rewards={
         "living": Reward(event=living, weight=0.01, levdoom=-0.01),
-        "death": Reward(event=death, weight=-1.0, levdoom=0.0),
-        "poison_taken": Reward(event=Rose("POISONS_TAKEN"), weight=-1.0, levdoom=0.0),
-        "health_gained": Reward(event=Rose("HEALTH"), weight=1.0, levdoom=1.0),
+        "death": Reward(event=death, weight=-1.0, levdoom=0.0, paces=(Pace(times=1),)),
+        # The fourth vial kills an agent that was not healed meanwhile. A new vial comes every 30 tics.
+        "poison_taken": Reward(
+            event=Rose("POISONS_TAKEN"),
+            weight=-1.0,
+            levdoom=0.0,
+            paces=(Pace(times=4), Pace(tics=30, needs="health_gained")),
+        ),
+        # Two kits lie together; stimpacks heal from near death to full health; then a kit for each blow of the floor.
+        "health_gained": Reward(
+            event=Rose("HEALTH"),
+            weight=1.0,
+            levdoom=1.0,
+            paces=(Pace(tics=4, times=2), Pace(tics=16, times=6), Pace(tics=32)),
+        ),
     },
-    return_range=return_range,
 )

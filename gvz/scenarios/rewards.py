@@ -1,5 +1,6 @@
 """Rewards as named events of one decision, each with a weight. Imports tier 0."""
 
+import math
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -7,7 +8,7 @@ from difflib import get_close_matches
 from typing import Any
 
 from gvz.errors import ConfigError
-from gvz.specs import typed
+from gvz.specs import EnvConfig, typed
 
 Variables = Mapping[str, float]
 """What the game says after a decision: name of a game or bookkeeping variable -> value."""
@@ -22,15 +23,42 @@ decision ago, back to the start of the episode or HISTORY_STEPS decisions, which
 HISTORY_STEPS = 5
 """decisions an event can look back (eq. 3.5 needs five)"""
 
+_EDGE_SHARE = 0.05
+"""part of a range of returns that lies on either side of 0, at least; more than what alarms call its edge"""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Pace:
+    """How often an event can come, for a while."""
+
+    tics: float = 1.0
+    """game tics from one to the next, at least"""
+    times: float = math.inf
+    """how often it comes before the next pace holds"""
+    amount: float = 1.0
+    """of each"""
+    needs: str | None = None
+    """another component, whose event comes with each of these: a kill costs a bullet"""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Reward:
-    """One component of a scenario's reward: an event and what it is worth."""
+    """One component of a scenario's reward: an event, what it is worth, and how often it can come.
+
+    The paces follow one another, from any decision on. Together they are the most that a player gets of the event, in
+    all tasks: the game's rules where they set a limit, else what was measured and some ten percent.
+    """
 
     event: Event
     weight: float
     levdoom: float
     """the weight in profile levdoom"""
+    paces: tuple[Pace, ...] = (Pace(),)
+    """default: once a decision, without end"""
+    levdoom_paces: tuple[Pace, ...] | None = None
+    """the paces in profile levdoom, where they differ"""
+    adds_up: bool = False
+    """what comes in one decision adds up (a distance); else the event counts once in a decision"""
 
 
 def living(_history: Sequence[Variables], _terminated: bool) -> float:
@@ -118,3 +146,40 @@ class Rewarder:
         self._history.append(variables)
         history = self._history  # "0.0 +" keeps negative zeros out of the logs
         return {name: 0.0 + weight * event(history, terminated) for name, weight, event in self._terms}
+
+
+def return_range(
+    rewards: Mapping[str, Reward], weights: Mapping[str, float], env: EnvConfig, discount: float
+) -> tuple[float, float]:
+    """The range of discounted returns of a scenario, from how often its events can come.
+
+    Each component adds the most that its event can bring: to the upper end if it pays, else to the lower one. So the
+    upper end is the return of a player who gets all that pays at its full pace, and nothing that costs.
+
+    A time-out ends no return: it is a truncation, and learners bootstrap from the frame after it. 0 is inside the range
+    and not at its end, because it is the return of an episode without events.
+
+    Args:
+        rewards: the components.
+        weights: component -> weight, for all of them.
+        env: its profile and frame skip.
+        discount: of one decision, 0 <= discount < 1.
+
+    Returns:
+        (v_min, v_max); equal if all weights are 0.
+    """
+    low = high = 0.0
+    for name, reward in rewards.items():
+        start = 0.0  # decisions from now to the first event of this pace
+        paces = reward.levdoom_paces if env.profile == "levdoom" else None
+        for pace in reward.paces if paces is None else paces:
+            apart = max(1.0, pace.tics / env.frame_skip)  # decisions from one event to the next
+            merged = apart * env.frame_skip / pace.tics if reward.adds_up else 1.0  # events in one decision
+            duration = apart * pace.times / merged
+            amount = pace.amount * merged * discount**start * (1 - discount**duration) / (1 - discount**apart)
+            start += duration
+            worth, also = weights[name], 0.0 if pace.needs is None else weights[pace.needs]
+            low += amount * min(0.0, worth + max(0.0, also))
+            high += amount * max(0.0, worth + min(0.0, also))
+    edge = _EDGE_SHARE * (high - low)
+    return min(low, -edge), max(high, edge)

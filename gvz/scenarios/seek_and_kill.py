@@ -16,7 +16,7 @@ Known: about one enemy in a hundred appears in the walled-off notch at the map's
 """
 
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform, words
-from gvz.scenarios.rewards import Fell, Reward, Rose, death, living, moved
+from gvz.scenarios.rewards import HISTORY_STEPS, Fell, Pace, Reward, Rose, death, living, moved
 from gvz.wad.udmf import UdmfMap
 
 WAD = "health_gathering_supreme.wad"
@@ -154,26 +154,14 @@ TORCHES = {
 MIXED = ("ZombieMan", "MarineChainsawVzd", "DoomImp", "Cacodemon", "LostSoul")
 STRONG = ("Arachnotron", "Fatso", "PainElemental", "Archvile", "Revenant")
 
+KILLS = (Pace(tics=4, times=3), Pace(tics=12, times=3), Pace(tics=36))
+"""Enemies that stand together die first, then as many as come: five in 180 tics. Most of them kill each other."""
+
 
 def drain_acid(maze: UdmfMap) -> None:
     """Makes the floor harmless."""
     for sector in maze.sectors:
         del sector["special"]
-
-
-def return_range(discount: float) -> tuple[float, float]:
-    """Range of discounted returns, per decision of four tics.
-
-    Upper: walking at 8.33 units a tic, 167 in five decisions, for ever (0.83 each, the bulk of it) for the two
-    thirds of the time that walls leave, and a kill (1 - 0.1) every 15 decisions, 20 in an episode. Lower:
-    standing still (-0.01), 28 misses in 98 decisions, the pistol's rate (-0.1 each), and dying of 15 hits (-0.3
-    each, then -1).
-    """
-    walking = (2 / 3 * 0.005 * 20 * 25 / 3 - 0.01) / (1 - discount)
-    kills = sum(0.9 * discount ** (15 * kill) for kill in range(20))
-    hits = sum(0.3 * discount ** (2 * hit) for hit in range(15)) + discount**30
-    misses = sum(0.1 * discount ** (3.5 * shot) for shot in range(28))
-    return -0.01 / (1 - discount) - misses - hits, walking + kills
 
 
 SCENARIO = Scenario(
@@ -280,13 +268,27 @@ SCENARIO = Scenario(
     timeouts={"thesis": 1200, "levdoom": 1250},
     upper_bounds={"thesis": 20, "levdoom": 20},
     rewards={
-        "kill": Reward(event=Rose("KILLCOUNT"), weight=1.0, levdoom=1.0),
-        "player_kill": Reward(event=Rose("PLAYER_KILLS"), weight=0.0, levdoom=0.0),
-        "death": Reward(event=death, weight=-1.0, levdoom=0.0),
-        "ammo_spent": Reward(event=Fell("AMMO2"), weight=-0.1, levdoom=0.0),
+        "kill": Reward(event=Rose("KILLCOUNT"), weight=1.0, levdoom=1.0, paces=KILLS),
+        "player_kill": Reward(event=Rose("PLAYER_KILLS"), weight=0.0, levdoom=0.0, paces=KILLS),
+        "death": Reward(event=death, weight=-1.0, levdoom=0.0, paces=(Pace(times=1),)),
+        # A held trigger fires every 14 tics. Decisions of four tics round that down now and then.
+        "ammo_spent": Reward(event=Fell("AMMO2"), weight=-0.1, levdoom=0.0, paces=(Pace(tics=13, times=200),)),
         "living": Reward(event=living, weight=-0.01, levdoom=0.0),
-        "health_lost": Reward(event=Fell("HEALTH"), weight=-0.3, levdoom=0.0),
-        "moved": Reward(event=moved, weight=0.005, levdoom=0.001),
+        "health_lost": Reward(
+            event=Fell("HEALTH"), weight=-0.3, levdoom=0.0, paces=(Pace(tics=3, times=5), Pace(tics=16, times=10))
+        ),
+        # Map units a tic, each counted by five decisions: 22 while blows push the agent, 25 / 3 along a passage, and
+        # half of that between walls in the long run.
+        "moved": Reward(
+            event=moved,
+            weight=0.005,
+            levdoom=0.001,
+            paces=(
+                Pace(times=12, amount=HISTORY_STEPS * 22),
+                Pace(times=100, amount=HISTORY_STEPS * 25 / 3),
+                Pace(amount=HISTORY_STEPS * 25 / 6),
+            ),
+            adds_up=True,
+        ),
     },
-    return_range=return_range,
 )

@@ -123,6 +123,14 @@ def test_a_run_cannot_play_another_scenario_unless_its_buttons_are_unified():
     check_tasks(dataclasses.replace(CONFIG, env=EnvConfig(action_set="unified")), tasks)
 
 
+def test_the_support_of_a_run_follows_from_how_its_games_are_played():
+    scenario = CONFIG.resolved_scenario()
+    for changes in ({}, {"frame_skip": 8}, {"profile": "levdoom"}, {"reward_weights": (("kill", 3.0),)}):
+        env = dataclasses.replace(CONFIG.env, **changes)
+        spec = run_agent(dataclasses.replace(CONFIG, env=env)).spec
+        assert (spec.v_min, spec.v_max) == scenario.return_range(env, CONFIG.agent.discount)
+
+
 def test_the_reward_weights_of_a_run_are_shown_in_its_own_scenario_alone(run):
     env = EnvConfig(action_set="unified", reward_weights=(("kill", 2.0),))
     config = dataclasses.replace(CONFIG, env=env)
