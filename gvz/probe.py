@@ -14,17 +14,21 @@ import time
 import zlib
 from importlib.metadata import version
 from pathlib import Path
+from typing import NoReturn
 
 from gvz import janitor
 from gvz.engine import Engine, EngineConfig
 from gvz.engine_process import log_tail, one_of
 from gvz.errors import EngineError, WadError
 from gvz.wad.lumps import read_wad
+from gvz.wad.stock import engine_directory
 
 _FAULTS = re.compile(
     r"unknown|tried to register|script error|runaway script|no map|not found|execution could not continue", re.I
 )
 """what ZDoom prints, and then goes on as if nothing was wrong"""
+_SCRIPT_ERROR = "Script error"
+_ALONE_S = 20.0
 _MEMORY_BYTES = 4 * 2**30
 _TICS = 70
 _NUM_PLACES = 8
@@ -60,12 +64,33 @@ def probe_wad(wad: Path, map_name: str = "MAP01", timeout_s: float = 60.0) -> st
         finally:
             janitor.clean_dead_instances()  # a crashed client cleans up nothing
         text = log.read_text(errors="replace") if log.exists() else ""
-        faults = [line for line in text.splitlines() if _FAULTS.search(line)]
+        faults = _faults(text)
+        if done.returncode < 0 and not faults:
+            faults = _faults(_output_of_engine_alone(command))
         if done.returncode != 0 or faults:
             what = f"the engine crashed (exit code {done.returncode})" if done.returncode < 0 else "cannot be played"
-            lines = faults[:8] or done.stderr.strip().splitlines()[-1:]
+            lines = faults[:8] or done.stderr.strip().splitlines()[-1:] or ["it does not say why"]
             raise EngineError(f"{wad}: {what}: {'; '.join(lines)}{log_tail(log)}")
         return text
+
+
+def _faults(text: str) -> list[str]:
+    """The lines of an engine's output that tell of a fault; the cause of a script error is in the next line."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    before = ["", *lines]
+    return [line for last, line in zip(before, lines, strict=False) if _FAULTS.search(line) or _SCRIPT_ERROR in last]
+
+
+def _output_of_engine_alone(command: list[str]) -> str:
+    """What the engine prints when no client starts it: one that ends while it starts is killed with its client, which
+    crashes, often before it has printed the cause.
+    """
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        done = subprocess.run(
+            [*command, "alone"], stdin=subprocess.DEVNULL, capture_output=True, timeout=_ALONE_S, check=False
+        )
+        return (done.stdout + done.stderr).decode(errors="replace")
+    return ""
 
 
 def ensure_loads(wad: Path, map_name: str = "MAP01", timeout_s: float = 60.0) -> None:
@@ -85,11 +110,13 @@ def ensure_loads(wad: Path, map_name: str = "MAP01", timeout_s: float = 60.0) ->
                 marker.touch()
 
 
-def _main(parent_pid: int, wad: str, map_name: str, log: str, timeout_s: float) -> None:
+def _main(parent_pid: int, wad: str, map_name: str, log: str, timeout_s: float, alone: bool) -> None:
     janitor.die_with_parent(parent_pid)
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_CPU, (int(timeout_s) + 1, int(timeout_s) + 1))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    if alone:
+        _become_engine(Path(wad).resolve(), Path(log).parent)
     config = EngineConfig(
         wad=Path(wad), map_name=map_name, buttons=(), variables=(), log=Path(log), step_timeout_s=timeout_s / 4
     )
@@ -103,5 +130,15 @@ def _main(parent_pid: int, wad: str, map_name: str, log: str, timeout_s: float) 
         engine.close()
 
 
+def _become_engine(wad: Path, directory: Path) -> NoReturn:
+    """Replaces this process by an engine that loads everything there is in a file, plays nothing and ends."""
+    os.chdir(directory)
+    os.environ["HOME"] = str(directory)
+    engine, resources = engine_directory() / "vizdoom", engine_directory() / "freedoom2.wad"
+    hidden = ("+viz_window_hidden", "1", "+viz_noxserver", "1", "-nosound", "-nojoy")
+    os.execv(engine, [str(engine), "-iwad", str(resources), "-file", str(wad), "-norun", *hidden])
+
+
 if __name__ == "__main__":
-    _main(int(sys.argv[1]), sys.argv[2], sys.argv[3], sys.argv[4], float(sys.argv[5]))
+    parent, file, name, output, limit, *rest = sys.argv[1:]
+    _main(int(parent), file, name, output, float(limit), alone=rest == ["alone"])

@@ -38,6 +38,18 @@ def test_a_file_that_crashes_the_engine_is_an_error_with_its_log(tmp_path: Path,
     assert not list(janitor.runtime_dir().glob("*.json")), "the crashed client's engine was not cleared away"
 
 
+@pytest.mark.parametrize(
+    ("decorate", "message"),
+    [
+        ("ACTOR Foo\n{\n  Health\n}", r'DECORATE" line 4:; SC_GetNumber: Bad numeric constant "}"'),
+        ("ACTOR Foo : Health\n{\n  Inventory.Amont 3\n}", r'line 3:; "inventory.amont" is an unknown actor property'),
+    ],
+)
+def test_a_syntax_error_in_decorate_is_told_in_the_engines_words(tmp_path: Path, decorate: str, message: str):
+    with pytest.raises(EngineError, match=rf'bad\.wad: the engine crashed .*: Script error, "bad\.wad:.*{message}'):
+        probe_wad(with_decorate(tmp_path / "bad.wad", decorate))
+
+
 def test_a_file_that_is_loaded_with_complaints_is_an_error(tmp_path: Path):
     decorate = next(lump.data for lump in read_wad(STOCK_WAD.read_bytes()) if lump.name == "DECORATE").decode()
     wad = with_decorate(tmp_path / "odd.wad", decorate + "\nACTOR Foo { }\nACTOR Foo { }\n")
