@@ -14,14 +14,14 @@ from string import Template
 
 from gvz.cache import cache_directory
 from gvz.errors import ResourceError, TaskError, WadError
-from gvz.scenarios.base import Content, Task, Uniform, Value
+from gvz.scenarios.base import Content, Task, Thing, Uniform, Value, nearest
 from gvz.specs import Profile
 from gvz.wad.acs import compile_acs
-from gvz.wad.decorate import declared_actors
+from gvz.wad.decorate import declared_actors, declared_numbers, used_sprites
 from gvz.wad.lumps import read_maps, read_wad, write_map_wad
-from gvz.wad.stock import scenario_wad, stock_textures
+from gvz.wad.stock import scenario_wad, stock_editor_numbers, stock_sprites, stock_textures
 from gvz.wad.textures import check_textures
-from gvz.wad.udmf import UdmfMap, make_thing, parse_textmap, write_textmap
+from gvz.wad.udmf import UdmfMap, is_inside, make_thing, parse_textmap, write_textmap
 
 MAP_NAME = "MAP01"
 
@@ -82,12 +82,16 @@ def map_source(task: Task, profile: Profile) -> MapSource:
     """The texts of a task's WAD. The magic number is drawn from the hash of all of them.
 
     Raises:
-        TaskError: the parameters of scenario and attributes are not those that the script names.
+        TaskError: the parameters of scenario and attributes are not those that the script names; a thing that is on no
+            map of the scenario, outside the map, or of no known class; a sprite that is not there.
         WadError: an unknown texture or base map.
     """
     content = task_content(task, profile)
-    textmap = write_textmap(_draw(task, content))
     decorate = "\n".join(content.actors.values())
+    _check_sprites(task, decorate)
+    drawn = _draw(task, content)
+    drawn.things += [make_thing(t.type, t.x, t.y, tid=t.tid) for t in _checked_things(task, content, drawn, decorate)]
+    textmap = write_textmap(drawn)
     template = Template(task.scenario.script)
     names = _script_names(content)
     if (given := {*names, "map_magic"}) != (used := set(template.get_identifiers())):
@@ -149,7 +153,7 @@ def _set_properties(tid: str, properties: Mapping[str, Value]) -> str:
 
 
 def _draw(task: Task, content: Content) -> UdmfMap:
-    """The base map with the content's textures and things, and the scenario's own changes."""
+    """The base map with the content's textures and the scenario's own changes."""
     assert content.base_wad is not None
     assert content.textures is not None
     base = read_maps(read_wad(scenario_wad(content.base_wad)))[MAP_NAME]
@@ -166,8 +170,38 @@ def _draw(task: Task, content: Content) -> UdmfMap:
         check_textures(drawn, stock_textures())
     except WadError as error:
         raise WadError(f"task {task.id}: {error}") from error
-    drawn.things += [make_thing(t.type, t.x, t.y, tid=t.tid) for t in content.things.get(content.base_wad, ())]
     return drawn
+
+
+def _checked_things(task: Task, content: Content, drawn: UdmfMap, decorate: str) -> tuple[Thing, ...]:
+    """The things that are added to the base map. The engine would leave out, or show as a sign, what makes no sense."""
+    scenario = task.scenario
+    parts = [scenario.content, scenario.levdoom, *scenario.levdoom_tasks.values()]
+    parts += [part for attribute in scenario.attributes for part in (attribute.content, attribute.levdoom)]
+    base_maps = sorted({part.base_wad for part in parts if part.base_wad is not None})
+    if strange := sorted(content.things.keys() - set(base_maps)):
+        raise TaskError(
+            f"task {task.id}: got things on {', '.join(strange)}{nearest(strange[0], base_maps)}, "
+            f"want a base map of the scenario: {', '.join(base_maps)}"
+        )
+    assert content.base_wad is not None
+    things = content.things.get(content.base_wad, ())
+    numbers = stock_editor_numbers() | declared_numbers(decorate)
+    for thing in things:
+        if thing.type not in numbers:
+            raise TaskError(f"task {task.id}: got {thing}, want the editor number of an actor class of Doom's")
+        if not is_inside(drawn, thing.x, thing.y):
+            raise TaskError(f"task {task.id}: got {thing}, want a place inside the map {content.base_wad}")
+    return things
+
+
+def _check_sprites(task: Task, decorate: str) -> None:
+    """Refuses classes that show sprites which are not there; the engine would show nothing and go on."""
+    if strange := sorted(used_sprites(decorate) - stock_sprites()):
+        raise TaskError(
+            f"task {task.id}: its DECORATE shows the unknown sprite {strange[0][:4]}, frame {strange[0][4]}"
+            f"{nearest(strange[0], sorted(stock_sprites()))}; want sprites of freedoom2.wad"
+        )
 
 
 def _cached(data: bytes) -> Path:

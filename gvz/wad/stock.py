@@ -4,6 +4,7 @@ Read from the vizdoom package's data files; its compiled module is never importe
 """
 
 import importlib.util
+import re
 import zipfile
 from functools import cache
 from pathlib import Path
@@ -12,6 +13,9 @@ from gvz.errors import WadError
 from gvz.wad.decorate import declared_actors
 from gvz.wad.lumps import read_wad
 from gvz.wad.textures import flats, wall_textures
+
+_MAPINFO = ("common", "doomcommon", "doomitems", "doom2")
+"""MAPINFO texts that hold for Doom II, the game that is played"""
 
 
 @cache
@@ -53,6 +57,26 @@ def stock_actors() -> frozenset[str]:
             if name.startswith(("actors/doom/", "actors/shared/", "actors/actor.txt")) and name.endswith(".txt")
         ]
     return frozenset(name for text in texts for name in declared_actors(text))
+
+
+@cache
+def stock_editor_numbers() -> frozenset[int]:
+    """Editor numbers of the things that a Doom map may hold, from the MAPINFO text in the engine's vizdoom.pk3."""
+    with zipfile.ZipFile(engine_directory() / "vizdoom.pk3") as archive:
+        text = "\n".join(archive.read(f"mapinfo/{name}.txt").decode("latin-1") for name in _MAPINFO)
+    blocks = re.findall(r"DoomEdNums\s*\{([^}]*)\}", text, re.IGNORECASE)
+    return frozenset(int(number) for block in blocks for number in re.findall(r"^\s*([0-9]+)\s*=", block, re.MULTILINE))
+
+
+@cache
+def stock_sprites() -> frozenset[str]:
+    """Sprites with their frames, such as `BON1A`, of freedoom2.wad and of the engine's vizdoom.pk3."""
+    names = [lump.name for lump in read_wad((engine_directory() / "freedoom2.wad").read_bytes())]
+    found = names[names.index("S_START") + 1 : names.index("S_END")]
+    with zipfile.ZipFile(engine_directory() / "vizdoom.pk3") as archive:
+        found += [Path(name).stem.upper() for name in archive.namelist() if name.startswith("sprites/")]
+    # A name is sprite, frame, rotation; a mirrored picture stands for a second frame and rotation.
+    return frozenset(name[:4] + name[place] for name in found for place in (4, 6) if place < len(name))
 
 
 @cache

@@ -98,6 +98,21 @@ def make_thing(type_number: int, x: float, y: float, *, tid: int = 0, angle: int
     }
 
 
+def is_inside(udmf_map: UdmfMap, x: float, y: float) -> bool:
+    """Whether a place, in map units, is in a sector: a ray from there eastwards meets an odd number of walls."""
+    num_walls = 0
+    for line in udmf_map.linedefs:
+        if line.get("sideback", NO_REFERENCE) != NO_REFERENCE:
+            continue  # open space on both sides
+        (x1, y1), (x2, y2) = (
+            (float(vertex["x"]), float(vertex["y"]))
+            for vertex in (udmf_map.vertices[int(line[end])] for end in ("v1", "v2"))
+        )
+        if (y1 > y) != (y2 > y) and x < x1 + (y - y1) / (y2 - y1) * (x2 - x1):
+            num_walls += 1
+    return num_walls % 2 == 1
+
+
 def parse_textmap(text: str) -> UdmfMap:
     """Reads the text of a TEXTMAP lump.
 

@@ -195,6 +195,35 @@ def with_attribute(content: Content) -> Task:
     return Task(dataclasses.replace(scenario, attributes=(*scenario.attributes, new)), ("new",))
 
 
+WAD = "defend_the_center.wad"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (
+            Content(things={"defend_the_centre.wad": (Thing(26, 0, 0),)}),
+            r"things on defend_the_centre.wad \(did you mean 'defend_the_center.wad'\?\), want a base map of the scen",
+        ),
+        (Content(things={WAD: (Thing(26, 0, 0), Thing(26, 2000, 0))}), "x=2000, .* want a place inside the map defend"),
+        (Content(things={WAD: (Thing(5555, 0, 0),)}), "type=5555, .* want the editor number of an actor class"),
+        (
+            Content(actors={"Foo": "ACTOR Foo\n{\n States\n {\n Spawn:\n  BOM1 A -1\n }\n}"}),
+            "unknown sprite BOM1, frame A",
+        ),
+    ],
+)
+def test_things_and_sprites_that_are_not_there_are_refused(content: Content, message: str):
+    with pytest.raises(TaskError, match=f"task defend_the_center/new: .*{message}"):
+        compile_task(with_attribute(content))
+
+
+def test_an_integer_radius_is_refused():
+    task = with_attribute(Content(parameters={"radius": 735}))
+    with pytest.raises(AcsError, match=r"argument 2 of FixedMul: got the integer 735, want .* such as 735\.0"):
+        compile_task(task)
+
+
 def test_an_unknown_texture_is_refused():
     task = with_attribute(Content(textures=Textures("TANROCK2", "LAVVA1", "CEIL4_1")))
     with pytest.raises(WadError, match=r"task defend_the_center/new: sector 0 texturefloor: .*'LAVVA1'.*'LAVA1'"):

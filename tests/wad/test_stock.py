@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from gvz.errors import WadError
-from gvz.wad.stock import engine_directory, scenario_wad, stock_actors
+from gvz.wad.stock import engine_directory, scenario_wad, stock_actors, stock_editor_numbers, stock_sprites
 
 
 def test_dooms_actors_are_known_and_other_games_are_not():
@@ -16,6 +16,13 @@ def test_dooms_actors_are_known_and_other_games_are_not():
         LiveStick HeadCandles TallGreenColumn TallRedColumn HeartColumn BlueTorch GreenTorch RedTorch MapSpot Health"""
     assert set(wanted.split()) <= stock_actors()
     assert not {"HereticImp", "Mummy", "Ettin", "StrifePlayer", "FlemoidusCommonus", "actor"} & stock_actors()
+
+
+def test_dooms_editor_numbers_and_sprites_are_known():
+    assert {1, 26, 42, 2012, 3001, 9001} <= stock_editor_numbers()
+    assert not {5555, 31999} & stock_editor_numbers()
+    assert {"BON1D", "MEDIA", "SKULF", "DOGSA"} <= stock_sprites()
+    assert not {"BON1E", "MEDI", "S_EN", "MUMMA"} & stock_sprites()
 
 
 def test_a_scenario_is_read_by_its_file_name():

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from gvz.errors import WadError
 from gvz.wad.lumps import read_maps, read_wad
 from gvz.wad.stock import engine_directory, scenario_wad
-from gvz.wad.udmf import Block, UdmfMap, make_thing, parse_textmap, write_textmap
+from gvz.wad.udmf import Block, UdmfMap, is_inside, make_thing, parse_textmap, write_textmap
 
 TRIANGLE = """
 namespace = "zdoom"; // a comment
@@ -40,6 +40,19 @@ def all_maps() -> list[tuple[str, bytes]]:
         for file in files
         for name, level in read_maps(read_wad(file.read_bytes())).items()
     ]
+
+
+def test_a_place_is_inside_between_walls_and_not_in_a_pillar():
+    room = UdmfMap(sectors=[{}])
+    for (west, south), (east, north) in (((0, 0), (100, 60)), ((40, 20), (60, 40))):  # a room and a pillar in it
+        first = len(room.vertices)
+        room.vertices += [{"x": x, "y": y} for x, y in ((west, south), (west, north), (east, north), (east, south))]
+        room.linedefs += [{"v1": first + i, "v2": first + (i + 1) % 4} for i in range(4)]
+    room.vertices += [{"x": 20, "y": 0}, {"x": 20, "y": 60}]
+    room.linedefs.append({"v1": 8, "v2": 9, "sideback": 0})  # drawn through open space: no wall
+    inside = {(10, 30), (30, 30), (70, 30), (50, 10), (50, 50), (99.5, 0.5)}
+    outside = {(50, 30), (-10, 30), (110, 30), (50, 70), (50, -1), (-10, 0), (-10, 60)}
+    assert {place for place in inside | outside if is_inside(room, *place)} == inside
 
 
 def test_a_map_is_read_into_its_blocks():

@@ -106,7 +106,7 @@ def _add_map_variable(unit: Unit, variable: Variable) -> None:
     if index == MAX_MAP_VARIABLES:
         raise error(variable.at, f"got more than {MAX_MAP_VARIABLES} map variables, want fewer")
     size = array_size(unit, variable)
-    symbol = VariableSymbol("map array" if size else "map", index, variable.type)
+    symbol = VariableSymbol("map array" if size else "map", index, variable.type, size)
     unit.declare(variable.name, symbol, variable.at)
     initial = initial_values(variable, size)
     values = tuple(_initial_constant(unit, node, symbol, variable.name) for node in initial)

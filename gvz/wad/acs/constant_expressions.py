@@ -1,5 +1,6 @@
 """Expressions whose value must be known when the source is compiled. Imports gvz.wad.acs."""
 
+from gvz.errors import AcsError
 from gvz.wad.acs.lexer import Position, error
 from gvz.wad.acs.symbols import ConstantSymbol, Unit
 from gvz.wad.acs.syntax import Binary, Expression, Name, Number, String, Unary
@@ -13,7 +14,7 @@ def constant(unit: Unit, node: Expression, what: str) -> ConstantSymbol:
     """
     match node:
         case Number():
-            return ConstantSymbol(_signed(node.value))
+            return ConstantSymbol(_signed(node.value), is_integer=not node.is_fixed)
         case String():
             return ConstantSymbol(unit.string(node.text, node.at), node.text)
         case Name(index=None):
@@ -21,8 +22,10 @@ def constant(unit: Unit, node: Expression, what: str) -> ConstantSymbol:
             if isinstance(symbol, ConstantSymbol):
                 return symbol
         case Unary():
-            value = constant_number(unit, node.operand, what)
-            return ConstantSymbol(_signed({"-": -value, "!": int(not value), "~": ~value}[node.operator]))
+            operand = constant(unit, node.operand, what)
+            value = _number(operand, node.operand, what)
+            result = _signed({"-": -value, "!": int(not value), "~": ~value}[node.operator])
+            return ConstantSymbol(result, is_integer=operand.is_integer)
         case Binary():
             chain = [node]
             while isinstance(node.left, Binary):
@@ -39,10 +42,36 @@ def constant(unit: Unit, node: Expression, what: str) -> ConstantSymbol:
 
 def constant_number(unit: Unit, node: Expression, what: str) -> int:
     """The value of a constant expression that must be a number."""
-    result = constant(unit, node, what)
+    return _number(constant(unit, node, what), node, what)
+
+
+def _number(result: ConstantSymbol, node: Expression, what: str) -> int:
     if result.text is not None:
         raise error(node.at, f"{what}: got a string, want a number")
     return result.value
+
+
+def number_if_constant(unit: Unit, node: Expression) -> int | None:
+    """The value of an expression whose code is emitted already; None if only the running script knows it."""
+    try:
+        return constant_number(unit, node, "")
+    except AcsError:
+        return None
+
+
+def refuse_zero_divisor(unit: Unit, operator: str, node: Expression) -> None:
+    """Refuses to divide by the constant 0, where the engine would end the script.
+
+    Args:
+        unit: the source.
+        operator: of an expression or an assignment.
+        node: what is on its right, with its code emitted already.
+
+    Raises:
+        AcsError: `operator` divides, and `node` is 0.
+    """
+    if operator.removesuffix("=") in ("/", "%") and number_if_constant(unit, node) == 0:
+        raise error(node.at, f"got a division by zero on the right of {operator!r}, want another number")
 
 
 def _signed(value: int) -> int:

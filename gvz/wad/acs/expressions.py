@@ -1,6 +1,7 @@
 """Expressions, assignments and calls to instructions. Imports gvz.wad.acs."""
 
 from gvz.wad.acs.classes import USED_AS_CLASS
+from gvz.wad.acs.constant_expressions import number_if_constant, refuse_zero_divisor
 from gvz.wad.acs.intrinsics import FIXED_PROPERTIES, LATENT, Intrinsic, Kind, Type
 from gvz.wad.acs.lexer import error
 from gvz.wad.acs.symbols import ConstantSymbol, FunctionSymbol, Unit, VariableSymbol
@@ -44,12 +45,20 @@ def emit_value(unit: Unit, node: Expression, kind: Kind, what: str) -> None:
         raise error(node.at, f"{what}: got a function that returns nothing, want a value")
     if kind == "script":
         _note_script(unit, node)
+    if kind == "fixed":
+        _refuse_integer(unit, node, what)
+
+
+def _refuse_integer(unit: Unit, node: Expression, what: str) -> None:
+    """Refuses an integer literal, or a constant defined by one, where a fixed-point number is wanted; 0 is both."""
     literal = node.operand if isinstance(node, Unary) else node
-    if kind == "fixed" and isinstance(literal, Number) and literal.value and not literal.is_fixed:
-        raise error(
-            literal.at,
-            f"{what}: got the integer {literal.value}, want a fixed-point number such as {literal.value}.0",
-        )
+    if isinstance(literal, Number):
+        value = 0 if literal.is_fixed else literal.value
+    else:
+        symbol = _named_constant(unit, literal)
+        value = symbol.value if symbol is not None and symbol.is_integer else 0
+    if value:
+        raise error(literal.at, f"{what}: got the integer {value}, want a fixed-point number such as {value}.0")
 
 
 def _note_script(unit: Unit, node: Expression) -> None:
@@ -97,6 +106,7 @@ def _emit_binary(unit: Unit, node: Binary) -> Type:
     emit_value(unit, node.left, kinds[-1], f"left of {node.operator!r}")
     for link, kind in zip(reversed(chain), reversed(kinds), strict=True):
         emit_value(unit, link.right, kind, f"right of {link.operator!r}")
+        refuse_zero_divisor(unit, link.operator, link.right)
         unit.code.emit(BINARY_OPCODES[link.operator])
     return "int"
 
@@ -130,6 +140,9 @@ def _emit_index(unit: Unit, node: Name, symbol: VariableSymbol) -> None:
         if not symbol.is_array:
             raise error(node.at, f"got an index on {node.name!r}, want it on an array")
         emit_value(unit, node.index, "int", f"index of {node.name!r}")
+        number = number_if_constant(unit, node.index)
+        if number is not None and not 0 <= number < symbol.size:
+            raise error(node.index.at, f"index of {node.name!r}: got {number}, want 0 to {symbol.size - 1}")
 
 
 def _variable(unit: Unit, target: Name) -> VariableSymbol:
@@ -170,6 +183,7 @@ def emit_assign(unit: Unit, node: Assign) -> None:
     if node.operator != "=" and symbol.type == "str":
         raise error(node.at, f"got {node.operator!r} on the string {node.target.name!r}, want '='")
     emit_stored_value(unit, node.value, symbol, node.target.name)
+    refuse_zero_divisor(unit, node.operator, node.value)
     unit.code.emit(VARIABLE_OPCODES[symbol.storage][node.operator], symbol.index)
 
 

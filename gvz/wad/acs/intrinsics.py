@@ -29,8 +29,8 @@ INSTRUCTIONS = """
 120 int PlayerHealth
 121 int PlayerArmorPoints
 135 int SinglePlayer
-136 int FixedMul int int
-137 int FixedDiv int int
+136 int FixedMul fixed fixed
+137 int FixedDiv fixed fixed
 142 void ClearInventory
 143 void GiveInventory class int
 145 void TakeInventory class int

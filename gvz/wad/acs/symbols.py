@@ -23,6 +23,8 @@ class VariableSymbol:
     storage: Storage
     index: int
     type: str
+    size: int = 0
+    """elements of an array"""
 
     @property
     def is_array(self) -> bool:
@@ -42,6 +44,8 @@ class ConstantSymbol:
 
     value: int
     text: str | None = None
+    is_integer: bool = False
+    """written as an integer literal, so it is no fixed-point number"""
 
 
 Symbol = VariableSymbol | FunctionSymbol | ConstantSymbol | Intrinsic
@@ -110,7 +114,7 @@ class Unit:
             AcsError: it has one already, or there are too many.
         """
         if size:
-            self._add_local(name, VariableSymbol("script array", len(self.array_sizes), type_name), at)
+            self._add_local(name, VariableSymbol("script array", len(self.array_sizes), type_name, size), at)
             self.array_sizes.append(size)
         else:
             self._add_local(name, VariableSymbol("script", self.num_locals, type_name), at)
