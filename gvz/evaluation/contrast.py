@@ -3,7 +3,7 @@
     python -m gvz.evaluation.contrast
 
 measures it for Seek and Kill's `default` and for `complete` with each of its textures, and writes
-results/reference/contrast.json. Imports cv2, numpy, gvz.env, gvz.evaluation.reference, gvz.scenarios, gvz.specs.
+results/reference/contrast.json. Imports cv2, numpy, gvz.{env,specs,tasks}, gvz.evaluation.reference, gvz.scenarios.
 """
 
 import json
@@ -15,10 +15,11 @@ import numpy as np
 from gvz.env import DoomEnv
 from gvz.evaluation.reference import RECORDS
 from gvz.scenarios.base import Task
-from gvz.specs import EnvConfig
+from gvz.specs import LABEL_CLASSES, EnvConfig
 from gvz.tasks import scenario_named
 
 FILE = RECORDS / "contrast.json"
+ENEMY = LABEL_CLASSES.index("enemy")
 NUM_EPISODES = 40
 DECISIONS = 120
 """of an episode; every LOOK_PERIODth frame is looked at"""
@@ -78,19 +79,19 @@ def measure(task: Task, num_episodes: int = NUM_EPISODES) -> dict[str, float]:
                     break
                 if decision % LOOK_PERIOD == LOOK_PERIOD - 1:
                     assert isinstance(observation, dict)
-                    enemies = [label.value for label in env.labels() if label.object_category == "Monster"]
-                    found += _sightings(observation["screen"], observation["labels"][..., 0], enemies)
+                    found += _sightings(observation["screen"], observation["labels"][..., 0] == ENEMY)
     medians = np.median(found, axis=0)
     return {"num_enemies": len(found), "contrast": float(medians[0]), "separation": float(medians[1])}
 
 
-def _sightings(screen: np.ndarray, labels: np.ndarray, enemies: list[int]) -> list[tuple[float, float]]:
-    """Contrast and separation of each enemy that is large enough."""
+def _sightings(screen: np.ndarray, enemies: np.ndarray) -> list[tuple[float, float]]:
+    """Contrast and separation of each enemy, or group of enemies that touch, that is large enough."""
     values = []
     kernel = np.ones((2 * RING_PIXELS + 1,) * 2, np.uint8)
-    for enemy in enemies:
-        inside = labels == enemy
-        around = cv2.dilate(inside.astype(np.uint8), kernel).astype(bool) & ~np.isin(labels, enemies)
+    num_groups, groups = cv2.connectedComponents(enemies.astype(np.uint8))
+    for group in range(1, num_groups):
+        inside = groups == group
+        around = cv2.dilate(inside.astype(np.uint8), kernel).astype(bool) & ~enemies
         around[STATUS_BAR_ROW:] = False
         if min(inside.sum(), around.sum()) >= MIN_PIXELS:
             values.append((contrast(screen[inside], screen[around]), separation(screen[inside], screen[around])))

@@ -30,7 +30,7 @@ PAGE = ROOT / "docs" / "BENCHMARK.md"
 BEGIN = "<!-- reference scores: written by `python -m gvz.evaluation.reference` -->"
 END = "<!-- end of reference scores -->"
 
-PLAYERS = ("random", "idle", "scripted")
+PLAYERS = ("random", "idle", "sweep", "scripted")
 COLUMNS = (
     *("schema", "player", "profile", "action_set", "frame_skip", "task", "episode", "seed"),
     *("score", "kills", "player_kills", "reward", "length_frames", "terminated"),

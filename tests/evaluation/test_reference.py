@@ -1,6 +1,7 @@
 """The reference scores: records are whole, and docs/BENCHMARK.md says what they and the code say."""
 
 import gzip
+import itertools
 import json
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from gvz.errors import ConfigError
 from gvz.evaluation.play import episode_seed
 from gvz.evaluation.reference import PAGE, PLAYERS, estimate, pack, read_reference, tables, with_tables
+from gvz.experiments.base import experiment_named
 from gvz.tasks import named_tasks, scenarios
 
 SCORES = read_reference()
@@ -37,6 +39,76 @@ def test_no_score_is_above_its_bound():
 def test_the_tables_of_the_page_are_what_the_records_give():
     page = PAGE.read_text()
     assert with_tables(page, tables(SCORES)) == page
+
+
+def mean(player: str, task: str, column: str = "score") -> float:
+    return float(np.mean([row[column] for row in SCORES[player, task]]))
+
+
+def percent(player: str, *tasks: str) -> float:
+    bound = scenarios()[tasks[0].partition("/")[0]].upper_bound("thesis")
+    return float(np.mean([100 * mean(player, task) / bound for task in tasks]))
+
+
+def test_the_sweep_of_dodge_projectiles_and_the_script_played_the_same_episodes():
+    for task in named_tasks("dodge_projectiles"):
+        sweep, scripted = (
+            [(row["seed"], row["score"], row["reward"], row["terminated"]) for row in SCORES[player, task.id]]
+            for player in ("sweep", "scripted")
+        )
+        assert sweep == scripted, task.id
+
+
+def test_the_page_says_what_a_player_without_sight_reaches():
+    page = " ".join(PAGE.read_text().split())
+    dtc, hg, sk, dp = "defend_the_center/default", "health_gathering", "seek_and_kill/default", "dodge_projectiles"
+    test_tasks = [task.id for task in named_tasks(dp, split="test")]
+    for told in (
+        f"firing reaches {percent('sweep', dtc):.0f} % in `default`",
+        f"who is told where enemies are {percent('scripted', dtc):.0f} %. What is above",
+        f"{percent('sweep', hg + '/default'):.0f} % in `default`, {percent('sweep', hg + '/lava'):.0f} % in `lava`",
+        f"({percent('sweep', hg + '/supreme'):.0f} % and {percent('sweep', hg + '/poison'):.0f} %)",
+        f"kills {mean('sweep', sk):.1f} of 20 in `default`",
+        f"who is told where enemies are {mean('scripted', sk):.1f}.",
+        f"reaches {percent('sweep', dp + '/default'):.0f} % in `default` and",
+        f"and {percent('sweep', *test_tasks):.0f} % of the bound on the test set",
+    ):
+        assert told in page, told
+
+
+def test_the_page_says_where_the_thesis_is_beside_the_sweep():
+    published = experiment_named("training_set_size").published["thesis"]
+    above = [
+        published[scenario][1] - percent("sweep", *(task.id for task in named_tasks(scenario, split="test")))
+        for scenario in scenarios()
+    ]
+    below, least, _, most = sorted(above)
+    told = f"is {least:.0f} to {most:.0f} points above the sweep in three scenarios and {-below:.0f} points below it in"
+    assert told in " ".join(PAGE.read_text().split())
+
+
+def test_the_page_says_how_enemies_kill_each_other_and_what_walking_earns():
+    page = " ".join(PAGE.read_text().split())
+    deaths = {t.name: [row["kills"] for row in SCORES["sweep", t.id]] for t in named_tasks("dodge_projectiles")}
+    infighting = deaths.pop("complete")
+    assert not any(map(any, deaths.values()))
+    default = "seek_and_kill/default"
+    earned = {player: f"{mean(player, default, 'reward'):.0f}" for player in ("sweep", "scripted")}
+    own = {player: f"{mean(player, default, 'player_kills'):.1f}" for player in ("sweep", "scripted")}
+    for told in (
+        f"In {np.count_nonzero(infighting)} of 100 episodes of the sweep",
+        f"another's missiles, {np.mean(infighting):.1f} on average",
+        f"The sweep earns {earned['sweep']} in an episode of `default` with {own['sweep']} own kills",
+        f"the scripted player {earned['scripted']} with {own['scripted']}",
+    ):
+        assert told in page, told
+
+
+def test_the_page_says_what_the_other_mean_over_test_tasks_would_give():
+    levels = [[task.id for task in named_tasks("dodge_projectiles", level=level, split="test")] for level in (2, 3, 4)]
+    flat = percent("sweep", *itertools.chain(*levels))
+    other = np.mean([percent("sweep", *tasks) for tasks in levels])
+    assert f"has {flat:.0f} % by ours and {other:.0f} % by the other" in " ".join(PAGE.read_text().split())
 
 
 def test_an_estimate_over_tasks_is_the_mean_of_their_episodes():
@@ -100,7 +172,7 @@ def test_packing_sorts_drops_columns_and_gives_the_same_bytes(tmp_path):
 def test_what_is_no_reference_record_is_refused(tmp_path):
     file = tmp_path / "rows.jsonl"
     file.write_text(record(player="rainbow"))
-    with pytest.raises(ConfigError, match="rows of rainbow; want only random, idle, scripted"):
+    with pytest.raises(ConfigError, match="rows of rainbow; want only random, idle, sweep, scripted"):
         pack(file, tmp_path)
     file.write_text("half a li")
     with pytest.raises(ConfigError, match="line 1: not JSON"):
