@@ -32,9 +32,9 @@ class InlinePool:
         """
         if config.num_actors != 1:
             raise ValueError(f"num_actors: got {config.num_actors}, want 1: inline, all games are one actor's")
-        (spec,) = config.actor_specs("inline", [0] * config.num_lanes)
+        (spec,) = config.actor_specs([0] * config.num_lanes)
         self._messages: list[Message] = []
-        self._ring = RingReader.create(None, spec.ring_capacity, config.frame_shape)
+        self._ring = RingReader.create("gvz-ring-inline", spec.ring_capacity, config.frame_shape)
         self._writer = self._ring.writer()
         self._published: tuple[np.ndarray, ParamsHeader] | None = None
         self._rest = StepBlock(np.empty(0, STEP_DTYPE), np.empty((0, *config.frame_shape), np.uint8))

@@ -4,8 +4,6 @@
 `close`. Neither starts a thread: all watching happens in `poll`, which the learner calls in every round.
 """
 
-import os
-import secrets
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,12 +74,12 @@ class PoolConfig:
         return num_steps * self.games_per_actor
 
     def shared_memory_bytes(self) -> int:
-        """What an `ActorPool` takes of /dev/shm."""
+        """Shared memory of an `ActorPool`: rings and parameter queue."""
         rings = self.num_actors * ring_bytes(self.ring_capacity, self.frame_shape)
         return rings + (broadcast_bytes(self.num_params) if self.policy else 0)
 
-    def actor_specs(self, names: str, first_episodes: list[int]) -> list[ActorSpec]:
-        """One spec an actor. `names` begins the names of its segments; `first_episodes` has an entry a lane."""
+    def actor_specs(self, first_episodes: list[int]) -> list[ActorSpec]:
+        """One spec an actor. `first_episodes` has an entry a lane."""
         # to the environment 0 means never, even where only a fresh engine plays an episode the same again
         recycle_episodes = None if self.actors.recycle_episodes == 0 else self.actors.recycle_episodes
         specs = []
@@ -101,9 +99,7 @@ class PoolConfig:
                     stack_size=self.stack_size,
                     num_actions=self.num_actions,
                     policy=self.policy,
-                    ring_name=f"{names}-ring-{actor}",
                     ring_capacity=self.ring_capacity,
-                    broadcast_name=f"{names}-params",
                     num_params=self.num_params,
                     layout_hash=self.layout_hash,
                     work_dir=str(self.work_dir.absolute()),
@@ -139,23 +135,22 @@ class ActorPool:
             state: what `state()` returned in the run that is resumed.
 
         Raises:
-            ResourceError: /dev/shm has no room.
+            ResourceError: there is not enough memory.
             ResumeError: `state` is of a pool of another size.
         """
-        first_episodes = episodes_to_begin_with(config, state)
-        specs = config.actor_specs(f"gvz-{os.getpid()}-{secrets.token_hex(4)}", first_episodes)
+        specs = config.actor_specs(episodes_to_begin_with(config, state))
         self._config = config
         self._worthwhile = max(1, int(_WORTHWHILE_SHARE * config.num_actors * config.ring_capacity))
         self._actors: list[SupervisedActor] = []
-        self._board: BroadcastWriter | None = None
+        self._params: BroadcastWriter | None = None
         self._polled_at = time.monotonic()
         self._env_steps = self._episodes = 0
         self._waited_s = 0.0
         try:
             if config.policy:
-                self._board = BroadcastWriter.create(specs[0].broadcast_name, config.num_params, config.layout_hash)
+                self._params = BroadcastWriter.create("gvz-params", config.num_params, config.layout_hash)
             for spec in specs:
-                self._actors.append(SupervisedActor(spec, config.actors))
+                self._actors.append(SupervisedActor(spec, config.actors, self._params))
             for actor in self._actors:
                 actor.start()
         except BaseException:
@@ -170,8 +165,8 @@ class ActorPool:
 
     def publish(self, params: np.ndarray, header: ParamsHeader) -> None:
         """Gives the actors `params` float32[P] to act by; they take them before their next step. Never waits."""
-        if self._board is not None:
-            self._board.publish(params, header)
+        if self._params is not None:
+            self._params.publish(params, header)
 
     def drain(self, max_records: int, wait_s: float = 0.0) -> list[StepBlock]:
         """Takes up to `max_records` records, an equal share from every actor as far as it has them.
@@ -247,7 +242,7 @@ class ActorPool:
         return [actor.ring.writer_status() for actor in self._actors]
 
     def close(self, *, grace_s: float = STOP_TIMEOUT_S) -> None:
-        """Ends every process and removes every segment. Can be repeated.
+        """Ends every process and frees the shared memory. Can be repeated.
 
         Args:
             grace_s: how long actors may take over their last step, and as long again over SIGTERM before SIGKILL.
@@ -266,8 +261,8 @@ class ActorPool:
             for actor in self._actors:
                 actor.process = None
                 actor.ring.close()
-            if self._board is not None:
-                self._board.close()
+            if self._params is not None:
+                self._params.close()
             janitor.clean_dead_instances()
 
 

@@ -13,8 +13,10 @@ from pathlib import Path
 
 from gvz import janitor
 from gvz.cache import xla_cache_directory
+from gvz.transport.broadcast import BroadcastWriter
 from gvz.transport.channel import Channel
 from gvz.transport.messages import ActorSpec, Message, Stop
+from gvz.transport.ring import RingReader
 
 LOG_TAIL_BYTES = 4000
 
@@ -38,20 +40,22 @@ def _environment() -> dict[str, str]:
 class ActorProcess:
     """A running worker. `spec` goes to it as the first message; its output is appended to a log file."""
 
-    def __init__(self, spec: ActorSpec):
+    def __init__(self, spec: ActorSpec, ring: RingReader, params: BroadcastWriter | None):
+        """Starts the process, which inherits the descriptors of its socket, its ring and the parameter queue."""
         work_dir = Path(spec.work_dir)
         work_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._who = f"actor {spec.actor}"
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         with theirs, log_path(spec).open("ab") as log:
+            inherited = [theirs.fileno(), ring.descriptor] + ([] if params is None else [params.descriptor])
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "actors.worker", str(theirs.fileno()), str(os.getpid())],
+                [sys.executable, "-P", "-m", "actors.worker", str(os.getpid()), *map(str, inherited)],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
                 cwd=work_dir,
                 env=_environment(),
-                pass_fds=[theirs.fileno()],
+                pass_fds=inherited,
                 start_new_session=True,
             )
         self.pid = self._process.pid

@@ -12,6 +12,7 @@ from actors.config import ActorsConfig
 from actors.process import ActorProcess, log_path, read_log_tail
 from gvz import janitor
 from gvz.errors import TransportError, WorkerError
+from gvz.transport.broadcast import BroadcastWriter
 from gvz.transport.messages import ActorSpec, EpisodeStats, Fault, Message, Ready
 from gvz.transport.ring import RingReader, WriterState
 
@@ -34,15 +35,17 @@ class SupervisedActor:
         failure: why no process will follow the last one; None while all is well.
     """
 
-    def __init__(self, spec: ActorSpec, limits: ActorsConfig):
+    def __init__(self, spec: ActorSpec, limits: ActorsConfig, params: BroadcastWriter | None):
+        """`params` is the queue that the actor takes its parameters from; None for random play."""
         height, width, channels = spec.frame_shape
-        self.ring = RingReader.create(spec.ring_name, spec.ring_capacity, (height, width, channels))
+        self.ring = RingReader.create(f"gvz-ring-{spec.actor}", spec.ring_capacity, (height, width, channels))
         self.process: ActorProcess | None = None
         self.next_episodes = list(spec.first_episodes)
         self.restarts = 0
         self.failure: WorkerError | None = None
         self._spec = spec
         self._limits = limits
+        self._params = params
         self._start_at = 0.0
         self._ready_at: float | None = None
         self._silent_s = 0.0  # without a sign of life (or, before Ready, since the start) while we watched
@@ -57,7 +60,7 @@ class SupervisedActor:
 
     def start(self) -> None:
         """Starts a process; does not wait for it."""
-        self.process = ActorProcess(self._spec)
+        self.process = ActorProcess(self._spec, self.ring, self._params)
         self._ready_at, self._kill_at, self._silent_s = None, None, 0.0
         self._heartbeat_ns = self.ring.writer_status().heartbeat_ns
 

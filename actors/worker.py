@@ -1,7 +1,8 @@
-"""An actor process: `python -m actors.worker FD PARENT_PID`, started by `actors/process.py`.
+"""An actor process: `python -m actors.worker PARENT_PID SOCKET RING [PARAMS]`, started by `actors/process.py`.
 
-FD is its end of a socket. The first message on it is an `ActorSpec`; what follows are the acting loop and, from the
-learner, `Stop`. Everything that goes wrong becomes a `Fault` message and a non-zero exit.
+SOCKET, RING and PARAMS are inherited file descriptors: its end of a socket, its ring, the parameter queue (absent for
+random play). The first message on the socket is an `ActorSpec`; then the process acts until it receives `Stop`.
+Everything that goes wrong becomes a `Fault` message and a non-zero exit.
 """
 
 import contextlib
@@ -32,14 +33,13 @@ MAX_PARAMS_SHARE = 0.05
 class Worker:
     """The life of an actor process after its spec has come."""
 
-    def __init__(self, spec: ActorSpec, channel: Channel):
+    def __init__(self, spec: ActorSpec, channel: Channel, ring: int, params: int | None):
+        """`ring` and `params` are file descriptors; they stay the caller's."""
         height, width, channels = spec.frame_shape
         self._spec = spec
         self._channel = channel
-        self._ring = RingWriter.attach(spec.ring_name, spec.ring_capacity, (height, width, channels))
-        self._board = (
-            BroadcastReader.attach(spec.broadcast_name, spec.num_params, spec.layout_hash) if spec.policy else None
-        )
+        self._ring = RingWriter.attach(ring, spec.ring_capacity, (height, width, channels))
+        self._params = None if params is None else BroadcastReader.attach(params, spec.num_params, spec.layout_hash)
         self._take_params_at = 0.0
         self._loop = ActorLoop(spec, self._ring, channel.send)
 
@@ -64,7 +64,7 @@ class Worker:
     def _take_params(self) -> bool:
         """Acts by the newest parameters from now on; False if there are none newer, or if it is too soon."""
         start = time.monotonic()
-        newest = self._board.read() if self._board and start >= self._take_params_at else None
+        newest = self._params.read() if self._params and start >= self._take_params_at else None
         if newest is None:
             return False
         self._loop.set_params(*newest)
@@ -75,7 +75,7 @@ class Worker:
     def _wait_for_params(self) -> bool:
         """Waits for the first version; False if told to stop first."""
         start = time.monotonic()
-        while self._board and not self._take_params():
+        while self._params and not self._take_params():
             self._ring.beat(WriterState.STARTING)
             if self._must_stop():
                 return False
@@ -90,7 +90,7 @@ class Worker:
 
 def main() -> int:
     """Entry point of the process; returns its exit code."""
-    descriptor, parent_pid = int(sys.argv[1]), int(sys.argv[2])
+    parent_pid, descriptor, ring, *params = map(int, sys.argv[1:])
     janitor.die_with_parent(parent_pid)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the learner's to decide about
     signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
@@ -101,7 +101,10 @@ def main() -> int:
     if not isinstance(spec, ActorSpec):
         raise TypeError(f"first message: got {type(spec).__name__}, want ActorSpec")
     try:
-        Worker(spec, channel).run()
+        worker = Worker(spec, channel, ring, params[0] if params else None)
+        for inherited in (ring, *params):  # their memory is mapped; the engines must not inherit them
+            os.close(inherited)
+        worker.run()
     except Exception as error:  # the process boundary: whatever it is, the learner is to hear of it
         traceback.print_exc()
         kind = "engine_start" if isinstance(error, EngineError) else "exception"

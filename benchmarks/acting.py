@@ -40,12 +40,12 @@ def measure(budget: Budget) -> list[Row]:
             )
             for games in all_games
         }
-        agent = parts[4].agent
+        agent = parts[4].learner.agent
         params = agent.init(jax.random.key(0))
         flat = np.asarray(jax.jit(flatten_params)(params))
         size = (str(config.env.render_width), str(config.env.render_height))
         engines = [stack.enter_context(Remote("bare_engine", workload.TASK, *size)) for _ in range(num_engines)]
-        products = [stack.enter_context(Remote("cpu_matmul", **ENVIRONMENT)) for _ in range(cores)]
+        products = [stack.enter_context(Remote("cpu_matmul", environment=ENVIRONMENT)) for _ in range(cores)]
         acting = {games: stack.enter_context(workload.playing(parts[games].pool_config, flat)) for games in all_games}
         plays = {
             f"actor pool, full network, {games} games an actor": partial(workload.decisions_per_s, pool, budget.body_s)

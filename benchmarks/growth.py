@@ -140,7 +140,6 @@ def _batch(budget: Budget) -> list[Row]:
 
 def _parameters(budget: Budget) -> list[Row]:
     """A gradient step over the parameters, by way of the hidden units; a publication of as many numbers."""
-    import secrets
 
     import jax
 
@@ -157,7 +156,7 @@ def _parameters(budget: Budget) -> list[Row]:
         params = jax.eval_shape(run_agent(change(workload.run_config(budget), size)).init, jax.random.key(0))
         counts[size] = sum(leaf.size for leaf in jax.tree.leaves(params))
     steps = {counts[size]: found for size, found in _updates(budget, hidden, change).items()}
-    writers = {n: BroadcastWriter.create(f"gvz-bench-{secrets.token_hex(6)}", n, 0) for n in counts.values()}
+    writers = {n: BroadcastWriter.create("gvz-bench", n, 0) for n in counts.values()}
     try:
         bodies = {}
         for n, writer in writers.items():

@@ -40,9 +40,10 @@ def measure(budget: Budget) -> list[Row]:
         }
         ours = next(reversed(bodies))
         if on_cpu:
+            without_gpu = {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": ""}
             for name, (script, _) in PEERS.items():
                 size = (str(config.replay.capacity), str(config.learner.batch_size))
-                peer = start_peer(script, budget.peers, *size, JAX_PLATFORMS="cpu", CUDA_VISIBLE_DEVICES="")
+                peer = start_peer(script, budget.peers, *size, environment=without_gpu)
                 if isinstance(peer, str):
                     rows.append(absent(name, peer))
                     continue

@@ -12,9 +12,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any
 
 PEERS = Path(__file__).parent / "peers"
@@ -35,14 +35,22 @@ class Remote:
         about: what the process said about itself: versions and settings.
     """
 
-    def __init__(self, script: str, *arguments: str, python: Path | str = sys.executable, **environment: str):
+    def __init__(
+        self,
+        script: str,
+        *arguments: str,
+        python: Path | str = sys.executable,
+        environment: Mapping[str, str] = MappingProxyType({}),
+        pass_fds: Sequence[int] = (),
+    ):
         """Starts `benchmarks/peers/<script>.py` and waits until it is ready.
 
         Args:
             script: file name without suffix.
             *arguments: of its command line.
             python: interpreter.
-            **environment: variables to set.
+            environment: variables to set.
+            pass_fds: file descriptors that it inherits.
 
         Raises:
             RemoteError: there is no such interpreter, or the process ended before it was ready (a package that it
@@ -64,6 +72,7 @@ class Remote:
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 cwd=self._directory.name,
+                pass_fds=pass_fds,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(path), **environment},
             )
         self._buffer = b""
@@ -150,7 +159,9 @@ class Remote:
         return lines[-1][:300] if lines else "it ended without a word"
 
 
-def start_peer(script: str, python: Path, *arguments: str, **environment: str) -> "Remote | str":
+def start_peer(
+    script: str, python: Path, *arguments: str, environment: Mapping[str, str] = MappingProxyType({})
+) -> "Remote | str":
     """A peer's process, or why there is none.
 
     A peer that cannot live with the others (TensorFlow and torch in one process do not) has an environment of its
@@ -160,7 +171,7 @@ def start_peer(script: str, python: Path, *arguments: str, **environment: str) -
     own = venv.with_name(f"{venv.name}-{script.partition('_')[0]}") / "bin" / "python"
     python = own if own.exists() else python
     try:
-        return Remote(script, *arguments, python=python, **environment)
+        return Remote(script, *arguments, python=python, environment=environment)
     except RemoteError as error:
         return f"not installed, or it does not start: {error}"
 

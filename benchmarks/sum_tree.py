@@ -26,7 +26,8 @@ def measure(budget: Budget) -> list[Row]:
     with contextlib.ExitStack() as stack:
         peer = "its goal is on a CPU"
         if on_cpu:
-            peer = start_peer("flashbax_tree", budget.peers, str(num_leaves), str(STEPS_PER_CALL), JAX_PLATFORMS="cpu")
+            sizes = str(num_leaves), str(STEPS_PER_CALL)
+            peer = start_peer("flashbax_tree", budget.peers, *sizes, environment={"JAX_PLATFORMS": "cpu"})
         bodies: dict[str, Callable[[], float]] = {}
         for batch in batches:
             bodies[f"sum tree, batch {batch}"] = partial(seconds_per_call, _steps(num_leaves, batch), budget.body_s)

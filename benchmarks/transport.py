@@ -10,7 +10,6 @@ parameters are that actors act by is measured by `whole`.
 import contextlib
 import dataclasses
 import itertools
-import secrets
 import statistics
 import time
 from collections.abc import Callable
@@ -56,7 +55,7 @@ def measure(budget: Budget) -> list[Row]:
 
 def _ring_bodies(stack: contextlib.ExitStack, budget: Budget) -> dict[str, Callable[[], float]]:
     """GB/s of memcpy, of a block in, of a block out, and of a stream between two processes."""
-    reader = RingReader.create(f"gvz-bench-{secrets.token_hex(6)}", 4 * NUM_FRAMES, SHAPE)
+    reader = RingReader.create("gvz-bench", 4 * NUM_FRAMES, SHAPE)
     stack.callback(reader.close)
     writer = reader.writer()
     frames = np.random.default_rng(0).integers(0, 256, (NUM_FRAMES, *SHAPE), np.uint8)
@@ -85,10 +84,10 @@ def _ring_bodies(stack: contextlib.ExitStack, budget: Budget) -> dict[str, Calla
                     times.append(time.perf_counter() - before)
         return BLOCK_BYTES / statistics.median(times) / 1e9
 
-    streamed = RingReader.create(f"gvz-bench-{secrets.token_hex(6)}", 4 * NUM_FRAMES, SHAPE)
+    streamed = RingReader.create("gvz-bench", 4 * NUM_FRAMES, SHAPE)
     stack.callback(streamed.close)
-    assert streamed.name is not None
-    source = stack.enter_context(Remote("ring_writer", streamed.name, str(4 * NUM_FRAMES), str(NUM_FRAMES)))
+    arguments = str(streamed.descriptor), str(4 * NUM_FRAMES), str(NUM_FRAMES)
+    source = stack.enter_context(Remote("ring_writer", *arguments, pass_fds=[streamed.descriptor]))
 
     def stream() -> float:
         count, start = 0, time.perf_counter()
@@ -106,12 +105,15 @@ def _ring_bodies(stack: contextlib.ExitStack, budget: Budget) -> dict[str, Calla
 
 def _queue_bodies(stack: contextlib.ExitStack, budget: Budget) -> dict[str, Callable[[], float]]:
     """Seconds of a memcpy of the vector and of a publication, with the readers done or copying."""
-    name = f"gvz-bench-{secrets.token_hex(6)}"
-    writer = BroadcastWriter.create(name, NUM_PARAMS, 0)
+    writer = BroadcastWriter.create("gvz-bench", NUM_PARAMS, 0)
     stack.callback(writer.close)
     params, header = np.ones(NUM_PARAMS, np.float32), ParamsHeader(version=1, num_updates=0)
     targets = itertools.cycle([params.copy() for _ in range(3)])  # as many vectors as the queue holds
-    readers = [stack.enter_context(Remote("params_reader", name, str(NUM_PARAMS))) for _ in range(NUM_READERS)]
+    arguments = str(writer.descriptor), str(NUM_PARAMS)
+    readers = [
+        stack.enter_context(Remote("params_reader", *arguments, pass_fds=[writer.descriptor]))
+        for _ in range(NUM_READERS)
+    ]
 
     def paused(call: Callable[[], object]) -> float:
         times, start = [], time.perf_counter()

@@ -29,12 +29,12 @@ class Bill:
     num_actors: int
     num_games: int
     transport_bytes: int
-    """rings and broadcast queue"""
+    """rings and parameter queue"""
 
     @property
     def shm_bytes(self) -> int:
-        """Shared memory: transport and engines."""
-        return self.transport_bytes + self.num_games * ENGINE_SHM_BYTES
+        """What the engines take of /dev/shm. (Rings and parameter queue are anonymous memory, not files in it.)"""
+        return self.num_games * ENGINE_SHM_BYTES
 
     @property
     def snapshot_bytes(self) -> int:
@@ -50,6 +50,7 @@ class Bill:
             + self.snapshot_bytes
             + self.num_actors * (ACTOR_MEMORY_BYTES + 2 * self.params_bytes)
             + self.num_games * ENGINE_MEMORY_BYTES
+            + self.transport_bytes
             + self.shm_bytes
         )
 
@@ -58,7 +59,8 @@ class Bill:
         where = "host" if self.replay_on_host else "device"
         return [
             f"replay {format_bytes(self.replay_bytes)} ({where}), checkpoint copy {format_bytes(self.snapshot_bytes)}",
-            f"shared memory {format_bytes(self.shm_bytes)}, host memory in all {format_bytes(self.memory_bytes)}",
+            f"/dev/shm {format_bytes(self.shm_bytes)}, rings and parameter queue {format_bytes(self.transport_bytes)}, "
+            f"host memory in all {format_bytes(self.memory_bytes)}",
             f"processes: 1 learner, {self.num_actors} actors, {self.num_games} engines",
         ]
 
@@ -81,7 +83,7 @@ def check(bill: Bill, *, shm_free: int | None = None, memory_free: int | None = 
         raise ResourceError(
             f"shared memory: /dev/shm has {format_bytes(shm_free)} free, want {format_bytes(bill.shm_bytes)}. "
             f"In Docker start with --shm-size={need}m; elsewhere `mount -o remount,size={need}m /dev/shm` as root; "
-            "or lower --actors.games-per-actor or --actors.ring-capacity."
+            "or lower --actors.games-per-actor."
         )
     if bill.memory_bytes > memory_free:
         raise ResourceError(

@@ -1,9 +1,10 @@
 """Finds and removes what dead processes of ours left behind. Linux; standard library and gvz.errors only.
 
-A SIGKILL leaves shared memory, private directories and, at worst, engines. So whoever makes such a thing
-first writes a record of it: a small private file that names the thing and its owner (process id and start
-time, so that a reused process id is not mistaken for its owner). `clean_dead_instances` removes what belongs
-to records whose owner is gone, and nothing else: nothing is ever matched by a pattern of names.
+A SIGKILL leaves private directories and, at worst, engines with their files in /dev/shm. (Our own shared memory is
+anonymous: the kernel frees it.) So whoever makes such a thing first writes a record of it: a small private file that
+names the thing and its owner (process id and start time, so that a reused process id is not mistaken for its owner).
+`clean_dead_instances` removes what belongs to records whose owner is gone, and nothing else: nothing is ever matched
+by a pattern of names.
 
 Every step can be repeated and any number of janitors may run at once: names are never used twice.
 """
@@ -28,8 +29,8 @@ from typing import Literal
 
 from gvz.errors import ResourceError, WaitTimeoutError
 
-Kind = Literal["engine", "segment", "directory"]
-"""engine: `name` is an engine's private directory; segment: a file of /dev/shm; directory: a `temporary_directory`."""
+Kind = Literal["engine", "directory"]
+"""engine: `name` is an engine's private directory; directory: a `temporary_directory`."""
 
 SHM_DIR = Path("/dev/shm")
 ENGINE_DIR_PREFIX = "gvz-engine-"
@@ -119,7 +120,7 @@ def temporary_directory(purpose: str) -> Generator[Path, None, None]:
 
 
 def clean_dead_instances() -> list[str]:
-    """Removes what dead owners left: engines, shared memory, private directories.
+    """Removes what dead owners left: engines, their shared memory, private directories.
 
     Returns:
         One line for each thing removed, and for each record that cannot be read (these are left alone).
@@ -144,7 +145,7 @@ def clean_dead_instances() -> list[str]:
 
 
 def dead_instances() -> list[str]:
-    """What `clean_dead_instances` would remove: private directories of engines and names in /dev/shm."""
+    """What `clean_dead_instances` would remove: private directories."""
     found: list[str] = []
     for path in _records():
         with contextlib.suppress(*_UNREADABLE):
@@ -304,11 +305,8 @@ def _check_name(kind: str, name: str) -> None:
     elif kind == "directory":
         good = Path(name).is_absolute() and ".." not in name and _DIRECTORY.fullmatch(Path(name).name) is not None
         wanted = "an absolute path that ends in gvz-PURPOSE-0123456789abcdef"
-    elif kind == "segment":
-        good = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) is not None
-        wanted = "a file name of letters, digits, '.', '_', '-'"
     else:
-        raise ValueError(f"record of kind {kind!r}: want engine, segment or directory")
+        raise ValueError(f"record of kind {kind!r}: want engine or directory")
     if not good:
         raise ValueError(f"record of kind {kind!r}: got name {name!r}, want {wanted}")
 
@@ -330,7 +328,6 @@ def _remove_directory(directory: Path) -> list[str]:
 
 _REMOVE: dict[str, Callable[[str], list[str]]] = {
     "engine": lambda name: clean_engine(Path(name)),
-    "segment": _unlink_shm,
     "directory": lambda name: _remove_directory(Path(name)),
 }
 """by kind: removes what a record names, returns a line for each thing removed"""

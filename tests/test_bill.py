@@ -17,8 +17,9 @@ BILL = Bill(
 )
 
 
-def test_shared_memory_is_transport_and_engines():
-    assert BILL.shm_bytes == 100_000_000 + 8 * ENGINE_SHM_BYTES
+def test_engines_alone_take_dev_shm_and_the_transport_is_memory_all_the_same():
+    assert BILL.shm_bytes == 8 * ENGINE_SHM_BYTES
+    assert BILL.memory_bytes - dataclasses.replace(BILL, transport_bytes=0).memory_bytes == 100_000_000
 
 
 def test_a_replay_on_a_gpu_is_not_charged_to_the_host_but_its_checkpoint_copy_is():
@@ -39,7 +40,7 @@ def test_what_fits_passes():
 
 def test_a_small_dev_shm_is_refused_with_advice():
     with pytest.raises(
-        ResourceError, match=r"/dev/shm has 64 MB free, want 188 MB\. In Docker start with --shm-size=180m"
+        ResourceError, match=r"/dev/shm has 64 MB free, want 88 MB\. In Docker start with --shm-size=84m"
     ):
         check(BILL, shm_free=64_000_000, memory_free=10**12)
 

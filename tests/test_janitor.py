@@ -9,7 +9,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -32,11 +31,11 @@ def registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def segment() -> Iterator[Path]:
-    path = janitor.SHM_DIR / f"gvz-test-{os.getpid()}"
-    path.write_bytes(b"payload")
-    yield path
-    path.unlink(missing_ok=True)
+def directory(tmp_path: Path) -> Path:
+    """A private directory, as `temporary_directory` names it."""
+    path = tmp_path / "gvz-test-0123456789abcdef"
+    path.mkdir()
+    return path
 
 
 def run_until_killed(code: str) -> str:
@@ -63,13 +62,13 @@ def wait_until_gone(pid: int) -> bool:
 
 
 def test_records_are_private(registry: Path):
-    janitor.record("segment", "gvz-x")
+    janitor.record("directory", "/tmp/gvz-test-0123456789abcdef")
     (path,) = registry.glob("*.json")
     assert path.stat().st_mode & 0o777 == 0o600
     assert registry.stat().st_mode & 0o777 == 0o700
-    janitor.forget("segment", "gvz-x")
+    janitor.forget("directory", "/tmp/gvz-test-0123456789abcdef")
     assert list(registry.iterdir()) == []
-    janitor.forget("segment", "gvz-x")  # again, and of what was never recorded
+    janitor.forget("directory", "/tmp/gvz-test-0123456789abcdef")  # again, and of what was never recorded
 
 
 def test_a_temporary_directory_goes_with_its_block_or_with_the_next_start(registry: Path):
@@ -94,45 +93,44 @@ def test_a_record_half_written_long_ago_is_removed(registry: Path):
     assert [path.name for path in registry.iterdir()] == ["new.partial"]
 
 
-def test_what_a_living_owner_has_is_left_alone(registry: Path, segment: Path):
-    janitor.record("segment", segment.name)
+def test_what_a_living_owner_has_is_left_alone(registry: Path, directory: Path):
+    janitor.record("directory", str(directory))
     assert janitor.clean_dead_instances() == []
-    assert segment.exists()
+    assert directory.exists()
     assert len(list(registry.glob("*.json"))) == 1
 
 
-def test_a_dead_owners_segment_is_unlinked(registry: Path, segment: Path):
+def test_a_dead_owners_directory_is_removed(registry: Path, directory: Path):
     run_until_killed(
-        f"from gvz import janitor; janitor.record('segment', {segment.name!r}); print(1, flush=True); input()"
+        f"from gvz import janitor; janitor.record('directory', {str(directory)!r}); print(1, flush=True); input()"
     )
     assert len(list(registry.glob("*.json"))) == 1
-    assert janitor.clean_dead_instances() == [f"shared memory {segment.name}"]
-    assert not segment.exists()
+    assert janitor.clean_dead_instances() == [f"directory {directory}"]
+    assert not directory.exists()
     assert list(registry.iterdir()) == []
     assert janitor.clean_dead_instances() == []
 
 
-def test_a_reused_process_id_is_not_the_owner(registry: Path, segment: Path):
-    janitor.record("segment", segment.name)
+def test_a_reused_process_id_is_not_the_owner(registry: Path, directory: Path):
+    janitor.record("directory", str(directory))
     start = janitor.process_start(os.getpid())
     assert start is not None
     change_record(registry, owner_start=start - 1)
-    assert janitor.clean_dead_instances() == [f"shared memory {segment.name}"]
+    assert janitor.clean_dead_instances() == [f"directory {directory}"]
 
 
-def test_records_of_another_machine_are_left_alone(registry: Path, segment: Path):
-    janitor.record("segment", segment.name)
+def test_records_of_another_machine_are_left_alone(registry: Path, directory: Path):
+    janitor.record("directory", str(directory))
     change_record(registry, owner_start=1, machine="another boot")
     assert janitor.clean_dead_instances() == []
-    assert segment.exists()
+    assert directory.exists()
 
 
 @pytest.mark.parametrize(
     ("kind", "name"),
     [
-        ("segment", "../etc/passwd"),
-        ("segment", ".."),
-        ("segment", ""),
+        ("segment", "gvz-x"),
+        ("directory", ""),
         ("engine", "gvz-engine-relative"),
         ("engine", "/tmp/gvz-engine-x/../../home"),
         ("engine", "/home/someone"),
@@ -143,19 +141,25 @@ def test_records_of_another_machine_are_left_alone(registry: Path, segment: Path
         ("file", "/tmp/gvz-test-0123456789abcdef"),
     ],
 )
-def test_forged_records_delete_nothing(registry: Path, segment: Path, kind: str, name: str):
-    janitor.record("segment", segment.name)
+def test_forged_records_delete_nothing(registry: Path, directory: Path, kind: str, name: str):
+    janitor.record("directory", str(directory))
     change_record(registry, owner_start=1, kind=kind, name=name)
     (line,) = janitor.clean_dead_instances()
     assert line.startswith("left alone: unreadable record")
-    assert segment.exists()
+    assert directory.exists()
     with pytest.raises(ValueError, match="record of kind"):
         janitor.record(kind, name)
 
 
 def forged(**changes: object) -> str:
     machine = janitor._machine()
-    record = {"kind": "segment", "name": "x", "owner_pid": 1, "owner_start": 1, "machine": machine}
+    record = {
+        "kind": "directory",
+        "name": "/tmp/gvz-test-0123456789abcdef",
+        "owner_pid": 1,
+        "owner_start": 1,
+        "machine": machine,
+    }
     return json.dumps({**record, **changes})
 
 
@@ -172,7 +176,7 @@ def forged(**changes: object) -> str:
     ids=range(6),
 )
 def test_a_record_that_is_damaged_is_reported_and_left(registry: Path, text: str):
-    path = registry / "segment-1-1-x.json"
+    path = registry / "directory-1-1-x.json"
     path.write_text(text)
     assert len(janitor.dead_instances()) <= 1  # a name can be too long only for the disk
     (line,) = janitor.clean_dead_instances()

@@ -26,7 +26,6 @@ from gvz.probe import probe_wad
 from gvz.reports.results import read_results
 from gvz.rundir import RunDir
 from gvz.telemetry import Telemetry
-from gvz.transport.segment import Segment
 from gvz.wad.acs import compile_acs
 from gvz.wad.lumps import Lump, read_wad, write_wad
 from learner import checkpoint
@@ -148,18 +147,14 @@ def test_a_run_directory_and_all_in_it_are_private_whatever_the_umask(tmp_path: 
 
 
 @pytest.mark.usefixtures("open_umask")
-def test_shared_memory_and_the_records_of_it_are_private_whatever_the_umask(
+def test_private_directories_and_the_records_of_them_are_private_whatever_the_umask(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     tmp_path.chmod(0o700)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    segment = Segment.create(f"gvz-test-private-{os.getpid()}", 64, layout_hash=1)
-    try:
-        assert segment.name is not None
-        assert stat.S_IMODE((janitor.SHM_DIR / segment.name).stat().st_mode) == 0o600
+    with janitor.temporary_directory("test") as directory:
+        assert stat.S_IMODE(directory.stat().st_mode) == 0o700
         assert set(modes(tmp_path).values()) == {0o700, 0o600}
-    finally:
-        segment.close()
 
 
 # ------------------------------------------------------------------------------------------------- from strangers

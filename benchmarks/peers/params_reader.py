@@ -1,5 +1,5 @@
 """Takes every version of the parameters that it can, looking as often as a fast actor acts:
-`python params_reader.py NAME NUM_PARAMS`."""
+`python params_reader.py DESCRIPTOR NUM_PARAMS`."""
 
 import sys
 import time
@@ -15,7 +15,7 @@ _STEP_S = 0.001
 
 def main() -> None:
     """Attaches to the queue and serves."""
-    reader = BroadcastReader.attach(sys.argv[1], int(sys.argv[2]), 0)
+    reader = BroadcastReader.attach(int(sys.argv[1]), int(sys.argv[2]), 0)
 
     def read(seconds: float) -> dict[str, Any]:
         count, start = 0, time.perf_counter()

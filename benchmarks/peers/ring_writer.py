@@ -1,4 +1,4 @@
-"""Writes blocks into a ring as fast as its reader makes room: `python ring_writer.py NAME CAPACITY BLOCK`."""
+"""Writes blocks into a ring as fast as its reader makes room: `python ring_writer.py DESCRIPTOR CAPACITY BLOCK`."""
 
 import sys
 import time
@@ -15,8 +15,8 @@ _TIMEOUT_S = 60.0
 
 def main() -> None:
     """Attaches to the ring and serves."""
-    name, capacity, block = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-    ring = RingWriter.attach(name, capacity, _SHAPE)
+    descriptor, capacity, block = map(int, sys.argv[1:])
+    ring = RingWriter.attach(descriptor, capacity, _SHAPE)
     frames = np.random.default_rng(0).integers(0, 256, (block, *_SHAPE), np.uint8)
 
     def write(seconds: float) -> dict[str, Any]:

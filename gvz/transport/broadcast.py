@@ -21,7 +21,7 @@ _TICKET, _VERSION, _NUM_UPDATES, _EPSILON_BITS, _NUM_WORDS = 0, 1, 2, 3, 8
 _READ_TIMEOUT_S = 30.0
 
 
-class _Board:
+class _ParamsQueue:
     """What both ends share: the mapped arrays."""
 
     def __init__(self, segment: Segment, num_params: int, num_slots: int, layout_hash: int):
@@ -38,13 +38,13 @@ class _Board:
         self._fence = Fence()
 
     def close(self) -> None:
-        """Lets go of the memory; the writer also removes it. Can be repeated."""
+        """Lets go of the memory. Can be repeated."""
         self._count = memoryview(bytes(8)).cast("Q")
         self._words, self._vectors = [], []
         self._segment.close()
 
 
-class BroadcastWriter(_Board):
+class BroadcastWriter(_ParamsQueue):
     """The learner's end, which makes the queue."""
 
     @classmethod
@@ -52,14 +52,14 @@ class BroadcastWriter(_Board):
         """Makes a queue without a version.
 
         Args:
-            name: name of the segment.
+            name: what errors call it.
             num_params: length P of the flat float32 vector.
             layout_hash: u64 hash of the parameter tree; readers must bring the same.
             num_slots: versions kept, at least 2. A reader is overtaken only when `num_slots - 1` publications begin
                 within its one copy.
 
         Raises:
-            ResourceError: /dev/shm has no room.
+            ResourceError: there is not enough memory.
         """
         if num_slots < 2:
             raise ValueError(f"num_slots: got {num_slots}, want at least 2 (one is read while one is written)")
@@ -68,11 +68,16 @@ class BroadcastWriter(_Board):
             broadcast_bytes(num_params, num_slots),
             layout_hash=hash_layout("broadcast", num_params, num_slots, layout_hash),
         )
-        board = cls(segment, num_params, num_slots, layout_hash)
-        for words in (board._count, *board._words):
+        queue = cls(segment, num_params, num_slots, layout_hash)
+        for words in (queue._count, *queue._words):
             for index in range(_NUM_WORDS):
                 words[index] = 0
-        return board
+        return queue
+
+    @property
+    def descriptor(self) -> int:
+        """File descriptor by which other processes can attach a `BroadcastReader`."""
+        return self._segment.descriptor
 
     def publish(self, params: np.ndarray, header: ParamsHeader) -> None:
         """Makes `params` float32[P] the newest version. Never waits.
@@ -100,7 +105,7 @@ class BroadcastWriter(_Board):
         self._count[0] = count + 1
 
 
-class BroadcastReader(_Board):
+class BroadcastReader(_ParamsQueue):
     """An actor's end."""
 
     def __init__(self, segment: Segment, num_params: int, num_slots: int, layout_hash: int):
@@ -108,14 +113,14 @@ class BroadcastReader(_Board):
         self._seen = 0  # publications
 
     @classmethod
-    def attach(cls, name: str, num_params: int, layout_hash: int, *, num_slots: int = 3) -> "BroadcastReader":
+    def attach(cls, descriptor: int, num_params: int, layout_hash: int, *, num_slots: int = 3) -> "BroadcastReader":
         """Maps the queue.
 
         Raises:
-            TransportError: no such queue, or it was made for other parameters.
+            TransportError: the descriptor is no queue's, or the queue was made for other parameters.
         """
         segment = Segment.attach(
-            name,
+            descriptor,
             broadcast_bytes(num_params, num_slots),
             layout_hash=hash_layout("broadcast", num_params, num_slots, layout_hash),
         )

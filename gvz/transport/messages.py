@@ -19,7 +19,7 @@ import numpy as np
 
 from gvz.errors import TransportError
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Raised by one whenever the meaning or layout of anything in this file changes."""
 
 STEP_DTYPE = np.dtype(
@@ -137,9 +137,7 @@ class ActorSpec:
     num_actions: int
     policy: bytes
     """serialized jax.export of the acting function; empty for a uniformly random policy"""
-    ring_name: str
     ring_capacity: int
-    broadcast_name: str
     num_params: int
     """length of the flat parameter vector; 0 for a random policy, which has no queue"""
     layout_hash: int
@@ -213,7 +211,7 @@ def _fits(value: Any, kind: Any) -> bool:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ParamsHeader:
-    """What a version of the parameters says of itself on the broadcast board."""
+    """What a version of the parameters says of itself in the parameter queue."""
 
     version: int
     """0 is the initial parameters; rises by one with every publication"""

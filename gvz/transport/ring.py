@@ -81,7 +81,7 @@ class _Ring:
         return published - consumed
 
     def close(self) -> None:
-        """Lets go of the memory; the end that created the ring also removes it. Can be repeated."""
+        """Lets go of the memory. Can be repeated."""
         self._words = memoryview(bytes(8 * _NUM_WORDS)).cast("Q")
         self._steps, self._frames = np.empty(0, STEP_DTYPE), np.empty(0, np.uint8)
         self._sequence = self._steps["sequence"]
@@ -92,16 +92,16 @@ class RingReader(_Ring):
     """The learner's end, which makes the ring and outlives its writers."""
 
     @classmethod
-    def create(cls, name: str | None, capacity: int, frame_shape: tuple[int, int, int]) -> "RingReader":
+    def create(cls, name: str, capacity: int, frame_shape: tuple[int, int, int]) -> "RingReader":
         """Makes an empty ring.
 
         Args:
-            name: name of the segment; None for a ring within this process.
+            name: what errors call it.
             capacity: records, at least 1.
             frame_shape: (H, W, C) of a frame, uint8.
 
         Raises:
-            ResourceError: /dev/shm has no room.
+            ResourceError: there is not enough memory.
         """
         segment = Segment.create(
             name, ring_bytes(capacity, frame_shape), layout_hash=_layout_hash(capacity, frame_shape)
@@ -111,6 +111,11 @@ class RingReader(_Ring):
         for index in range(_NUM_WORDS):
             ring._words[index] = 0
         return ring
+
+    @property
+    def descriptor(self) -> int:
+        """File descriptor by which another process can attach its `RingWriter`."""
+        return self._segment.descriptor
 
     def writer(self) -> "RingWriter":
         """The writing end for a writer in this process."""
@@ -189,14 +194,14 @@ class RingWriter(_Ring):
         self._words[_PID] = os.getpid()
 
     @classmethod
-    def attach(cls, name: str, capacity: int, frame_shape: tuple[int, int, int]) -> "RingWriter":
+    def attach(cls, descriptor: int, capacity: int, frame_shape: tuple[int, int, int]) -> "RingWriter":
         """Becomes the writer; goes on after the last record that a predecessor published.
 
         Raises:
-            TransportError: no such ring, or it has another layout.
+            TransportError: the descriptor is no ring's, or the ring has another layout.
         """
         segment = Segment.attach(
-            name, ring_bytes(capacity, frame_shape), layout_hash=_layout_hash(capacity, frame_shape)
+            descriptor, ring_bytes(capacity, frame_shape), layout_hash=_layout_hash(capacity, frame_shape)
         )
         return cls(segment, capacity, frame_shape)
 

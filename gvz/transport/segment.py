@@ -1,13 +1,13 @@
-"""Named POSIX shared memory with a header that proves what it is. Imports the standard library, numpy, gvz.errors
-and gvz.janitor.
+"""Anonymous shared memory with a header that proves what it is. Imports the standard library, numpy, gvz.errors.
 
-A segment is a file of /dev/shm (what `shm_open` would make), mapped. `multiprocessing.shared_memory` is not used:
-its resource tracker unlinks segments that a mere reader attached to.
+A segment is a `memfd_create` file, mapped. It has no name in any directory: a process is given its descriptor when it
+is started, and the kernel frees the memory when the last process that maps it or holds its descriptor has ended. So
+no crash leaves anything behind. It counts as memory of the process group, not towards the size of /dev/shm.
 
 Layout: eight little-endian u64 (magic, schema, total bytes, layout hash, four unused), then the payload.
 """
 
-import contextlib
+import fcntl
 import hashlib
 import mmap
 import os
@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 
-from gvz import janitor
 from gvz.errors import ResourceError, TransportError
 from gvz.transport.messages import SCHEMA_VERSION
 
@@ -30,57 +29,67 @@ POISON = 0xFF
 
 
 class Segment:
-    """One mapped piece of shared memory. Views of `payload` keep the mapping alive after `close`."""
+    """One mapped piece of shared memory. Views of `payload` keep the mapping alive after `close`.
 
-    def __init__(self, name: str | None, mapping: mmap.mmap, *, owner: bool):
+    Attributes:
+        name: what errors and `/proc/PID/maps` call it.
+        descriptor: the file descriptor to give to another process (`pass_fds`); -1 where the segment is attached.
+    """
+
+    def __init__(self, name: str, mapping: mmap.mmap, descriptor: int = -1):
         self.name = name
+        self.descriptor = descriptor
         self.payload = memoryview(mapping)[HEADER_BYTES:]
-        self._owner = owner
 
     @classmethod
-    def create(cls, name: str | None, payload_bytes: int, *, layout_hash: int) -> "Segment":
-        """Makes a segment, all of its memory taken at once and poisoned.
+    def create(cls, name: str, payload_bytes: int, *, layout_hash: int) -> "Segment":
+        """Makes a segment, all of its memory allocated at once and poisoned. Its size can never change.
 
         Args:
-            name: file name in /dev/shm, not used before; None for private memory without a name.
+            name: any label; several segments may have the same.
             payload_bytes: size without the header.
             layout_hash: u64; `attach` must bring the same.
 
         Raises:
-            ResourceError: /dev/shm has no room. (Without asking first, the first touch of a missing page is SIGBUS.)
-            TransportError: the name is taken.
+            ResourceError: there is not enough memory.
         """
         total = HEADER_BYTES + payload_bytes
-        mapping = mmap.mmap(-1, total) if name is None else _create_file(name, total)
+        available = _available_bytes()
+        if total > available:  # the kernel would not refuse: it would kill processes until there is room
+            raise ResourceError(
+                f"segment {name}: got {available} bytes of available memory, want {total}; "
+                "lower actors.ring_capacity or actors.num_actors"
+            )
+        descriptor = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        try:
+            os.posix_fallocate(descriptor, 0, total)
+            fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)
+            mapping = mmap.mmap(descriptor, total)
+        except OSError as error:
+            os.close(descriptor)
+            raise ResourceError(f"segment {name}: the kernel refused {total} bytes: {error.strerror}") from error
         np.frombuffer(mapping, np.uint8)[HEADER_BYTES:] = POISON
         header = memoryview(mapping)[:HEADER_BYTES].cast("Q")
         header[1], header[2], header[3] = SCHEMA_VERSION, total, layout_hash
         header[0] = MAGIC
-        return cls(name, mapping, owner=name is not None)
+        return cls(name, mapping, descriptor)
 
     @classmethod
-    def attach(cls, name: str, payload_bytes: int, *, layout_hash: int) -> "Segment":
-        """Maps the segment that another process made.
+    def attach(cls, descriptor: int, payload_bytes: int, *, layout_hash: int) -> "Segment":
+        """Maps the segment that another process made. The descriptor stays the caller's, who may close it.
 
         Raises:
-            TransportError: no such segment, not ours, or not what was expected of it.
+            TransportError: no such descriptor, or the file is not what was expected.
         """
+        total = HEADER_BYTES + payload_bytes
         try:
-            file = os.open(_path(name), os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+            size = os.fstat(descriptor).st_size
+            name = Path(f"/proc/self/fd/{descriptor}").readlink().name.removeprefix("memfd:").removesuffix(" (deleted)")
+            if size != total:
+                raise TransportError(f"segment {name}: got {size} bytes, want {total}")
+            mapping = mmap.mmap(descriptor, total)
         except OSError as error:
-            raise TransportError(
-                f"segment {name}: cannot be attached: {error.strerror}; its owner has ended, or systemd has removed "
-                "it at a logout of this user (RemoveIPC=yes in logind.conf)"
-            ) from error
-        try:
-            found, total = os.fstat(file), HEADER_BYTES + payload_bytes
-            if found.st_uid != os.geteuid():
-                raise TransportError(f"segment {name}: got owner {found.st_uid}, want our own {os.geteuid()}")
-            if found.st_size != total:
-                raise TransportError(f"segment {name}: got {found.st_size} bytes, want {total}")
-            mapping = mmap.mmap(file, total)
-        finally:
-            os.close(file)
+            raise TransportError(f"segment of descriptor {descriptor}: cannot be mapped: {error.strerror}") from error
         got = memoryview(mapping)[:HEADER_BYTES].cast("Q")
         wanted = (MAGIC, SCHEMA_VERSION, total, layout_hash)
         for index, field in enumerate(("magic", "schema", "size", "layout hash")):
@@ -89,44 +98,21 @@ class Segment:
                     f"segment {name}: got {field} {got[index]:#x}, want {wanted[index]:#x}; "
                     "both sides must run the same version with the same configuration"
                 )
-        return cls(name, mapping, owner=False)
+        return cls(name, mapping)
 
     def close(self) -> None:
-        """Lets go of the mapping; the owner also unlinks the name, once. Can be repeated."""
+        """Lets go of mapping and descriptor. Can be repeated."""
         self.payload = memoryview(b"")
-        if self._owner and self.name is not None:
-            self._owner = False
-            with contextlib.suppress(FileNotFoundError):  # a janitor may have been called on it by hand
-                _path(self.name).unlink()
-            janitor.forget("segment", self.name)
+        if self.descriptor >= 0:
+            os.close(self.descriptor)
+            self.descriptor = -1
 
 
-def _create_file(name: str, total: int) -> mmap.mmap:
-    path = _path(name)
-    if path.exists():
-        raise TransportError(f"segment {name}: the name is taken in {janitor.SHM_DIR}; names are never used twice")
-    janitor.record("segment", name)
-    file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-    try:
-        os.posix_fallocate(file, 0, total)
-        return mmap.mmap(file, total)
-    except OSError as error:
-        path.unlink()
-        janitor.forget("segment", name)
-        free = os.statvfs(janitor.SHM_DIR)
-        raise ResourceError(
-            f"segment {name}: {janitor.SHM_DIR} has no room for {total} bytes ({free.f_bavail * free.f_frsize} free): "
-            f"{error.strerror}; enlarge it (mount -o remount,size=2G {janitor.SHM_DIR}, docker run --shm-size=2g), "
-            "or lower actors.ring_capacity or actors.num_actors"
-        ) from error
-    finally:
-        os.close(file)
-
-
-def _path(name: str) -> Path:
-    if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) is None:
-        raise ValueError(f"segment name: got {name!r}, want letters, digits, '.', '_', '-'")
-    return janitor.SHM_DIR / name
+def _available_bytes() -> int:
+    """Memory that can be taken without swapping."""
+    found = re.search(r"^MemAvailable: +(\d+) kB$", Path("/proc/meminfo").read_text(), re.MULTILINE)
+    assert found is not None, "/proc/meminfo has no line MemAvailable"
+    return 1024 * int(found[1])
 
 
 def aligned(num_bytes: int) -> int:

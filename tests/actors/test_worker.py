@@ -44,12 +44,12 @@ def first_param_policy() -> bytes:
 @pytest.fixture
 def spec(tmp_path: Path) -> ActorSpec:
     pool_config = config(tmp_path, {}, num_actors=1)
-    return pool_config.actor_specs(f"gvz-test-{os.urandom(6).hex()}", [0, 0])[0]
+    return pool_config.actor_specs([0, 0])[0]
 
 
 @pytest.fixture
 def ring(spec: ActorSpec) -> Iterator[RingReader]:
-    reader = RingReader.create(spec.ring_name, spec.ring_capacity, FRAME_SHAPE)
+    reader = RingReader.create("gvz-test", spec.ring_capacity, FRAME_SHAPE)
     yield reader
     reader.close()
 
@@ -73,7 +73,7 @@ def start(first: bytes | None, parent_pid: int) -> subprocess.CompletedProcess[s
     ours, theirs = socket.socketpair()
     with ours, theirs:
         process = subprocess.Popen(
-            [sys.executable, "-m", "actors.worker", str(theirs.fileno()), str(parent_pid)],
+            [sys.executable, "-m", "actors.worker", str(parent_pid), str(theirs.fileno()), "-1"],
             pass_fds=[theirs.fileno()],
             stderr=subprocess.PIPE,
             text=True,
@@ -107,7 +107,7 @@ def test_a_worker_whose_parent_has_gone_ends_at_once():
 
 
 def test_told_to_stop_it_ends_well(spec: ActorSpec, ring: RingReader):
-    process = ActorProcess(spec)
+    process = ActorProcess(spec, ring, None)
     try:
         while not any(isinstance(message, Ready) for message in process.receive()):
             assert process.exit_text() is None
@@ -121,45 +121,42 @@ def test_told_to_stop_it_ends_well(spec: ActorSpec, ring: RingReader):
         process.end(grace_s=0.0)
 
 
-@pytest.mark.usefixtures("ring")
 def test_a_learner_that_never_reads_is_given_up(
-    spec: ActorSpec, channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
+    spec: ActorSpec, ring: RingReader, channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(worker, "SPACE_TIMEOUT_S", 0.05)
     with pytest.raises(WaitTimeoutError, match=r"waited 0\.\d s for the learner to read; 0 of \d+ records are free"):
-        Worker(spec, channels[1]).run()
+        Worker(spec, channels[1], ring.descriptor, None).run()
 
 
-@pytest.mark.usefixtures("ring")
 def test_a_learner_that_never_publishes_is_given_up(
-    spec: ActorSpec, channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
+    spec: ActorSpec, ring: RingReader, channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(worker, "PARAMS_TIMEOUT_S", 0.05)
     spec = replace(spec, policy=first_param_policy(), num_params=NUM_PARAMS, layout_hash=LAYOUT)
-    board = BroadcastWriter.create(spec.broadcast_name, NUM_PARAMS, LAYOUT)
+    queue = BroadcastWriter.create("gvz-test", NUM_PARAMS, LAYOUT)
     try:
         with pytest.raises(
             WaitTimeoutError, match="actor 0 waited 0 s for the learner to publish the first parameters"
         ):
-            Worker(spec, channels[1]).run()
+            Worker(spec, channels[1], ring.descriptor, queue.descriptor).run()
         channels[0].send(Stop())
-        Worker(spec, channels[1]).run()  # told to stop, it does not wait
+        Worker(spec, channels[1], ring.descriptor, queue.descriptor).run()  # told to stop, it does not wait
     finally:
-        board.close()
+        queue.close()
 
 
-@pytest.mark.usefixtures("ring")
 def test_taking_parameters_keeps_to_its_share_of_the_time(
-    spec: ActorSpec, channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
+    spec: ActorSpec, ring: RingReader, channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
 ):
     spec = replace(spec, policy=first_param_policy(), num_params=NUM_PARAMS, layout_hash=LAYOUT)
-    board = BroadcastWriter.create(spec.broadcast_name, NUM_PARAMS, LAYOUT)
+    queue = BroadcastWriter.create("gvz-test", NUM_PARAMS, LAYOUT)
     try:
-        actor = Worker(spec, channels[1])
+        actor = Worker(spec, channels[1], ring.descriptor, queue.descriptor)
         assert not actor._take_params()
         for share, taken in ((1e9, True), (1e9, True), (1e-9, True), (1e-9, False)):
             monkeypatch.setattr(worker, "MAX_PARAMS_SHARE", share)
-            board.publish(*params(1))
+            queue.publish(*params(1))
             assert actor._take_params() == taken
     finally:
-        board.close()
+        queue.close()

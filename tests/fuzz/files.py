@@ -219,6 +219,6 @@ def janitor_record(directory: Path) -> Target:
         fields = {"kind": kind, "name": name, "owner_pid": pid, "owner_start": 1, "machine": janitor._machine()}
         return json.dumps(fields).encode()
 
-    seeds = [record("segment", "gvz-x", 1), record("engine", str(engine), 1), record("segment", "gvz-y", os.getpid())]
+    seeds = [record("engine", str(engine), pid) for pid in (1, os.getpid())]
     seeds += [record("engine", str(engine), 1) + b"\n%%%%\n" + instance for instance in (b"1 2 Abc\n", b"1 2 ../x\n")]
-    return Target(run=run, seeds=seeds, words=[*JSON_WORDS, b'"engine"', b'"segment"', b"../", b"/", b"9" * 400])
+    return Target(run=run, seeds=seeds, words=[*JSON_WORDS, b'"engine"', b'"directory"', b"../", b"/", b"9" * 400])

@@ -5,14 +5,12 @@ Imports gvz.transport, learner for rings. Segments are real ones; then their byt
 
 import contextlib
 import os
-import secrets
 import socket
 import struct
 from pathlib import Path
 
 import numpy as np
 
-from gvz import janitor
 from gvz.errors import TransportError, WaitTimeoutError
 from gvz.transport import broadcast
 from gvz.transport.broadcast import BroadcastReader, BroadcastWriter
@@ -57,9 +55,7 @@ MESSAGES = [
         stack_size=4,
         num_actions=3,
         policy=b"\0\1",
-        ring_name="r",
         ring_capacity=8,
-        broadcast_name="b",
         num_params=3,
         layout_hash=2**64 - 1,
         work_dir="/x",
@@ -125,7 +121,7 @@ def ring(_directory: Path) -> Target:
     from learner.ingest import Ingest
     from learner.replay import ReplaySpec
 
-    reader = RingReader.create(None, CAPACITY, FRAME_SHAPE)
+    reader = RingReader.create("gvz-fuzz", CAPACITY, FRAME_SHAPE)
     writer, payload = reader.writer(), reader._segment.payload
     writer.beat(WriterState.ACTING)
     steps, frames = writer.reserve(4)
@@ -184,7 +180,7 @@ def ring(_directory: Path) -> Target:
 
 def parameter_queue(_directory: Path) -> Target:
     """The control words and slots of the queue of parameters."""
-    writer = BroadcastWriter.create(None, NUM_PARAMS, LAYOUT)  # pyright: ignore[reportArgumentType]
+    writer = BroadcastWriter.create("gvz-fuzz", NUM_PARAMS, LAYOUT)
     segment = writer._segment
     image = bytes(segment.payload)
     images = [image]
@@ -215,15 +211,16 @@ def parameter_queue(_directory: Path) -> Target:
 
 def segment_header(_directory: Path) -> Target:
     """A whole segment of shared memory, its header included, as it is attached to."""
-    name = f"gvz-fuzz-{os.getpid()}-{secrets.token_hex(4)}"
-    segment = Segment.create(name, 64, layout_hash=LAYOUT)
-    file = janitor.SHM_DIR / name
-    image = file.read_bytes()
+    segment = Segment.create("gvz-fuzz", 64, layout_hash=LAYOUT)
+    image = os.pread(segment.descriptor, HEADER_BYTES + 64, 0)
+    file = os.memfd_create("gvz-fuzz")  # of any size: a segment's own is fixed
+    segment.close()
 
     def run(data: bytes) -> bool:
-        file.write_bytes(data)
+        os.ftruncate(file, 0)
+        os.pwrite(file, data, 0)
         try:
-            attached = Segment.attach(name, 64, layout_hash=LAYOUT)
+            attached = Segment.attach(file, 64, layout_hash=LAYOUT)
         except TransportError:
             return False
         assert data[: 4 * 8] == image[: 4 * 8]
@@ -232,4 +229,5 @@ def segment_header(_directory: Path) -> Target:
         return True
 
     sizes = [struct.pack("<Q", n) for n in (64, 127, 128, 129)]
-    return Target(run=run, seeds=[image, image + b"x", image[:-1], b""], words=[*WORDS, *sizes], close=segment.close)
+    seeds = [image, image + b"x", image[:-1], b""]
+    return Target(run=run, seeds=seeds, words=[*WORDS, *sizes], close=lambda: os.close(file))

@@ -3,7 +3,6 @@
 import itertools
 import json
 import math
-import os
 from dataclasses import replace
 
 import jax
@@ -52,9 +51,9 @@ def write(ring: RingWriter, record: Record) -> None:
 def test_streams_through_real_rings_are_drawn_as_the_actors_saw_them():
     """Two actors of two lanes each, small rings that wrap and fill, and an actor that dies and has a successor."""
     rng = np.random.default_rng(0)
-    rings = [RingReader.create(f"gvz-test-ingest-{os.getpid()}-{actor}", 24, SPEC.frame_shape) for actor in range(2)]
+    rings = [RingReader.create("gvz-test", 24, SPEC.frame_shape) for _ in range(2)]
     try:
-        writers = [RingWriter.attach(ring.name, 24, SPEC.frame_shape) for ring in rings]
+        writers = [RingWriter.attach(ring.descriptor, 24, SPEC.frame_shape) for ring in rings]
         streams = [play(rng, SPEC, lane, mean_steps=8) for lane in range(4)]
         ingest, oracle, state = Ingest(SPEC, block_size=16), ReplayOracle(SPEC), replay.init(SPEC)
         decisions = 0
@@ -69,7 +68,7 @@ def test_streams_through_real_rings_are_drawn_as_the_actors_saw_them():
                 if writers[0].free:
                     writers[0].reserve(1)[1][:] = 255
                 writers[0].close()
-                writers[0] = RingWriter.attach(rings[0].name, 24, SPEC.frame_shape)
+                writers[0] = RingWriter.attach(rings[0].descriptor, 24, SPEC.frame_shape)
                 streams[:2] = [play(rng, SPEC, lane, mean_steps=8) for lane in range(2)]
             blocks = [ring.read(1000) for ring in rings]
             for arrays in ingest.arrays(blocks, params_version=0):

@@ -4,7 +4,6 @@
 time of one memcpy for a publication.
 """
 
-import secrets
 import subprocess
 import sys
 import time
@@ -41,7 +40,7 @@ class Memcpy:
 @pytest.mark.parametrize("side", ["write", "read"])
 def test_ring(benchmark: BenchmarkFixture, side: str):
     """One block of 64 records in, or out."""
-    reader = RingReader.create(f"gvz-perf-{secrets.token_hex(6)}", 2 * NUM_FRAMES, SHAPE)
+    reader = RingReader.create("gvz-perf", 2 * NUM_FRAMES, SHAPE)
     writer = reader.writer()
     frames = np.random.default_rng(0).integers(0, 256, (NUM_FRAMES, *SHAPE), np.uint8)
 
@@ -79,7 +78,7 @@ def test_ring(benchmark: BenchmarkFixture, side: str):
 _READER = """
 import sys
 from gvz.transport.broadcast import BroadcastReader
-reader = BroadcastReader.attach(sys.argv[1], int(sys.argv[2]), 0)
+reader = BroadcastReader.attach(int(sys.argv[1]), int(sys.argv[2]), 0)
 print("attached", flush=True)
 while True:
     newest = reader.read()
@@ -91,10 +90,10 @@ while True:
 @pytest.mark.parametrize("num_readers", [0, 8])
 def test_broadcast(benchmark: BenchmarkFixture, num_readers: int):
     """One publication, while the readers copy as fast as they can."""
-    name = f"gvz-perf-{secrets.token_hex(6)}"
-    writer = BroadcastWriter.create(name, NUM_PARAMS, 0)
-    command = [sys.executable, "-c", _READER, name, str(NUM_PARAMS)]
-    readers = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(num_readers)]
+    writer = BroadcastWriter.create("gvz-perf", NUM_PARAMS, 0)
+    command = [sys.executable, "-c", _READER, str(writer.descriptor), str(NUM_PARAMS)]
+    inherited = [writer.descriptor]
+    readers = [subprocess.Popen(command, stdout=subprocess.PIPE, pass_fds=inherited) for _ in range(num_readers)]
     params = np.ones(NUM_PARAMS, np.float32)
     header = ParamsHeader(version=1, num_updates=0)
     memcpy = Memcpy(params)

@@ -1,13 +1,13 @@
 """The parameter queue: whole versions only, and a writer that never waits."""
 
 import math
-import secrets
+import mmap
+import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,20 +24,19 @@ NUM_PARAMS, LAYOUT = 1000, 0xABCDEF
 
 
 @pytest.fixture
-def name() -> str:
-    return f"gvz-test-{secrets.token_hex(6)}"
+def writer() -> Iterator[BroadcastWriter]:
+    queue = BroadcastWriter.create("gvz-test", NUM_PARAMS, LAYOUT)
+    yield queue
+    queue.close()
 
 
 @pytest.fixture
-def writer(name: str) -> Iterator[BroadcastWriter]:
-    board = BroadcastWriter.create(name, NUM_PARAMS, LAYOUT)
-    yield board
-    board.close()
+def reader(writer: BroadcastWriter) -> BroadcastReader:
+    return BroadcastReader.attach(writer.descriptor, writer.num_params, LAYOUT)
 
 
-@pytest.fixture
-def reader(writer: BroadcastWriter, name: str) -> BroadcastReader:
-    return BroadcastReader.attach(name, writer.num_params, LAYOUT)
+def words_of(queue: BroadcastWriter, start: int = 0, dtype: type = np.uint64) -> np.ndarray:
+    return np.frombuffer(mmap.mmap(queue.descriptor, 0), dtype, 8, HEADER_BYTES + start)
 
 
 def header(version: int, *, epsilon: float = 0.0) -> ParamsHeader:
@@ -82,8 +81,8 @@ def test_what_was_read_is_the_readers_own(writer: BroadcastWriter, reader: Broad
     assert newest[0].ctypes.data % 64 == 0
 
 
-def test_every_reader_gets_every_version(writer: BroadcastWriter, reader: BroadcastReader, name: str):
-    late = BroadcastReader.attach(name, NUM_PARAMS, LAYOUT)
+def test_every_reader_gets_every_version(writer: BroadcastWriter, reader: BroadcastReader):
+    late = BroadcastReader.attach(writer.descriptor, NUM_PARAMS, LAYOUT)
     publish(writer, 3)
     assert read(reader) == read(late) == (header(3), [3.0] * NUM_PARAMS)
 
@@ -99,36 +98,32 @@ def test_another_tree_is_refused(writer: BroadcastWriter):
         writer.publish(np.zeros(NUM_PARAMS, np.float32), ParamsHeader(version=0, num_updates=0, layout_hash=1))
 
 
-@pytest.mark.usefixtures("writer")
-def test_a_reader_of_another_tree_is_refused(name: str):
+def test_a_reader_of_another_tree_is_refused(writer: BroadcastWriter):
     with pytest.raises(TransportError, match="got layout hash"):
-        BroadcastReader.attach(name, NUM_PARAMS, LAYOUT + 1)
+        BroadcastReader.attach(writer.descriptor, NUM_PARAMS, LAYOUT + 1)
     with pytest.raises(TransportError, match=r"got \d+ bytes"):
-        BroadcastReader.attach(name, NUM_PARAMS + 100, LAYOUT)
+        BroadcastReader.attach(writer.descriptor, NUM_PARAMS + 100, LAYOUT)
 
 
-def test_one_slot_is_refused(name: str):
+def test_one_slot_is_refused():
     with pytest.raises(ValueError, match="num_slots: got 1, want at least 2"):
-        BroadcastWriter.create(name, NUM_PARAMS, LAYOUT, num_slots=1)
+        BroadcastWriter.create("gvz-test", NUM_PARAMS, LAYOUT, num_slots=1)
 
 
 def test_a_version_that_never_becomes_whole_is_named(
-    writer: BroadcastWriter, reader: BroadcastReader, name: str, monkeypatch: pytest.MonkeyPatch
+    writer: BroadcastWriter, reader: BroadcastReader, monkeypatch: pytest.MonkeyPatch
 ):
     publish(writer, 0)
-    words = np.memmap(Path("/dev/shm") / name, np.uint64, "r+", HEADER_BYTES + 64, (8,))
-    words[0] += 1  # as if the writer were for ever at this slot
+    words_of(writer, 64)[0] += 1  # as if the writer never finished this slot
     monkeypatch.setattr(broadcast, "_READ_TIMEOUT_S", 0.05)
     with pytest.raises(WaitTimeoutError, match="reader waited 0 s for a whole version; the writer overtook every"):
         reader.read()
 
 
 @pytest.mark.parametrize("epsilon", [-0.1, 1.5, math.nan])
-def test_an_epsilon_that_is_no_probability_is_found(
-    writer: BroadcastWriter, reader: BroadcastReader, name: str, epsilon: float
-):
+def test_an_epsilon_that_is_no_probability_is_found(writer: BroadcastWriter, reader: BroadcastReader, epsilon: float):
     publish(writer, 0)
-    np.memmap(Path("/dev/shm") / name, np.float64, "r+", HEADER_BYTES + 64, (8,))[3] = epsilon
+    words_of(writer, 64, np.float64)[3] = epsilon
     with pytest.raises(TransportError, match=r"got epsilon (-0\.1|1\.5|nan), want 0\.\.1; its slot is damaged"):
         reader.read()
 
@@ -136,32 +131,31 @@ def test_an_epsilon_that_is_no_probability_is_found(
 @settings(max_examples=100, deadline=None)
 @given(count=st.integers(1, 2**64 - 1))
 def test_publications_that_never_were_are_found(count: int):
-    name = f"gvz-test-{secrets.token_hex(6)}"
-    writer = BroadcastWriter.create(name, NUM_PARAMS, LAYOUT)
+    writer = BroadcastWriter.create("gvz-test", NUM_PARAMS, LAYOUT)
     try:
-        np.memmap(Path("/dev/shm") / name, np.uint64, "r+", HEADER_BYTES, (8,))[0] = count
+        words_of(writer)[0] = count
         with pytest.raises(TransportError, match=f"{count} publications, but slot {(count - 1) % 3} was never written"):
-            BroadcastReader.attach(name, NUM_PARAMS, LAYOUT).read()
+            BroadcastReader.attach(writer.descriptor, NUM_PARAMS, LAYOUT).read()
     finally:
         writer.close()
 
 
-def test_closing_removes_the_queue_and_can_be_repeated(writer: BroadcastWriter, reader: BroadcastReader, name: str):
-    path = Path("/dev/shm") / name
-    assert path.stat().st_size == HEADER_BYTES + broadcast_bytes(NUM_PARAMS)
-    reader.close()
-    assert path.exists()
+def test_closing_can_be_repeated_and_leaves_the_other_end_its_memory(writer: BroadcastWriter, reader: BroadcastReader):
+    publish(writer, 3)
     writer.close()
     writer.close()
-    assert not path.exists()
+    assert read(reader) == (header(3), [3.0] * NUM_PARAMS)
+
+
+def test_the_size_is_what_it_says(writer: BroadcastWriter):
+    assert os.fstat(writer.descriptor).st_size == HEADER_BYTES + broadcast_bytes(NUM_PARAMS)
 
 
 _READER = """
 import sys
 import numpy as np
 from gvz.transport.broadcast import BroadcastReader
-name, num_params = sys.argv[1], int(sys.argv[2])
-reader = BroadcastReader.attach(name, num_params, 7, num_slots=2)
+reader = BroadcastReader.attach(int(sys.argv[1]), int(sys.argv[2]), 7, num_slots=2)
 last, count = -1, 0
 while count < 300:
     newest = reader.read()
@@ -175,11 +169,12 @@ while count < 300:
 """
 
 
-def test_readers_that_are_overtaken_never_see_half_a_version(name: str):
+def test_readers_that_are_overtaken_never_see_half_a_version():
     """Two slots and a writer at full speed: readers are overtaken all the time. One of them is stopped meanwhile."""
     num_params = 200_000
-    writer = BroadcastWriter.create(name, num_params, 7, num_slots=2)
-    readers = [subprocess.Popen([sys.executable, "-c", _READER, name, str(num_params)]) for _ in range(3)]
+    writer = BroadcastWriter.create("gvz-test", num_params, 7, num_slots=2)
+    command = [sys.executable, "-c", _READER, str(writer.descriptor), str(num_params)]
+    readers = [subprocess.Popen(command, pass_fds=[writer.descriptor]) for _ in range(3)]
     try:
         version, deadline = 0, time.monotonic() + 60.0
         while any(process.poll() is None for process in readers):

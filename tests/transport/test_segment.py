@@ -1,8 +1,8 @@
-"""Shared memory segments: made once, proved on attaching, gone afterwards."""
+"""Shared memory segments: anonymous, proved on attaching, freed by the kernel whoever dies."""
 
+import contextlib
+import mmap
 import os
-import secrets
-import stat
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvz import janitor
 from gvz.errors import ResourceError, TransportError
 from gvz.transport.segment import HEADER_BYTES, Segment, hash_layout
 
@@ -21,56 +20,78 @@ PAYLOAD, LAYOUT = 1000, hash_layout("test", 1)
 
 
 @pytest.fixture
-def name() -> str:
-    return f"gvz-test-{secrets.token_hex(6)}"
-
-
-@pytest.fixture
-def segment(name: str) -> Iterator[Segment]:
-    made = Segment.create(name, PAYLOAD, layout_hash=LAYOUT)
+def segment() -> Iterator[Segment]:
+    made = Segment.create("gvz-test", PAYLOAD, layout_hash=LAYOUT)
     yield made
     made.close()
 
 
-def file_of(segment: Segment) -> Path:
-    assert segment.name is not None
-    return Path("/dev/shm") / segment.name
+def attach(segment: Segment, payload_bytes: int = PAYLOAD) -> Segment:
+    return Segment.attach(segment.descriptor, payload_bytes, layout_hash=LAYOUT)
 
 
-def test_both_sides_see_one_memory(segment: Segment, name: str):
-    other = Segment.attach(name, PAYLOAD, layout_hash=LAYOUT)
+def descriptors() -> list[str]:
+    """What this process's file descriptors stand for."""
+    found = []
+    for link in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # the descriptor by which this directory is read
+            found.append(str(link.readlink()))
+    return sorted(found)
+
+
+def test_both_sides_see_one_memory(segment: Segment):
+    other = attach(segment)
     segment.payload[7] = 42
     assert other.payload[7] == 42
     assert len(other.payload) == PAYLOAD
+    assert other.name == segment.name == "gvz-test"
+
+
+def test_a_process_that_is_given_the_descriptor_sees_it_too(segment: Segment):
+    code = f"""
+import os, sys
+from gvz.transport.segment import Segment
+descriptor = int(sys.argv[1])
+other = Segment.attach(descriptor, {PAYLOAD}, layout_hash={LAYOUT})
+os.close(descriptor)
+other.payload[3] = 17
+"""
+    command = [sys.executable, "-c", code, str(segment.descriptor)]
+    subprocess.run(command, pass_fds=[segment.descriptor], timeout=60, check=True)
+    assert segment.payload[3] == 17
+
+
+def test_other_processes_do_not_inherit_it(segment: Segment):
+    code = "import os, sys; os.fstat(int(sys.argv[1]))"
+    command = [sys.executable, "-c", code, str(segment.descriptor)]
+    done = subprocess.run(command, close_fds=False, capture_output=True, text=True, timeout=60, check=False)
+    assert "Bad file descriptor" in done.stderr
 
 
 def test_new_memory_is_poisoned(segment: Segment):
     assert np.isnan(np.frombuffer(segment.payload, np.float32)).all()
 
 
-def test_memory_without_a_name_has_no_file():
+def test_it_is_no_file_of_dev_shm():
     before = set(Path("/dev/shm").iterdir())
-    segment = Segment.create(None, PAYLOAD, layout_hash=LAYOUT)
-    assert len(segment.payload) == PAYLOAD
+    segment = Segment.create("gvz-test", PAYLOAD, layout_hash=LAYOUT)
     assert set(Path("/dev/shm").iterdir()) == before
     segment.close()
 
 
-def test_a_segment_is_private_to_the_user(segment: Segment):
-    assert stat.S_IMODE(file_of(segment).stat().st_mode) == 0o600
+def test_closing_frees_the_memory_and_can_be_repeated():
+    def held() -> list[str]:
+        maps = Path("/proc/self/maps").read_text().splitlines()
+        return [line for line in (*maps, *descriptors()) if "gvz-test-closing" in line]
 
-
-def test_closing_removes_the_file_once_and_only_by_the_owner(name: str):
-    owner = Segment.create(name, PAYLOAD, layout_hash=LAYOUT)
-    other = Segment.attach(name, PAYLOAD, layout_hash=LAYOUT)
+    segment = Segment.create("gvz-test-closing", PAYLOAD, layout_hash=LAYOUT)
+    other = attach(segment)
+    assert held()
+    segment.close()
+    segment.close()
+    assert other.payload[0] == 0xFF, "who has attached it keeps it"
     other.close()
-    assert file_of(owner).exists()
-    owner.close()
-    assert not file_of(owner).exists()
-    successor = Segment.create(name, PAYLOAD, layout_hash=LAYOUT)
-    owner.close()
-    assert file_of(successor).exists(), "closing again must not remove what another made since"
-    successor.close()
+    assert held() == []
 
 
 def test_views_outlive_close(segment: Segment):
@@ -79,93 +100,54 @@ def test_views_outlive_close(segment: Segment):
     assert view[0] == 0xFF
 
 
-def test_a_taken_name_is_refused(segment: Segment, name: str):
-    with pytest.raises(TransportError, match="the name is taken"):
-        Segment.create(name, PAYLOAD, layout_hash=LAYOUT)
-    assert file_of(segment).exists()
+def test_its_size_cannot_be_changed(segment: Segment):
+    """A file that shrinks under a mapping ends whoever touches it by SIGBUS."""
+    for size in (0, 2 * PAYLOAD):
+        with pytest.raises(PermissionError):
+            os.ftruncate(segment.descriptor, size)
 
 
-@pytest.mark.parametrize("bad", ["", "../tmp/x", "a/b", ".hidden", "x\0y"])
-def test_a_name_cannot_leave_the_directory(bad: str):
-    with pytest.raises(ValueError, match="segment name: got"):
-        Segment.create(bad, PAYLOAD, layout_hash=LAYOUT)
+def test_memory_that_cannot_be_had_is_an_error_with_advice_and_leaves_no_descriptor():
+    before = descriptors()
+    with pytest.raises(ResourceError, match=r"got \d+ bytes of available memory, want \d+; lower actors"):
+        Segment.create("gvz-test", 2**50, layout_hash=LAYOUT)
+    assert descriptors() == before
 
 
-def test_no_room_is_an_error_with_advice_and_leaves_nothing(name: str):
-    records = set(janitor.runtime_dir().iterdir())
-    with pytest.raises(ResourceError, match=r"/dev/shm has no room for \d+ bytes .* --shm-size"):
-        Segment.create(name, 2**50, layout_hash=LAYOUT)
-    assert not (Path("/dev/shm") / name).exists()
-    assert set(janitor.runtime_dir().iterdir()) == records
+def test_attach_to_no_descriptor():
+    with pytest.raises(TransportError, match="segment of descriptor 987654: cannot be mapped: Bad file descriptor"):
+        Segment.attach(987654, PAYLOAD, layout_hash=LAYOUT)
 
 
-def test_attach_to_nothing(name: str):
-    with pytest.raises(TransportError, match="cannot be attached: No such file"):
-        Segment.attach(name, PAYLOAD, layout_hash=LAYOUT)
+def test_attach_to_another_file_names_it(tmp_path: Path):
+    with (tmp_path / "other").open("w+b") as file, pytest.raises(TransportError, match="segment other: got 0 bytes"):
+        Segment.attach(file.fileno(), PAYLOAD, layout_hash=LAYOUT)
 
 
-def test_attach_does_not_follow_a_link(segment: Segment, name: str):
-    link = Path("/dev/shm") / f"{name}-link"
-    link.symlink_to(file_of(segment))
-    try:
-        with pytest.raises(TransportError, match="cannot be attached: Too many levels of symbolic links"):
-            Segment.attach(link.name, PAYLOAD, layout_hash=LAYOUT)
-    finally:
-        link.unlink()
-
-
-@pytest.mark.usefixtures("segment")
-def test_attach_wants_our_own_file(name: str, monkeypatch: pytest.MonkeyPatch):
-    other_user = os.geteuid() + 1
-    monkeypatch.setattr(os, "geteuid", lambda: other_user)
-    with pytest.raises(TransportError, match=f"got owner {os.getuid()}, want our own {other_user}"):
-        Segment.attach(name, PAYLOAD, layout_hash=LAYOUT)
-
-
-@pytest.mark.usefixtures("segment")
-def test_attach_wants_the_right_size(name: str):
-    with pytest.raises(TransportError, match=f"{name}: got 1064 bytes, want 1065"):
-        Segment.attach(name, PAYLOAD + 1, layout_hash=LAYOUT)
+def test_attach_wants_the_right_size(segment: Segment):
+    with pytest.raises(TransportError, match="segment gvz-test: got 1064 bytes, want 1065"):
+        attach(segment, PAYLOAD + 1)
 
 
 @pytest.mark.parametrize(("word", "field"), list(enumerate(["magic", "schema", "size", "layout hash"])))
-def test_attach_wants_the_right_header(segment: Segment, name: str, word: int, field: str):
-    with file_of(segment).open("r+b") as file:
-        file.seek(8 * word)
-        file.write(b"\x07" * 8)
+def test_attach_wants_the_right_header(segment: Segment, word: int, field: str):
+    os.pwrite(segment.descriptor, b"\x07" * 8, 8 * word)
     with pytest.raises(TransportError, match=f"got {field} 0x707070707070707, want"):
-        Segment.attach(name, PAYLOAD, layout_hash=LAYOUT)
+        attach(segment)
 
 
 @settings(max_examples=200, deadline=None)
 @given(header=st.binary(min_size=32, max_size=32))
 def test_random_headers_are_refused(header: bytes):
-    segment = Segment.create(f"gvz-test-{secrets.token_hex(6)}", PAYLOAD, layout_hash=LAYOUT)
-    assert segment.name is not None
+    segment = Segment.create("gvz-test", PAYLOAD, layout_hash=LAYOUT)
     try:
-        with file_of(segment).open("r+b") as file:
-            right = file.read(32)
-            file.seek(0)
-            file.write(header)
+        right = mmap.mmap(segment.descriptor, HEADER_BYTES)[:32]
+        os.pwrite(segment.descriptor, header, 0)
         if header != right:
             with pytest.raises(TransportError, match="want 0x"):
-                Segment.attach(segment.name, PAYLOAD, layout_hash=LAYOUT)
+                attach(segment)
     finally:
         segment.close()
-
-
-def test_the_next_start_removes_what_a_killed_owner_left(name: str):
-    code = f"""
-import os, signal
-from gvz.transport.segment import Segment
-segment = Segment.create({name!r}, 100, layout_hash=1)
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-    assert subprocess.run([sys.executable, "-c", code], timeout=30, check=False).returncode == -9
-    path = Path("/dev/shm") / name
-    assert path.stat().st_size == 100 + HEADER_BYTES
-    janitor.clean_dead_instances()
-    assert not path.exists()
 
 
 def test_layout_hashes_differ_with_their_parts():
