@@ -96,7 +96,7 @@ def _profile(learner: "workload.Learner", budget: Budget) -> list[Row]:
 
     from learner import replay
 
-    agent, spec, config = learner.parts.agent, learner.parts.replay_spec, learner.config
+    agent, spec, config = learner.parts.learner.agent, learner.parts.learner.replay_spec, learner.config
     params, key = learner.state.params, jax.random.key(0)
     batch_size = config.learner.batch_size
     optimizer = optax.adam(config.learner.learning_rate, eps=config.learner.adam_eps)

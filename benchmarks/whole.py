@@ -56,7 +56,7 @@ def measure(budget: Budget) -> list[Row]:
                 _run(Path(directory) / f"run_{number}", budget, updates, period, processor_period_s, _processor)
             )
             learner = workload.Learner(config, parts)
-            learn = partial(learner.updates_per_s, parts.num_updates_per_call)
+            learn = partial(learner.updates_per_s, parts.learner.num_updates_per_call)
             learn(0.0)  # compiles
             updates_per_s, cost = workload.processor_costs(partial(learn, body_s))
             learner_alone.append(updates_per_s)

@@ -200,13 +200,13 @@ class Learner:
         from learner.policy import flatten_params
 
         self.config, self.parts = config, parts
-        self.state = train_step.init(parts.agent, parts.replay_spec, config.learner, jax.random.key(0))
-        self.replay = filled_replay(parts.replay_spec)
-        self._weights = jax.numpy.ones(parts.replay_spec.num_tasks)
+        self.state = train_step.init(parts.learner.agent, parts.learner.replay_spec, config.learner, jax.random.key(0))
+        self.replay = filled_replay(parts.learner.replay_spec)
+        self._weights = jax.numpy.ones(parts.learner.replay_spec.num_tasks)
         self._train_steps: dict[int, Any] = {}
-        self._add = jax.jit(partial(replay.add, parts.replay_spec), donate_argnums=0)
+        self._add = jax.jit(partial(replay.add, parts.learner.replay_spec), donate_argnums=0)
         self._flatten = jax.jit(flatten_params)
-        self._ingest = Ingest(parts.replay_spec)
+        self._ingest = Ingest(parts.learner.replay_spec)
         self._version = 1
 
     def acting_params(self) -> np.ndarray:
@@ -245,7 +245,7 @@ class Learner:
         if per_call not in self._train_steps:
             config, parts = self.config, self.parts
             self._train_steps[per_call] = train_step.make_train_step(
-                parts.agent, parts.replay_spec, config.learner, config.replay, per_call
+                parts.learner.agent, parts.learner.replay_spec, config.learner, config.replay, per_call
             )
         self.state, self.replay = self._train_steps[per_call](self.state, self.replay, self._weights)
 
@@ -267,7 +267,11 @@ class Learner:
 
         from learner import replay
 
-        agent, spec, batch_size = direct(self.parts.agent), self.parts.replay_spec, self.config.learner.batch_size
+        agent, spec, batch_size = (
+            direct(self.parts.learner.agent),
+            self.parts.learner.replay_spec,
+            self.config.learner.batch_size,
+        )
         batch, _ = jax.eval_shape(
             lambda s, key: replay.sample(spec, s, key, batch_size, 0.5), self.replay, jax.random.key(0)
         )

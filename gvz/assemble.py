@@ -14,6 +14,7 @@ from gvz.config import RunConfig
 from gvz.scenarios.compiler import compile_task
 from learner import replay
 from learner.agents.base import Agent, AgentSpec, make_agent
+from learner.off_policy import OffPolicyParts
 from learner.policy import export_policy, layout_hash
 from learner.replay import ReplaySpec
 from learner.train_step import default_num_updates
@@ -27,9 +28,7 @@ ENV_ENTRY_POINT = "gvz.env:make_env"
 class Parts:
     """What a run is made of, before anything is started."""
 
-    agent: Agent
-    replay_spec: ReplaySpec
-    num_updates_per_call: int
+    learner: OffPolicyParts
     pool_config: PoolConfig
     bill: Bill
 
@@ -101,9 +100,14 @@ def assemble(config: RunConfig, work_dir: Path) -> Parts:
         work_dir=work_dir,
     )
     return Parts(
-        agent=agent,
-        replay_spec=replay_spec,
-        num_updates_per_call=default_num_updates(config.learner),
+        learner=OffPolicyParts(
+            agent=agent,
+            agent_config=config.agent,
+            config=config.learner,
+            replay_config=config.replay,
+            replay_spec=replay_spec,
+            num_updates_per_call=default_num_updates(config.learner),
+        ),
         pool_config=pool_config,
         bill=Bill(
             replay_bytes=replay.memory_bytes(replay_spec),

@@ -45,7 +45,7 @@ class Monitor:
     """Looks at the counters of a run and says what they mean, to the panel, the records and the user."""
 
     def __init__(self, config: RunConfig, parts: Parts, progress: Progress, telemetry: Telemetry):
-        self._config, self._num_slots, self._progress = config, parts.replay_spec.num_slots, progress
+        self._config, self._num_slots, self._progress = config, parts.learner.replay_spec.num_slots, progress
         self._telemetry = telemetry
         self._expected, self._warned = _expected(config, parts), set[str]()
         self._rates, self._last_look_s, self._loss = Rates(), 0.0, float("nan")
@@ -55,8 +55,7 @@ class Monitor:
         counts: Counts,
         statistics: PoolStatistics,
         staleness: Staleness,
-        means: Mapping[str, float],
-        shares: Mapping[str, float],
+        metrics: Mapping[str, float],
     ) -> None:
         """A row of records, its alarms, and the panel, once a log period.
 
@@ -64,19 +63,17 @@ class Monitor:
             counts: of the run.
             statistics: of its actors.
             staleness: since the last look.
-            means: the learner's, as `train_step.read_metrics` gives them.
-            shares: of each task in the replay.
+            metrics: the learner's.
         """
         row = self._measure(counts, statistics, staleness)
-        learner = {f"learner/{name}": value for name, value in means.items()}
-        scalars = {**row, **learner, **{f"replay/share/{name}": share for name, share in shares.items()}}
+        scalars = {**row, **metrics}
         self._telemetry.scalars(counts.updates, scalars)
         for condition, text in alarms(scalars, self._telemetry.task_statuses(), self._expected).items():
             if condition not in self._warned:  # each thing once
                 self._warned.add(condition)
                 self._progress.say(f"warning: {text}")
                 self.fault("warning", text, counts.updates)
-        self._loss = means["loss"]
+        self._loss = metrics["learner/loss"]
         self._progress.show(self._status(counts, row))
 
     def look(self, counts: Counts, statistics: PoolStatistics, take_staleness: Callable[[], Staleness]) -> None:
@@ -139,14 +136,14 @@ class Monitor:
 
 
 def _expected(config: RunConfig, parts: Parts) -> Expected:
-    tasks, spec, agent = parts.pool_config.tasks, parts.agent.spec, config.agent
+    tasks, spec, agent = parts.pool_config.tasks, parts.learner.agent.spec, config.agent
     v_min, v_max = agent.value_range(spec.v_min, spec.v_max)
     waiting = config.num_actors * parts.pool_config.ring_capacity + 2 * config.learner.step_tolerance
     played = Counter(tasks[lane % len(tasks)] for lane in range(config.num_lanes))
     return Expected(
         games={task: played[task] for task in tasks},
         timeout_steps=-(-config.resolved_scenario().timeout_frames(config.env.profile) // config.env.frame_skip),
-        num_slots=parts.replay_spec.num_slots,
+        num_slots=parts.learner.replay_spec.num_slots,
         v_min=v_min,
         v_max=v_max,
         distributional=agent.distributional,

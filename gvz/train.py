@@ -1,19 +1,16 @@
-"""THE data flow of training, an arrow a line: drain -> replay.add -> limiter -> train_step -> broadcast.
+"""THE data flow of training, an arrow a line: pool -> learner -> pool, round after round.
 
-What is laid round it (supervision, records, checkpoints, resume) calls into the modules that do the work. Nothing
-here waits for the device between log periods but a publication, which copies the parameters to the host, and a
-checkpoint.
+What is laid round it (supervision, records, checkpoints, resume) calls into the modules that do the work. How records
+become gradient steps is the learner's matter (`learner.learner`), where games are played is the pool's. Nothing here
+waits for the device between log periods but a publication, which copies the parameters to the host, and a checkpoint.
 """
 
 import contextlib
 import dataclasses
 import time
-from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from actors.inline import InlinePool
 from actors.pool import STOP_TIMEOUT_S, ActorPool
@@ -25,17 +22,15 @@ from gvz.errors import CheckpointError, GvzError, WaitTimeoutError, WorkerError
 from gvz.monitor import Counts, Monitor
 from gvz.progress import Progress
 from gvz.rundir import START_RECORDS, RunDir
+from gvz.saver import Saver, Snapshot
 from gvz.stop import StopRequest
 from gvz.telemetry import Telemetry
 from gvz.transport.messages import EpisodeStats, Fault, ParamsHeader
 from gvz.watchdog import Watchdog
-from learner import replay, train_step
-from learner.checkpoint import Checkpointer, Restored, checkpoint_steps, restore_newest
-from learner.ingest import Ingest
-from learner.limiter import RateLimiter
+from learner.checkpoint import Restored, restore_newest
+from learner.learner import Learner
 from learner.memory import keep_freed_memory
-from learner.metrics import TaskKpis
-from learner.policy import flatten_params
+from learner.off_policy import OffPolicyLearner
 
 DRAIN_RECORDS = 256
 """most records taken between two looks at the limiter"""
@@ -45,34 +40,23 @@ NO_RECORDS_TIMEOUT_S = 900.0
 """a run whose actors deliver nothing for so long is stopped; a stuck actor is replaced long before"""
 LONGEST_ROUND_S = 1800.0
 """a learner that is at one round for so long (it compiles in one, too) is stuck in the device, and ended"""
-SAVE_RETRY_S, LONGEST_SAVE_RETRY_S = 60.0, 3600.0
-"""a failed checkpoint is tried again after so long, twice as long each time, or at the next period"""
 
 
 class Trainer:
     """One run, from its first update or its newest checkpoint to its last. `close` ends all that it started."""
 
     def __init__(self, config: RunConfig, run: RunDir, parts: Parts, progress: Progress, restored: Restored | None):
-        learner, spec, key = config.learner, parts.replay_spec, jax.random.key(config.seed)
-        self._config, self._run, self._parts, self._progress = config, run, parts, progress
-        self._add = jax.jit(partial(replay.add, spec), donate_argnums=0)
-        self._flatten = jax.jit(flatten_params)
-        self._train_steps: dict[int, train_step.TrainStep] = {}
-        if restored is None:
-            self._state = jax.jit(partial(train_step.init, parts.agent, spec, learner))(key)
-            self._replay = replay.init(spec)
-            self._acting = np.asarray(self._flatten(self._state.params))
-        else:
-            arrays = jax.tree.map(jnp.array, restored.arrays)  # copies: a borrowed buffer cannot be donated
-            self._state, self._replay = arrays["learner"], arrays["replay"]
-            self._acting = np.asarray(arrays["acting"])
         host = None if restored is None else restored.host
+        self._config, self._run, self._parts, self._progress = config, run, parts, progress
         self._counts = Counts() if host is None else Counts(**host["counts"])
-        self._ingest = Ingest(spec)
-        self._limiter = RateLimiter(
-            learner.env_steps_per_update, learner.warmup_steps, learner.step_tolerance, parts.num_updates_per_call
+        self._learner: Learner = OffPolicyLearner(
+            parts.learner,
+            jax.random.key(config.seed),
+            parts.pool_config.tasks,
+            run.path,
+            None if restored is None else (restored.arrays, restored.host),
         )
-        self._kpis = TaskKpis(spec.num_tasks, learner)
+        self._published_params = self._learner.acting_params() if restored is None else restored.arrays["acting"]
         self._telemetry = Telemetry(
             run,
             tasks=parts.pool_config.tasks,
@@ -82,13 +66,9 @@ class Trainer:
             wandb=config.log.wandb,
         )
         if host is not None:
-            self._ingest.restore(host["ingest"])
-            self._limiter.restore(host["limiter"])
-            self._kpis.restore({name: np.asarray(values) for name, values in host["kpis"].items()})
             self._telemetry.restore(host["telemetry"])
-        self._checkpointer = Checkpointer(run.path, keep=config.checkpoint.keep)
-        self._failed_saves, self._retry_save_s = 0, 0.0
         self._monitor = Monitor(config, parts, progress, self._telemetry)
+        self._saver = Saver(run, config.checkpoint, self._counts, self._snapshot, self._report_failed_save)
         self._collected_s, self._without_records_s = time.monotonic(), 0.0
         pool = InlinePool if config.mode == "sync" else ActorPool
         self._pool: Pool = pool(parts.pool_config, None if host is None else host["pool"])
@@ -97,53 +77,51 @@ class Trainer:
     def run(self, stop: StopRequest) -> None:
         """Trains until the last update, or until asked to stop; then writes a checkpoint.
 
+        The last row of metrics of an interrupted run stands after what its checkpoint vouches for: a resumed run sets
+        it aside, and its next row has the whole log period.
+
         Raises:
             WorkerError, WaitTimeoutError: the actors failed for good; a checkpoint is written first.
             NonFiniteError: the learner's numbers went wrong; the checkpoints before it stand.
             CheckpointError: the last checkpoint could not be written.
         """
-        self._monitor.look(self._counts, self._pool.statistics(), self._ingest.take_staleness)  # rates count from here
+        # rates count from here
+        self._monitor.look(self._counts, self._pool.statistics(), self._learner.take_staleness)
         try:
             with Watchdog("the learner", LONGEST_ROUND_S) as watchdog:
                 while self._counts.updates < self._config.learner.total_updates and not stop.requested:
                     watchdog.beat()
                     self._collect()
                     self._supervise()
-                    self._learn()
+                    self._counts.updates += self._learner.update()
                     self._broadcast()
                     self._record()
-                    self._save()
+                    self._saver.save_when_due()
         except (WorkerError, WaitTimeoutError):
-            with contextlib.suppress(CheckpointError, WaitTimeoutError):  # it is reported; this is the worse news
-                self._save_last()
+            # a failed save is already reported; the first error is raised
+            with contextlib.suppress(CheckpointError, WaitTimeoutError):
+                self._saver.save_last(self._record_row)
             raise
         self._progress.say("stopping: writing a checkpoint" if stop.requested else "done: writing the last checkpoint")
-        self._save_last()
+        self._saver.save_last(self._record_row)
 
     def close(self, *, abandon_save: bool = False) -> None:
         """Ends every actor, waits for the checkpoint (or abandons both), closes the records. Can be repeated."""
         if abandon_save:
-            self._checkpointer.abandon()
+            self._saver.abandon()
         self._pool.close(grace_s=0.0 if abandon_save else STOP_TIMEOUT_S)
         try:
-            self._checkpointer.wait()
-            self._report_save()
+            self._saver.wait()
         finally:
             self._telemetry.close()
 
-    # ------------------------------------------------------------------------------------- the arrows
-
     def _collect(self) -> None:
-        """Rings -> replay, as far as the limiter allows."""
-        ready_to_learn = self._limiter.num_updates_allowed() > 0
-        allowed = min(self._limiter.num_steps_allowed(), DRAIN_RECORDS)
+        """Rings -> learner, as far as it allows."""
+        ready_to_learn = self._learner.can_update()
+        allowed = min(self._learner.num_steps_allowed(), DRAIN_RECORDS)
         blocks = self._pool.drain(allowed, wait_s=0.0 if ready_to_learn else DRAIN_WAIT_S)
-        for arrays in self._ingest.arrays(blocks, self._counts.version):
-            self._replay = self._add(self._replay, arrays)
+        self._counts.env_steps += self._learner.add(blocks, self._counts.version)
         self._counts.records += sum(map(len, blocks))
-        steps = self._ingest.take_env_steps()
-        self._limiter.insert(steps)
-        self._counts.env_steps += steps
         # a round's length at most: the time in which this process was stopped is not the actors' silence
         waited_s, self._collected_s = min(time.monotonic() - self._collected_s, 1.0), time.monotonic()
         self._without_records_s = 0.0 if blocks or ready_to_learn else self._without_records_s + waited_s
@@ -159,61 +137,30 @@ class Trainer:
             if isinstance(message, EpisodeStats):
                 self._telemetry.episode(message, num_updates=self._counts.updates, env_steps=self._counts.env_steps)
                 if not message.cut:
-                    self._kpis.add(message.task, message.score)
+                    self._learner.add_episode(message.task, message.score)
             elif isinstance(message, Fault):
                 self._telemetry.fault(message, num_updates=self._counts.updates)
                 self._progress.say(f"fault: {message.message}")
-
-    def _learn(self) -> None:
-        """Replay -> gradient steps -> priorities, as far as the limiter allows."""
-        per_call = self._parts.num_updates_per_call
-        per_call = min(per_call, self._config.learner.total_updates - self._counts.updates)
-        if self._limiter.num_updates_allowed() < per_call:
-            return
-        if per_call not in self._train_steps:
-            replay.check_can_sample(self._parts.replay_spec, self._replay)
-            self._train_steps[per_call] = train_step.make_train_step(
-                self._parts.agent, self._parts.replay_spec, self._config.learner, self._config.replay, per_call
-            )
-        weights = jnp.asarray(self._kpis.weights())
-        self._state, self._replay = self._train_steps[per_call](self._state, self._replay, weights)
-        self._limiter.update(per_call)
-        self._counts.updates += per_call
 
     def _broadcast(self) -> None:
         """Parameters -> actors, every period, and once when warm-up ends: actors then act by the agent."""
         counts, learner = self._counts, self._config.learner
         warmed_up = counts.published_env_steps < learner.warmup_steps <= counts.env_steps
         if warmed_up or counts.updates >= counts.published_updates + learner.publish_period_updates:
-            self._acting = np.asarray(self._flatten(self._state.params))
+            self._published_params = self._learner.acting_params()
             counts.version += 1
             counts.published_updates, counts.published_env_steps = counts.updates, counts.env_steps
             self._send()
 
     def _send(self) -> None:
+        """Epsilon follows from the decisions at the publication, so a resumed run sends what was sent before."""
         header = ParamsHeader(
             version=self._counts.version,
             num_updates=self._counts.published_updates,
-            epsilon=self._epsilon(),
+            epsilon=self._learner.epsilon(self._counts.published_env_steps),
             layout_hash=self._parts.pool_config.layout_hash,
         )
-        self._pool.publish(self._acting, header)
-
-    def _epsilon(self) -> float:
-        """1 during warm-up, whatever the agent. Then 0 with noise, else linear from start to end.
-
-        It is a function of the decisions at the last publication, so a resumed run sends what was sent before.
-        """
-        agent = self._config.agent
-        since_warmup = self._counts.published_env_steps - self._config.learner.warmup_steps
-        if since_warmup < 0:
-            return 1.0
-        if agent.noisy != "off":
-            return 0.0
-        progress = min(1.0, since_warmup / agent.epsilon_decay_steps)
-        return agent.epsilon_start + progress * (agent.epsilon_end - agent.epsilon_start)
-
-    # ------------------------------------------------------------------- records, checkpoints, the end
+        self._pool.publish(self._published_params, header)
 
     def _record(self) -> None:
         """Counters -> panel; metrics -> records every log period and at the last update."""
@@ -222,100 +169,31 @@ class Trainer:
         if due or counts.updates == self._config.learner.total_updates:
             self._record_row()
         elif counts.updates == 0:
-            self._monitor.look(counts, self._pool.statistics(), self._ingest.take_staleness)
+            self._monitor.look(counts, self._pool.statistics(), self._learner.take_staleness)
 
     def _record_row(self) -> None:
         """A row of what came since the last one, if anything did. Waits for the device."""
         counts = self._counts
-        if counts.updates == counts.logged_updates:
-            return
-        counts.logged_updates = counts.updates
-        tasks = self._parts.pool_config.tasks
-        means, self._state = train_step.read_metrics(self._state, tasks, self._run.path)
-        stored = np.asarray(replay.records_per_task(self._parts.replay_spec, self._replay))
-        shares = dict(zip(tasks, (stored / stored.sum()).tolist(), strict=True))
-        self._monitor.log(counts, self._pool.statistics(), self._ingest.take_staleness(), means, shares)
+        if counts.updates > counts.logged_updates:
+            counts.logged_updates = counts.updates
+            metrics = self._learner.take_metrics()
+            self._monitor.log(counts, self._pool.statistics(), self._learner.take_staleness(), metrics)
 
-    def _save(self) -> None:
-        """Whole state -> checkpoint, every period; a failed one is reported and tried again."""
-        if self._checkpointer.busy:
-            return
-        self._report_save()
-        counts, period = self._counts, self._config.checkpoint.period_updates
-        due = counts.updates // period > counts.saved_updates // period  # at its multiples, also after an interruption
-        if due or (self._failed_saves and time.monotonic() > self._retry_save_s):
-            self._begin_save()
-
-    def _save_last(self) -> None:
-        """The last checkpoint, waited for; if it fails it is tried once more. Then the last row of metrics.
-
-        The row of an interrupted run stands after what its checkpoint vouches for: a resumed run sets it aside, and its
-        next row has the whole log period.
-
-        Raises:
-            CheckpointError: it failed again. WaitTimeoutError: the disk does not answer.
-            NonFiniteError: the learner's numbers went wrong since they were last read.
-        """
-        failure = ""
-        for attempt in range(3):
-            if attempt > 0:
-                self._begin_save()
-                self._record_row()  # before the wait, which is no part of its rates
-            self._checkpointer.wait()
-            failure = self._report_save()
-            if self._counts.saved_updates == self._counts.updates and not self._failed_saves:
-                self._record_row()
-                return
-        newest = max(checkpoint_steps(self._run.checkpoints), default=0)
-        raise CheckpointError(
-            f"the last checkpoint, at update {self._counts.updates}, could not be written: {failure}. The newest one "
-            f"is of update {newest}; mend this and give the same command to go on from there"
-        )
-
-    def _begin_save(self) -> None:
-        train_step.check_finite(self._state, self._run.path)
-        self._counts.saved_updates = self._counts.updates
-        arrays = {"learner": self._state, "replay": self._replay, "acting": self._acting}
-        self._checkpointer.save(self._counts.updates, arrays, self._state.params, self._host_state())
-
-    def _report_save(self) -> str:
-        """Notes how a save ended, if one did; returns why it failed."""
-        failure = self._checkpointer.outcome()
-        if failure is None:
-            return ""
-        if not failure:
-            self._failed_saves = 0
-            return ""
-        wait_s = min(SAVE_RETRY_S * 2**self._failed_saves, LONGEST_SAVE_RETRY_S)
-        self._failed_saves += 1
-        self._retry_save_s = time.monotonic() + wait_s
-        self._progress.say(f"checkpoint failed, tried again within {wait_s:.0f} s: {failure}")
-        self._monitor.fault("checkpoint", failure, self._counts.updates)
-        return failure
-
-    def _host_state(self) -> dict[str, Any]:
-        """What a checkpoint holds beside arrays, msgpack types."""
-        return {
+    def _snapshot(self) -> Snapshot:
+        """The whole state; raises NonFiniteError instead of saving numbers that went wrong."""
+        self._learner.check_finite()
+        host = {
             "counts": dataclasses.asdict(self._counts),
-            "ingest": self._ingest.state(),
-            "limiter": self._limiter.state(),
-            "kpis": {name: array.tolist() for name, array in self._kpis.state().items()},
             "telemetry": self._telemetry.state(),
             "pool": self._pool.state(),
             "records": self._run.record_lengths(),
+            **self._learner.state(),
         }
+        return Snapshot({**self._learner.arrays(), "acting": self._published_params}, self._learner.params, host)
 
-
-def _template(config: RunConfig, parts: Parts) -> dict[str, Any]:
-    """Shapes and dtypes of a checkpoint's arrays."""
-    spec = parts.replay_spec
-    return {
-        "learner": jax.eval_shape(
-            lambda: train_step.init(parts.agent, spec, config.learner, jax.random.key(config.seed))
-        ),
-        "replay": jax.eval_shape(lambda: replay.init(spec)),
-        "acting": jax.ShapeDtypeStruct((parts.pool_config.num_params,), jnp.float32),
-    }
+    def _report_failed_save(self, failure: str, retry_s: float) -> None:
+        self._progress.say(f"checkpoint failed, tried again within {retry_s:.0f} s: {failure}")
+        self._monitor.fault("checkpoint", failure, self._counts.updates)
 
 
 def train(config: RunConfig, run: RunDir, stop: StopRequest) -> int:
@@ -341,7 +219,8 @@ def train(config: RunConfig, run: RunDir, stop: StopRequest) -> int:
         for line in parts.bill.lines():
             progress.say(line)
         bill.check(parts.bill)
-        restored = restore_newest(run.checkpoints, _template(config, parts))
+        acting = jax.ShapeDtypeStruct((parts.pool_config.num_params,), jnp.float32)
+        restored = restore_newest(run.checkpoints, {**parts.learner.array_shapes(), "acting": acting})
         if restored is None:
             progress.say(f"new run in {run.path}")
             run.truncate_records(dict.fromkeys(run.record_lengths(), 0))

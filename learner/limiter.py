@@ -49,6 +49,11 @@ class RateLimiter:
         self._env_steps = 0
         self._updates = 0
 
+    @property
+    def num_updates(self) -> int:
+        """Updates done."""
+        return self._updates
+
     def num_updates_allowed(self) -> int:
         """Updates that are paid for and not done: whole calls of num_updates_per_call."""
         paid = math.floor((self._env_steps - self._warmup_steps) / self._ratio)

@@ -27,6 +27,7 @@ TIER_3 = (
     "gvz.progress",
     "gvz.reports",
     "gvz.rundir",
+    "gvz.saver",
     "gvz.selection",
     "gvz.stop",
     "gvz.telemetry",

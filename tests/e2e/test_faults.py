@@ -262,7 +262,7 @@ def test_a_checkpoint_that_cannot_be_written_is_reported_tried_again_and_at_last
         (run / "policies" / str(step)).parent.mkdir(parents=True, exist_ok=True)
         (run / "policies" / str(step)).touch()
     flags = (*SYNC, "--learner.total-updates", "300")
-    code, err = finish(launch(run, *flags, patch="gvz.train.SAVE_RETRY_S = 0.0"))
+    code, err = finish(launch(run, *flags, patch="gvz.saver.SAVE_RETRY_S = 0.0"))
     assert code == 1, err
     assert f"checkpoint failed, tried again within 0 s: checkpoint {run / 'policies' / '100'} could not be" in err
     assert 100 < checkpoint_steps(run / "policies")[0] < 200, "the first one was tried again soon"

@@ -1,0 +1,82 @@
+"""What a learner is to the training loop: step records in, gradient steps, parameters out. Imports gvz.transport.
+
+The loop in gvz/train.py knows this protocol alone. How records are kept and drawn (a replay, rollouts) and on which
+device is the learner's own matter. `learner.off_policy` learns from a replay.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from gvz.transport.messages import StepBlock
+from learner.ingest import Staleness
+
+
+class Learner(Protocol):
+    """One run's learner, from its first record to its last gradient step."""
+
+    @property
+    def params(self) -> Any:
+        """The parameters that evaluation reads, a pytree on the device."""
+        ...
+
+    def num_steps_allowed(self) -> int:
+        """Decisions that it takes now; at least 1 whenever `can_update` is False."""
+        ...
+
+    def add(self, blocks: Sequence[StepBlock], params_version: int) -> int:
+        """Takes step records; `params_version` is the newest that was published. Returns the decisions among them.
+
+        Raises:
+            TransportError: a record does not belong to this run, or does not continue its lane's stream.
+        """
+        ...
+
+    def add_episode(self, task: int, score: float) -> None:
+        """Takes the score of a finished episode of the task with this index."""
+        ...
+
+    def can_update(self) -> bool:
+        """The next gradient steps are paid for with decisions."""
+        ...
+
+    def update(self) -> int:
+        """Does gradient steps, if they are paid for; does not wait for the device. Returns their number."""
+        ...
+
+    def epsilon(self, env_steps: int) -> float:
+        """Probability of a uniformly random action after so many decisions of the run."""
+        ...
+
+    def acting_params(self) -> np.ndarray:
+        """What the actors act by, as one vector float32[P]. Waits for the device."""
+        ...
+
+    def take_metrics(self) -> dict[str, float]:
+        """Means since the last call, by name (docs/reference/metrics.md). Waits for the device.
+
+        Raises:
+            NonFiniteError: as `check_finite`.
+        """
+        ...
+
+    def take_staleness(self) -> Staleness:
+        """Age of the parameters that chose the decisions taken since the last call."""
+        ...
+
+    def check_finite(self) -> None:
+        """Waits for the device.
+
+        Raises:
+            NonFiniteError: a loss or a gradient was not finite.
+        """
+        ...
+
+    def arrays(self) -> dict[str, Any]:
+        """All that it remembers on the device, for a checkpoint."""
+        ...
+
+    def state(self) -> dict[str, Any]:
+        """All that it remembers on the host, for a checkpoint: msgpack types."""
+        ...

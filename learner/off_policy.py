@@ -1,0 +1,170 @@
+"""The learner of transitions from a replay: records -> replay -> gradient steps -> priorities.
+
+May import jax and learner's own modules. Nothing here waits for the device but `acting_params`, `take_metrics` and
+`check_finite`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gvz.transport.messages import StepBlock
+from learner import replay, train_step
+from learner.agents.base import Agent, Params
+from learner.config import AgentConfig, LearnerConfig, ReplayConfig
+from learner.ingest import Ingest, Staleness
+from learner.limiter import RateLimiter
+from learner.metrics import TaskKpis
+from learner.policy import flatten_params
+from learner.replay import ReplaySpec
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class OffPolicyParts:
+    """What an `OffPolicyLearner` is made of."""
+
+    agent: Agent
+    agent_config: AgentConfig
+    config: LearnerConfig
+    replay_config: ReplayConfig
+    replay_spec: ReplaySpec
+    num_updates_per_call: int
+    """gradient steps in one jitted call"""
+
+    def array_shapes(self) -> dict[str, Any]:
+        """Shapes and dtypes of `OffPolicyLearner.arrays()`."""
+        return {
+            "learner": jax.eval_shape(self.init, jax.random.key(0)),
+            "replay": jax.eval_shape(lambda: replay.init(self.replay_spec)),
+        }
+
+    def init(self, key: jax.Array) -> train_step.LearnerState:
+        """The state before the first update."""
+        return train_step.init(self.agent, self.replay_spec, self.config, key)
+
+
+class OffPolicyLearner:
+    """Rainbow, DQN and whatever else learns from replayed transitions."""
+
+    def __init__(
+        self,
+        parts: OffPolicyParts,
+        key: jax.Array,
+        tasks: Sequence[str],
+        diagnostics_dir: Path,
+        restored: tuple[dict[str, Any], dict[str, Any]] | None = None,
+    ):
+        """Starts with an empty replay, or goes on from a checkpoint.
+
+        Args:
+            parts: what it is made of.
+            key: JAX key of parameters, noise and sampling.
+            tasks: a name for each task index, for the metrics.
+            diagnostics_dir: existing directory where the batch of a non-finite update is saved.
+            restored: what `arrays()` and `state()` gave; further entries of either are ignored.
+        """
+        config, spec = parts.config, parts.replay_spec
+        self._parts, self._tasks, self._diagnostics_dir = parts, tuple(tasks), diagnostics_dir
+        self._add = jax.jit(partial(replay.add, spec), donate_argnums=0)
+        self._flatten = jax.jit(flatten_params)
+        self._train_steps: dict[int, train_step.TrainStep] = {}
+        self._ingest = Ingest(spec)
+        self._limiter = RateLimiter(
+            config.env_steps_per_update, config.warmup_steps, config.step_tolerance, parts.num_updates_per_call
+        )
+        self._kpis = TaskKpis(spec.num_tasks, config)
+        if restored is None:
+            self._state, self._replay = jax.jit(parts.init)(key), replay.init(spec)
+        else:
+            arrays, state = restored
+            # copies: a borrowed buffer cannot be donated
+            self._state, self._replay = jax.tree.map(jnp.array, (arrays["learner"], arrays["replay"]))
+            self._ingest.restore(state["ingest"])
+            self._limiter.restore(state["limiter"])
+            self._kpis.restore({name: np.asarray(values) for name, values in state["kpis"].items()})
+
+    @property
+    def params(self) -> Params:
+        return self._state.params
+
+    def num_steps_allowed(self) -> int:
+        return self._limiter.num_steps_allowed()
+
+    def add(self, blocks: Sequence[StepBlock], params_version: int) -> int:
+        for arrays in self._ingest.arrays(blocks, params_version):
+            self._replay = self._add(self._replay, arrays)
+        steps = self._ingest.take_env_steps()
+        self._limiter.insert(steps)
+        return steps
+
+    def add_episode(self, task: int, score: float) -> None:
+        self._kpis.add(task, score)
+
+    def can_update(self) -> bool:
+        return self._limiter.num_updates_allowed() > 0
+
+    def update(self) -> int:
+        """Does gradient steps as the protocol says.
+
+        Raises:
+            ConfigError: before the first one, the replay holds no complete transition.
+        """
+        count = min(self._parts.num_updates_per_call, self._parts.config.total_updates - self._limiter.num_updates)
+        if self._limiter.num_updates_allowed() < count:
+            return 0
+        weights = jnp.asarray(self._kpis.weights())
+        self._state, self._replay = self._train_step(count)(self._state, self._replay, weights)
+        self._limiter.update(count)
+        return count
+
+    def _train_step(self, num_updates: int) -> train_step.TrainStep:
+        if num_updates not in self._train_steps:
+            parts = self._parts
+            replay.check_can_sample(parts.replay_spec, self._replay)
+            self._train_steps[num_updates] = train_step.make_train_step(
+                parts.agent, parts.replay_spec, parts.config, parts.replay_config, num_updates
+            )
+        return self._train_steps[num_updates]
+
+    def epsilon(self, env_steps: int) -> float:
+        """1 during warm-up, whatever the agent. Then 0 with noise, else linear from start to end."""
+        agent, since_warmup = self._parts.agent_config, env_steps - self._parts.config.warmup_steps
+        if since_warmup < 0:
+            return 1.0
+        if agent.noisy != "off":
+            return 0.0
+        progress = min(1.0, since_warmup / agent.epsilon_decay_steps)
+        return agent.epsilon_start + progress * (agent.epsilon_end - agent.epsilon_start)
+
+    def acting_params(self) -> np.ndarray:
+        return np.asarray(self._flatten(self._state.params))
+
+    def take_metrics(self) -> dict[str, float]:
+        """Means of the train step as `learner/...`, shares of the tasks in the replay as `replay/share/...`."""
+        means, self._state = train_step.read_metrics(self._state, self._tasks, self._diagnostics_dir)
+        stored = np.asarray(replay.records_per_task(self._parts.replay_spec, self._replay))
+        shares = zip(self._tasks, (stored / stored.sum()).tolist(), strict=True)
+        learner = {f"learner/{name}": value for name, value in means.items()}
+        return {**learner, **{f"replay/share/{name}": share for name, share in shares}}
+
+    def take_staleness(self) -> Staleness:
+        return self._ingest.take_staleness()
+
+    def check_finite(self) -> None:
+        train_step.check_finite(self._state, self._diagnostics_dir)
+
+    def arrays(self) -> dict[str, Any]:
+        return {"learner": self._state, "replay": self._replay}
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "ingest": self._ingest.state(),
+            "limiter": self._limiter.state(),
+            "kpis": {name: array.tolist() for name, array in self._kpis.state().items()},
+        }
