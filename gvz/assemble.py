@@ -40,7 +40,7 @@ def run_agent(config: RunConfig) -> Agent:
         ConfigError: values that do not fit together.
     """
     scenario = config.resolved_scenario()
-    v_min, v_max = scenario.return_range(config.env, config.agent.discount)
+    v_min, v_max = config.value_range()
     height, width, channels = config.env.frame_shape
     return make_agent(
         config.agent,

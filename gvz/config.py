@@ -153,6 +153,17 @@ class RunConfig:
         """The scenario of this run's tasks."""
         return self.resolved_tasks()[0].scenario
 
+    def value_range(self) -> tuple[float, float]:
+        """(v_min, v_max): what the atoms of a return distribution span, as configured or of the scenario's returns."""
+        scenario_range = self.resolved_scenario().return_range(self.env, self.agent.discount)
+        return self.agent.value_range(*scenario_range)
+
+    def with_value_range(self, v_min: float, v_max: float) -> "RunConfig":
+        """The same with this range, if its agent learns return distributions."""
+        if not self.agent.distributional:
+            return self
+        return dataclasses.replace(self, agent=dataclasses.replace(self.agent, v_min=v_min, v_max=v_max))
+
     @property
     def num_actors(self) -> int:
         """Actor processes, one per core by default. In sync mode 1: all games are played in one place."""
@@ -276,6 +287,7 @@ def config_to_dict(config: RunConfig) -> dict[str, Any]:
             "tasks": [task.id for task in config.resolved_tasks()],
             "num_actors": config.num_actors,
             "games_per_actor": config.games_per_actor,
+            "value_range": config.value_range(),
         },
     }
 
@@ -292,6 +304,8 @@ def config_from_dict(saved: Any) -> RunConfig:
     resolved = _from_plain(_Resolved, saved.get("resolved"), "resolved")
     if resolved.tasks != (tasks := tuple(task.id for task in config.resolved_tasks())):
         raise ConfigError(f"resolved.tasks: got {list(resolved.tasks)}, but the configuration has {list(tasks)}")
+    if resolved.value_range is not None:
+        config = config.with_value_range(*resolved.value_range)
     if config.mode == "sync":
         return config
     numbers = {"num_actors": resolved.num_actors, "games_per_actor": resolved.games_per_actor}
@@ -305,6 +319,8 @@ class _Resolved:
     tasks: tuple[str, ...]
     num_actors: int
     games_per_actor: int
+    value_range: tuple[float, float] | None = None
+    """missing in runs of older versions"""
 
 
 def _from_plain(kind: Any, value: Any, where: str) -> Any:
@@ -345,7 +361,12 @@ _MAY_CHANGE = (
 
 
 def differences(old: RunConfig, new: RunConfig) -> list[str]:
-    """`field: old -> new` for every difference that would change the meaning of a run that goes on."""
+    """`field: old -> new` for every difference that would change the meaning of a run that goes on.
+
+    Args:
+        old: as it was saved, with the range of its atoms (`config_from_dict`); None for a run that did not save it.
+        new: as it was given: an open range is what it is derived to be now.
+    """
 
     def flat(config: RunConfig) -> dict[str, Any]:
         values: dict[str, Any] = {}
@@ -371,7 +392,7 @@ def differences(old: RunConfig, new: RunConfig) -> list[str]:
     def may_change(name: str) -> bool:
         return name in _MAY_CHANGE or f"{name.split('.')[0]}.*" in _MAY_CHANGE
 
-    before, after = flat(old), flat(new)
+    before, after = flat(old), flat(new.with_value_range(*new.value_range()))
     changed = [f"{k}: {before[k]} -> {after[k]}" for k in before if before[k] != after[k] and not may_change(k)]
     if new.learner.total_updates < old.learner.total_updates:
         changed.append(

@@ -256,4 +256,5 @@ def test_derived_numbers_are_saved_explicitly():
     config = RunConfig(name="x")
     saved = config_from_dict(config_to_dict(config))
     assert saved.actors.num_actors == config.num_actors
-    assert dataclasses.replace(saved, actors=config.actors) == config
+    assert (saved.agent.v_min, saved.agent.v_max) == config.value_range()
+    assert dataclasses.replace(saved, actors=config.actors, agent=config.agent) == config

@@ -36,7 +36,7 @@ def test_the_saved_configuration_comes_back(tmp_path):
         run.write_config(CONFIG)
         saved = run.saved_config()
         assert saved is not None
-        assert saved.agent == CONFIG.agent
+        assert saved.agent == CONFIG.with_value_range(*CONFIG.value_range()).agent
         assert saved.num_lanes == CONFIG.num_lanes
         run.check_resumable(CONFIG)
 
@@ -59,6 +59,22 @@ def test_a_change_of_meaning_is_refused_field_by_field(tmp_path):
     assert "learner.batch_size: 32 -> 64" in text
     assert "total_updates" not in text
     assert "log." not in text
+
+
+@pytest.mark.parametrize("value_range", [(-6.9, 14.1), None])
+def test_a_run_that_began_with_other_atoms_goes_on_with_those_alone(tmp_path, value_range):
+    """Of another version of this package, or of one that did not note them."""
+    with RunDir(tmp_path) as run:
+        run.write_config(CONFIG)
+        file = tmp_path / "config.json"
+        saved = json.loads(file.read_text())
+        saved["resolved"]["value_range"] = value_range
+        file.write_text(json.dumps(saved))
+        low, _ = CONFIG.value_range()
+        with pytest.raises(ResumeError, match=f"agent.v_min: {value_range and value_range[0]} -> {low}"):
+            run.check_resumable(CONFIG)
+        if value_range is not None:
+            run.check_resumable(CONFIG.with_value_range(*value_range))
 
 
 def test_total_updates_may_not_shrink(tmp_path):

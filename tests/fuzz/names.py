@@ -64,7 +64,7 @@ def command_line(_directory: Path) -> Target:
             assert output.getvalue(), "it ended without a word"
             return False
         again = config_from_dict(json.loads(json.dumps(config_to_dict(config))))
-        assert differences(config, again) == []
+        assert differences(again, config) == []
         return True
 
     flags = """--seed 5|--mode sync|--tasks defend_the_center/gore|--env.frame-height 36|--agent.v-min -1
