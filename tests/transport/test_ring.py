@@ -168,19 +168,18 @@ def test_a_full_ring_makes_the_writer_wait_and_says_for_whom(writer: RingWriter)
 def test_waiting_ends_when_the_reader_reads_and_is_counted(reader: RingReader, writer: RingWriter):
     for number in range(CAPACITY):
         write(writer, number)
-    seen: list[WriterState] = []
 
     def read_later():
+        while reader.writer_status().state != WriterState.WAITING_FOR_SPACE:
+            time.sleep(0.01)
         time.sleep(0.1)
-        seen.append(reader.writer_status().state)
         reader.read(3)
 
     thread = threading.Thread(target=read_later)
     thread.start()
     assert writer.wait_for_space(3, timeout_s=10.0)
     thread.join()
-    assert seen == [WriterState.WAITING_FOR_SPACE]
-    assert 0.05 < reader.writer_status().waited_for_space_s < 5.0
+    assert reader.writer_status().waited_for_space_s > 0.05
     assert reader.writer_status().heartbeat_ns > 0
 
 
