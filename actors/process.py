@@ -20,21 +20,26 @@ from gvz.transport.ring import RingReader
 
 LOG_TAIL_BYTES = 4000
 
-ENVIRONMENT = {
-    "JAX_PLATFORMS": "cpu",
-    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
-    "NPROC": "1",  # size of XLA's own thread pools
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-}
-"""A core is an actor's share. Must be set before the process imports anything."""
+
+def one_core() -> dict[str, str]:
+    """Environment variables that keep a process to one core. Must be set before it imports anything.
+
+    The user's own XLA_FLAGS stay: with --xla_cpu_max_isa actors and learner compute by the same instruction set.
+    """
+    return {
+        "JAX_PLATFORMS": "cpu",
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_multi_thread_eigen=false".strip(),
+        "NPROC": "1",  # size of XLA's own thread pools
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "MKL_NUM_THREADS": "1",
+    }
 
 
 def _environment() -> dict[str, str]:
     """Our own, with this process's import path and a cache of compiled acting functions (6 s less at a start)."""
     path = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path)
-    return {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(xla_cache_directory()), **ENVIRONMENT, "PYTHONPATH": path}
+    return {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(xla_cache_directory()), **one_core(), "PYTHONPATH": path}
 
 
 class ActorProcess:

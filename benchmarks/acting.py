@@ -24,7 +24,7 @@ def measure(budget: Budget) -> list[Row]:
     import jax
     import jax.numpy as jnp
 
-    from actors.process import ENVIRONMENT
+    from actors.process import one_core
     from gvz.assemble import assemble
     from learner.policy import flatten_params
 
@@ -45,7 +45,7 @@ def measure(budget: Budget) -> list[Row]:
         flat = np.asarray(jax.jit(flatten_params)(params))
         size = (str(config.env.render_width), str(config.env.render_height))
         engines = [stack.enter_context(Remote("bare_engine", workload.TASK, *size)) for _ in range(num_engines)]
-        products = [stack.enter_context(Remote("cpu_matmul", environment=ENVIRONMENT)) for _ in range(cores)]
+        products = [stack.enter_context(Remote("cpu_matmul", environment=one_core())) for _ in range(cores)]
         acting = {games: stack.enter_context(workload.playing(parts[games].pool_config, flat)) for games in all_games}
         plays = {
             f"actor pool, full network, {games} games an actor": partial(workload.decisions_per_s, pool, budget.body_s)

@@ -1,6 +1,6 @@
 """Plays evaluation episodes over the cores. An episode's seed follows from the task, the episode's number and the base
-seed alone, so that every player meets the same episodes. Imports gvz.{janitor,specs}, gvz.evaluation.players; gvz.env
-to play.
+seed alone, so that every player meets the same episodes. Imports gvz.{janitor,specs},
+actors.process, gvz.evaluation.players; gvz.env to play.
 
 One game a process. A policy that decides for 4 or 8 games at once would save CPU time: with the network of
 `rainbow_4task` 3.37 -> 2.93 and 2.89 ms a decision, engine included, with that of `rainbow_quick` 2.00 -> 1.38 and
@@ -20,6 +20,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from actors.process import one_core
 from gvz import janitor
 from gvz.errors import EngineError, GvzError, WaitTimeoutError
 from gvz.evaluation.players import Player
@@ -203,7 +204,7 @@ _worker = _Worker()
 def _begin_worker(parent_pid: int) -> None:
     janitor.die_with_parent(parent_pid)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    os.environ |= {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false", "NPROC": "1"}
+    os.environ |= one_core()
 
 
 def _play(entrant: Entrant, key: int, episode: Episode) -> Row:

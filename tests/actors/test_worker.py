@@ -106,9 +106,13 @@ def test_a_worker_whose_parent_has_gone_ends_at_once():
     assert (done.returncode, done.stderr) == (1, "")
 
 
-def test_told_to_stop_it_ends_well(spec: ActorSpec, ring: RingReader):
+def test_told_to_stop_it_ends_well(spec: ActorSpec, ring: RingReader, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_max_isa=AVX2")
     process = ActorProcess(spec, ring, None)
     try:
+        environment = Path(f"/proc/{process.pid}/environ").read_text().split("\0")
+        flags = "XLA_FLAGS=--xla_cpu_max_isa=AVX2 --xla_cpu_multi_thread_eigen=false"
+        assert flags in environment, "the user's flags hold for actors too"
         while not any(isinstance(message, Ready) for message in process.receive()):
             assert process.exit_text() is None
             ring.read(100)
