@@ -1,4 +1,4 @@
-"""What a machine must have for a run, checked one by one: `gvz doctor`. Imports gvz.{bill,cache,janitor}.
+"""What a machine must have for a run, checked one by one: `gvz doctor`. Imports gvz.{bill,cache,janitor,machine}.
 
 The engine and jax are tried in sub-processes, since a broken one can end the process that tries it.
 """
@@ -22,12 +22,13 @@ import psutil
 from gvz import janitor
 from gvz.bill import ACTOR_MEMORY_BYTES, ENGINE_SHM_BYTES, LEARNER_MEMORY_BYTES, format_bytes
 from gvz.cache import cache_directory
+from gvz.machine import instruction_set
 
 State = Literal["ok", "note", "bad"]
 """bad: runs will fail; note: they work, less well"""
 
 TESTED_PYTHONS = ((3, 11), (3, 12), (3, 13))
-_TRY_TIMEOUT_S = 120
+_TRY_TIMEOUT_S = 280
 _ENGINE = """
 import time, gvz
 begin = time.monotonic()
@@ -43,6 +44,12 @@ _DEVICES = """
 import jax, jax.numpy as jnp
 assert float(jnp.ones(8).sum()) == 8.0
 print(jax.default_backend(), "|", ", ".join(d.device_kind for d in jax.devices()))
+"""
+_LEARNER = """
+import os
+os.environ["JAX_PLATFORMS"] = "cpu"
+from learner import selfcheck
+selfcheck.main([])
 """
 
 
@@ -175,6 +182,13 @@ def check_devices() -> Finding:
     return finding
 
 
+def check_learner() -> Finding:
+    """The learner computes what it should on this processor (learner/selfcheck.py), by its instruction set."""
+    remedy = "send this line and those of system and packages with your question: scores of this machine may be wrong"
+    finding = _try("learner", _LEARNER, remedy)
+    return dataclasses.replace(finding, found=f"{instruction_set()}: {finding.found}")
+
+
 def check_video() -> Finding:
     """`gvz record` writes mp4 by FFmpeg's libraries, which PyAV brings along; GIF and WebP need nothing."""
     remedy = "pip install 'gvizdoom[video]', or record to .gif or .webp"
@@ -194,7 +208,8 @@ def check_leftovers() -> Finding:
 
 CHECKS: tuple[Callable[[], Finding], ...] = (
     *(check_system, check_python, check_packages, check_cores, check_memory, check_shared_memory),
-    *(check_temporary_directory, check_cache, check_leftovers, check_engine, check_devices, check_video),
+    *(check_temporary_directory, check_cache, check_leftovers, check_engine, check_devices, check_learner),
+    check_video,
 )
 """in the order of what depends on what"""
 

@@ -15,6 +15,17 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("gvizdoom", "vizdoom", "gymnasium", "jax", "jaxlib", "flax", "optax", "numpy", "opencv-python-headless")
 MEASURED = ("gvz", "actors", "learner", "configs")
 _GIT_TIMEOUT_S = 30
+_INSTRUCTION_SETS = {
+    "SSE4_2": "sse4_2",
+    "AVX": "avx",
+    "AVX2": "avx2",
+    "AVX512": "avx512f",
+    "AVX512_VNNI": "avx512_vnni",
+    "AVX512_BF16": "avx512_bf16",
+    "AMX": "amx_bf16",
+    "AMX_FP16": "amx_fp16",
+}
+"""values of XLA's flag --xla_cpu_max_isa, smallest first, and the processor flag that stands for each"""
 
 
 def cpu_model() -> str:
@@ -23,6 +34,23 @@ def cpu_model() -> str:
     lines = file.read_text().splitlines() if file.exists() else []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return models[0] if models else platform.processor() or platform.machine()
+
+
+def instruction_set(cpuinfo: str | None = None, xla_flags: str | None = None) -> str:
+    """The largest of XLA's instruction sets on this processor, such as AVX512_BF16; what XLA_FLAGS caps it at is told.
+
+    Args:
+        cpuinfo: text of /proc/cpuinfo; default this machine's.
+        xla_flags: default the environment's XLA_FLAGS.
+    """
+    file = Path("/proc/cpuinfo")
+    text = (file.read_text() if file.exists() else "") if cpuinfo is None else cpuinfo
+    flags = next((line.partition(":")[2].split() for line in text.splitlines() if line.startswith("flags")), [])
+    found = [name for name, flag in _INSTRUCTION_SETS.items() if flag in flags]
+    largest = found[-1] if found else platform.machine()
+    given = (os.environ.get("XLA_FLAGS", "") if xla_flags is None else xla_flags).split()
+    caps = [flag.partition("=")[2] for flag in given if flag.startswith("--xla_cpu_max_isa=")]
+    return f"{largest}, at most {caps[-1]} by XLA_FLAGS" if caps else largest
 
 
 def describe() -> dict[str, Any]:

@@ -14,12 +14,13 @@ Usage = namedtuple("Usage", "total used free")  # shutil.disk_usage's own shape
 
 
 @pytest.mark.engine
+@pytest.mark.timeout(900)  # it compiles a learner, starts an engine, and others may be busy
 def test_this_machine_is_fit():
     findings = [check() for check in doctor.CHECKS]
     assert [f for f in findings if f.state == "bad"] == []
     assert [f.name for f in findings] == [
         *("system", "python", "packages", "cores", "memory", "/dev/shm", "tmp", "cache", "leftovers"),
-        *("vizdoom", "jax", "video"),
+        *("vizdoom", "jax", "learner", "video"),
     ]
 
 
@@ -71,3 +72,16 @@ def test_one_that_does_not_answer_is_bad(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(doctor, "_TRY_TIMEOUT_S", 1)
     monkeypatch.setattr(doctor, "_DEVICES", "import time; time.sleep(60)")
     assert doctor.check_devices().found == "no answer within 1 s"
+
+
+def test_a_learner_that_computes_something_else_is_bad_and_its_instruction_set_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    wrong = "raise ValueError('self-check: loss of update 1 is 4, want 3')"
+    monkeypatch.setattr(doctor, "_LEARNER", wrong)
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_max_isa=AVX2")
+    finding = doctor.check_learner()
+    assert finding.state == "bad"
+    assert finding.found.endswith(
+        ", at most AVX2 by XLA_FLAGS: exit code 1: ValueError: self-check: loss of update 1 is 4, want 3"
+    )

@@ -38,6 +38,23 @@ def test_all_of_it_is_json_and_of_this_machine():
     assert found["devices"]
 
 
+@pytest.mark.parametrize(
+    ("cpuinfo", "xla_flags", "wanted"),
+    [
+        ("processor : 0\nflags\t\t: fpu sse4_2 avx avx2 fma\n", "", "AVX2"),
+        ("flags : sse4_2 avx avx2 avx512f avx512_vnni avx512_bf16", "--xla_dump_to=x", "AVX512_BF16"),
+        (
+            "flags : sse4_2 avx avx2 avx512f",
+            "--xla_cpu_max_isa=AVX2 --xla_cpu_max_isa=SSE4_2",
+            "AVX512, at most SSE4_2 by XLA_FLAGS",
+        ),
+        ("Features : fp asimd", "", os.uname().machine),
+    ],
+)
+def test_the_instruction_set_is_the_largest_that_xla_knows_and_its_cap_is_told(cpuinfo, xla_flags, wanted):
+    assert machine.instruction_set(cpuinfo, xla_flags) == wanted
+
+
 def test_packages_that_are_not_installed_have_no_version():
     assert set(machine.versions(["numpy", "no-such-package"])) == {"python", "numpy"}
 

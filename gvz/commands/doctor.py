@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class Doctor:
-    """Check Python, packages, memory, /dev/shm, ViZDoom, JAX; say what is wrong and how to mend it.
+    """Check Python, packages, memory, /dev/shm, ViZDoom, JAX, learner; say what is wrong and how to mend it.
 
     Exit code 1 if runs will fail on this machine.
     """
