@@ -12,11 +12,11 @@ import pytest
 
 from gvz.errors import ConfigError
 from gvz.registry import discover
-from learner import losses
 from learner.agents.base import Agent, AgentSpec, epsilon_greedy, make_agent
 from learner.config import AgentConfig
 from learner.networks import add_noise
 from learner.replay import Transitions
+from tests.learner import reference
 
 B, A = 6, 3
 SPEC = AgentSpec(obs_shape=(10, 10, 2), num_actions=A, num_tasks=2, v_min=-2.0, v_max=3.0)
@@ -134,47 +134,58 @@ def test_rainbow_with_every_part_off_is_dqn_to_the_last_bit():
         jax.tree.map(np.testing.assert_array_equal, ours, theirs)
 
 
-def test_dqn_loss_is_algorithm_1_with_the_huber_loss():
-    agent, _, evaluate, loss = jitted(replace(ALL_OFF, name="dqn"))
+def values(config: AgentConfig, params, obs, task, atoms=None) -> tuple[np.ndarray, np.ndarray]:
+    """(logits, Q) in float64, of the network whose weights are the means of `params`."""
+    logits = reference.network(config, params["params"], obs, task, A, SPEC.num_tasks)
+    return logits, logits[:, :, 0] if atoms is None else reference.softmax(logits) @ atoms
+
+
+@pytest.mark.isa
+@pytest.mark.parametrize("task_conditioned", [False, True])
+def test_dqn_loss_is_algorithm_1_with_the_huber_loss_in_float64(task_conditioned: bool):
+    config = replace(ALL_OFF, name="dqn", task_conditioned=task_conditioned)
+    agent, _, _, loss = jitted(config)
     params, target, b = made_up_params(agent, 0), made_up_params(agent, 1), batch()
     result = loss(params, target, jax.random.key(0), b)
-    q_tm1 = np.asarray(evaluate(params, b.obs_tm1, b.task).q_values, np.float64)[np.arange(B), b.a_tm1]
-    q_t = np.asarray(evaluate(target, b.obs_t, b.task).q_values, np.float64).max(1)
-    td = np.asarray(b.r_t) + np.asarray(b.discount_t) * q_t - q_tm1
-    np.testing.assert_allclose(result.td_error, td, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(result.priority, np.abs(td), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(result.loss, np.where(np.abs(td) < 1, td**2 / 2, np.abs(td) - 0.5), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(result.q_tm1, q_tm1, rtol=1e-5)
+    q_tm1 = values(config, params, b.obs_tm1, b.task)[1]
+    td = reference.td(q_tm1, b.a_tm1, b.r_t, b.discount_t, values(config, target, b.obs_t, b.task)[1])
+    np.testing.assert_allclose(result.td_error, td, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(result.priority, np.abs(td), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(result.loss, reference.huber(td), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(result.q_tm1, q_tm1[np.arange(B), b.a_tm1], rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize(("double", "distributional"), [(True, True), (False, True), (True, False)])
-def test_rainbow_loss_is_its_equations_with_a_noise_each_for_online_target_and_choice(
-    double: bool, distributional: bool
+@pytest.mark.isa
+@pytest.mark.parametrize(
+    ("double", "distributional", "dueling"), [(True, True, True), (False, True, False), (True, False, True)]
+)
+def test_rainbow_loss_is_its_equations_in_float64_with_a_noise_each_for_online_target_and_choice(
+    double: bool, distributional: bool, dueling: bool
 ):
-    config = replace(RAINBOW, double=double, distributional=distributional)
+    """A network whose means are the noisy weights, applied without noise, is the noisy network."""
+    config = replace(RAINBOW, double=double, distributional=distributional, dueling=dueling)
     agent, _, _, loss = jitted(config)
     params, target, b = made_up_params(agent, 0), made_up_params(agent, 1), batch()
     result = loss(params, target, jax.random.key(7), b)
 
-    @jax.jit
-    def by_hand(params, target):
-        key_online, key_target, key_selector = jax.random.split(jax.random.key(7), 3)
-        # A network whose means are the noisy weights, evaluated without noise, is the noisy network.
-        online = add_noise(params, key_online, "factorized")
-        at_tm1 = agent.evaluate(online, b.obs_tm1, b.task)
-        online_t = agent.evaluate(add_noise(params, key_selector, "factorized"), b.obs_t, b.task)
-        target_t = agent.evaluate(add_noise(target, key_target, "factorized"), b.obs_t, b.task)
-        selector, rest = online_t.q_values if double else None, (b.a_tm1, b.r_t, b.discount_t)
-        td = losses.q_learning_td(at_tm1.q_values, *rest, target_t.q_values, selector)
-        if distributional:
-            logits_tm1, logits_t = jnp.log(at_tm1.probabilities), jnp.log(target_t.probabilities)
-            return *losses.categorical_q_learning(logits_tm1, *rest, logits_t, at_tm1.atoms, selector), td
-        return losses.huber(td), jnp.abs(td), td
-
-    wanted, priority, td = by_hand(params, target)
+    key_online, key_target, key_selector = jax.random.split(jax.random.key(7), 3)
+    atoms = np.linspace(SPEC.v_min, SPEC.v_max, config.num_atoms) if distributional else None
+    online, moved_target, chooser = (
+        add_noise(p, key, "factorized")
+        for p, key in ((params, key_online), (target, key_target), (params, key_selector))
+    )
+    logits_tm1, q_tm1 = values(config, online, b.obs_tm1, b.task, atoms)
+    logits_t, q_t = values(config, moved_target, b.obs_t, b.task, atoms)
+    selector = values(config, chooser, b.obs_t, b.task, atoms)[1] if double else None
+    td = reference.td(q_tm1, b.a_tm1, b.r_t, b.discount_t, q_t, selector)
+    if distributional:
+        wanted, priority = reference.categorical(logits_tm1, b.a_tm1, b.r_t, b.discount_t, logits_t, atoms, selector)
+    else:
+        wanted, priority = reference.huber(td), np.abs(td)
     np.testing.assert_allclose(result.td_error, td, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(result.q_tm1, q_tm1[np.arange(B), b.a_tm1], rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(result.loss, wanted, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(result.priority, priority, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(result.priority, priority, rtol=1e-3, atol=1e-5)
 
 
 def test_online_target_and_choice_of_the_next_action_have_independent_noise():

@@ -11,50 +11,7 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 
 from learner import losses
-
-# --- oracles: loops over samples in float64, written from the papers' equations -----------------------------------
-
-
-def oracle_td(q_tm1, a_tm1, r_t, discount_t, q_t_value, q_t_selector=None):
-    td = []
-    for i in range(len(a_tm1)):
-        selector = q_t_value[i] if q_t_selector is None else q_t_selector[i]
-        best = max(range(len(selector)), key=lambda a: selector[a])
-        td.append(r_t[i] + discount_t[i] * q_t_value[i][best] - q_tm1[i][a_tm1[i]])
-    return np.array(td, np.float64)
-
-
-def oracle_project(shifted_atoms, probabilities, atoms):
-    """Bellemare et al. 2017, Algorithm 1: b = (Tz - v_min) / dz, mass to floor(b) and ceil(b)."""
-    v_min, v_max, n = float(atoms[0]), float(atoms[-1]), len(atoms)
-    width = (v_max - v_min) / (n - 1)
-    projected = np.zeros(n, np.float64)
-    for z, p in zip(np.asarray(shifted_atoms, np.float64), np.asarray(probabilities, np.float64), strict=True):
-        b = (min(max(z, v_min), v_max) - v_min) / width
-        low = min(int(np.floor(b)), n - 1)
-        high = min(low + 1, n - 1)
-        projected[low] += p * (1 - (b - low))
-        projected[high] += p * (b - low)
-    return projected
-
-
-def oracle_categorical(logits_tm1, a_tm1, r_t, discount_t, logits_t, atoms, q_t_selector=None):
-    """(cross-entropy, KL divergence) in float64."""
-
-    def softmax(x):
-        e = np.exp(x - x.max())
-        return e / e.sum()
-
-    results = []
-    for i in range(len(a_tm1)):
-        p_t = [softmax(row) for row in np.asarray(logits_t[i], np.float64)]
-        q = [float(p @ atoms) for p in p_t] if q_t_selector is None else list(q_t_selector[i])
-        target = oracle_project(r_t[i] + discount_t[i] * np.asarray(atoms, np.float64), p_t[int(np.argmax(q))], atoms)
-        log_p = np.log(softmax(np.asarray(logits_tm1[i][a_tm1[i]], np.float64)))
-        entropy = -sum(t * np.log(t) for t in target if t > 0)
-        cross_entropy = -float(target @ log_p)
-        results.append((cross_entropy, cross_entropy - entropy))
-    return np.array(results).T
+from tests.learner import reference
 
 
 def random_batch(seed: int, B: int = 7, A: int = 4, N: int = 11) -> dict[str, np.ndarray]:
@@ -107,7 +64,7 @@ def test_td_equals_the_float64_oracle(double: bool):
         selector = b["selector"] if double else None
         args = (b["q_tm1"], b["a_tm1"], b["r_t"], b["discount_t"], b["q_t"])
         td = losses.q_learning_td(*map(jnp.asarray, args), None if selector is None else jnp.asarray(selector))
-        np.testing.assert_allclose(td, oracle_td(*args, selector), rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(td, reference.td(*args, selector), rtol=1e-5, atol=1e-5)
 
 
 def test_no_gradient_flows_into_the_td_target():
@@ -158,7 +115,7 @@ def test_projection_keeps_mass_and_equals_the_oracle(seed: int, r: float, discou
     p = np.random.default_rng(seed).dirichlet(np.ones(21)).astype(np.float32)
     moved = r + discount * atoms
     projected = np.asarray(losses.project(jnp.asarray(moved[None]), jnp.asarray(p[None]), jnp.asarray(atoms))[0])
-    np.testing.assert_allclose(projected, oracle_project(moved, p, atoms), atol=5e-5)
+    np.testing.assert_allclose(projected, reference.project(moved, p, atoms), atol=5e-5)
     assert abs(projected.sum() - 1) < 1e-4
     if moved.min() >= low and moved.max() <= low + span:
         assert abs(projected @ atoms - p @ moved) < 1e-3 * span
@@ -173,7 +130,7 @@ def test_categorical_loss_equals_the_float64_oracle(double: bool):
         ours = losses.categorical_q_learning(
             *map(jnp.asarray, args), None if selector is None else jnp.asarray(selector)
         )
-        np.testing.assert_allclose(np.stack(ours), oracle_categorical(*args, selector), rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(np.stack(ours), reference.categorical(*args, selector), rtol=1e-4, atol=1e-5)
 
 
 def test_categorical_loss_of_a_terminal_reward_on_an_atom_is_its_negative_log_probability():

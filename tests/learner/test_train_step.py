@@ -1,4 +1,4 @@
-"""The train step against the same update done by hand, and its promises: one compilation, in place, no NaN kept."""
+"""The train step against the equations in float64, and its promises: one compilation, in place, no NaN kept."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -7,14 +7,15 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
 from gvz.errors import NonFiniteError
-from learner import replay, sum_tree, train_step
+from learner import losses, replay, sum_tree, train_step
 from learner.agents.base import AgentLoss, AgentSpec, Evaluation, make_agent
 from learner.config import AgentConfig, LearnerConfig, ReplayConfig
 from learner.replay import ReplaySpec, ReplayState
+
+pytestmark = pytest.mark.isa
 
 LANES, TASKS, B = 2, 2, 8
 SPEC = AgentSpec(obs_shape=(8, 8, 2), num_actions=3, num_tasks=TASKS, v_min=-3.0, v_max=3.0)
@@ -64,6 +65,36 @@ class OneWeight:
         return AgentLoss(value + 0.0 * away, jnp.abs(batch.r_t), w * jnp.ones(B), batch.r_t)
 
 
+@dataclass(frozen=True)
+class LinearQ:
+    """Q(s, a) = w_a . (two pixels, 1): DQN's loss, whose gradient is worked out by hand."""
+
+    spec: AgentSpec = SPEC
+
+    def init(self, key):
+        return {"w": jax.random.normal(key, (3, 3))}
+
+    def q_values(self, params, obs):
+        pixels = obs[:, 2, 5].astype(jnp.float32) / 255  # of the two stacked frames
+        return jnp.concatenate([pixels, jnp.ones((len(obs), 1))], axis=1) @ params["w"].T
+
+    def act(self, params, key, obs, task, epsilon):
+        del key, task, epsilon
+        return self.q_values(params, obs).argmax(1).astype(jnp.int32)
+
+    def evaluate(self, params, obs, task):
+        del task
+        q = self.q_values(params, obs)
+        return Evaluation(q.argmax(1), q)
+
+    def loss(self, online_params, target_params, key, batch):
+        del key
+        q_tm1 = losses.take_action(self.q_values(online_params, batch.obs_tm1), batch.a_tm1)
+        target = batch.r_t + batch.discount_t * self.q_values(target_params, batch.obs_t).max(1)
+        td = jax.lax.stop_gradient(target) - q_tm1
+        return AgentLoss(losses.huber(td), jnp.abs(td), q_tm1, td)
+
+
 @cache
 def filled_replay() -> dict[str, np.ndarray]:
     """50 records a lane: lane 0 plays task 0, lane 1 plays task 1; episodes of 10."""
@@ -102,29 +133,6 @@ def compiled(num_updates: int = 1, agent=AGENT, config: LearnerConfig = LEARNER)
     return train_step.make_train_step(agent, REPLAY, config, REPLAY_CONFIG, num_updates)
 
 
-@jax.jit
-def update_by_hand(params, target_params, opt_state, replay_state, key, beta, task_weights):
-    """One update in plain steps, with optax used the plain way."""
-    key, key_sample, key_loss = jax.random.split(key, 3)
-    batch, info = replay.sample(REPLAY, replay_state, key_sample, B, beta)
-
-    def mean_loss(params):
-        result = AGENT.loss(params, target_params, key_loss, batch)
-        return (info.weights * task_weights[batch.task] * result.loss).mean(), result
-
-    (loss, result), grads = jax.value_and_grad(mean_loss, has_aux=True)(params)
-    grad_norm = jnp.linalg.norm(jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves(grads)]))
-    optimizer = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(1e-3, eps=1e-7))
-    deltas, opt_state = optimizer.update(grads, opt_state)
-    params = optax.apply_updates(params, deltas)
-    replay_state = replay.update_priorities(REPLAY, replay_state, info.slots, result.priority)
-    return params, opt_state, replay_state, key, (loss, result, grad_norm, info, batch.task)
-
-
-def leaves_close(a, b, **tolerance):
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **({"rtol": 2e-4, "atol": 2e-6} | tolerance)), a, b)
-
-
 def raw(state):
     """Leaves as numpy, keys as their bits."""
 
@@ -134,47 +142,109 @@ def raw(state):
     return [np.asarray(jax.random.key_data(x) if is_key(x) else x) for x in jax.tree.leaves(state)]
 
 
-def test_updates_equal_those_done_by_hand(tmp_path: Path):
-    task_weights = np.float32([1.0, 2.5])
-    state, stored = fresh_state(), fresh_replay()
-    params, target, opt_state, key = state.params, state.target_params, state.opt_state, state.key
-    params, target, opt_state = jax.tree.map(jnp.array, (params, target, opt_state))
-    by_hand, seen = fresh_replay(), []
-    for update in range(7):
-        beta = 0.4 + 0.6 * update / 10  # annealed linearly over total_updates
-        params, opt_state, by_hand, key, numbers = update_by_hand(
-            params, target, opt_state, by_hand, key, jnp.float32(beta), task_weights
+LANE_SLOTS = REPLAY.lane_capacity
+DRAWN = {3: 1.0, 17: 3.0, LANE_SLOTS + 8: 2.0, LANE_SLOTS + 20: 2.0}
+"""priorities by slot: each of the 8 equal parts of their sum lies in one of them, so every batch is known"""
+
+
+class Float64Learner:
+    """What a learner of `LinearQ` must be after each update, in float64, from the papers' equations alone."""
+
+    def __init__(self, w: np.ndarray, task_weights: np.ndarray):
+        self.w, self.target, self.task_weights = w.astype(np.float64), w.astype(np.float64), task_weights
+        self.mean, self.square, self.num_updates = np.zeros_like(self.w), np.zeros_like(self.w), 0
+        self.max_priority = 1.0
+        slots = np.array(list(DRAWN))
+        self.slots = np.repeat(slots, [int(share) for share in DRAWN.values()])
+        lane, t = self.slots // LANE_SLOTS, self.slots % LANE_SLOTS
+        stored = filled_replay()
+        pixel = stored.frames.reshape(-1, 8, 8)[:, 2, 5] / 255.0
+
+        def features(t):
+            before = np.where(t % 10 == 0, t, t - 1)  # an episode's first frame is repeated
+            return np.stack([pixel[lane * LANE_SLOTS + before], pixel[lane * LANE_SLOTS + t], np.ones(B)], axis=1)
+
+        reward = stored.reward.astype(np.float64)
+        one_step = t % 10 == 8  # the next record is the episode's last
+        length = np.where(one_step, 1, 2)
+        self.r_t = reward[self.slots + 1] + np.where(one_step, 0.0, 0.9 * reward[self.slots + length])
+        self.discount_t = np.where((t + length) % 10 == 9, 0.0, 0.9**length)
+        self.phi_tm1, self.phi_t, self.a_tm1, self.task = (
+            features(t),
+            features(t + length),
+            stored.action[self.slots],
+            lane,
         )
-        if (update + 1) % 3 == 0:
-            target = params
-        seen.append(jax.device_get(numbers))
-        state, stored = compiled()(state, stored, task_weights)
-    leaves_close(state.params, params)
-    leaves_close(state.target_params, target)
-    leaves_close(stored.tree, by_hand.tree)
-    np.testing.assert_allclose(stored.max_priority, by_hand.max_priority, rtol=1e-4)
-    assert int(state.num_updates) == 7
+        self.probability = np.array([DRAWN[slot] for slot in self.slots]) / B
+
+    def update(self) -> dict[str, np.ndarray]:
+        """One update; returns what the metrics are made of."""
+        beta = 0.4 + 0.6 * self.num_updates / 10  # annealed linearly over total_updates
+        importance = (1 / (100 * self.probability)) ** beta  # eq. 4.13; any number of transitions gives the same
+        importance /= importance.max()
+        q_tm1 = (self.phi_tm1 * self.w[self.a_tm1]).sum(1)
+        td = self.r_t + self.discount_t * (self.phi_t @ self.target.T).max(1) - q_tm1
+        loss = np.where(np.abs(td) < 1, td**2 / 2, np.abs(td) - 0.5)
+        weights = importance * self.task_weights[self.task]
+        gradient = np.zeros_like(self.w)
+        for i in range(B):
+            gradient[self.a_tm1[i]] -= weights[i] * np.clip(td[i], -1, 1) * self.phi_tm1[i] / B
+        norm = np.linalg.norm(gradient)
+        clipped = gradient * min(1.0, 0.5 / norm)
+        self.num_updates += 1
+        k = self.num_updates
+        self.mean = 0.9 * self.mean + 0.1 * clipped  # Kingma and Ba 2015, Algorithm 1
+        self.square = 0.999 * self.square + 0.001 * clipped**2
+        self.w = self.w - 0.1 * (self.mean / (1 - 0.9**k)) / (np.sqrt(self.square / (1 - 0.999**k)) + 1e-7)
+        if k % 3 == 0:
+            self.target = self.w.copy()
+        self.leaves = np.zeros(REPLAY.num_slots)
+        self.leaves[self.slots] = (np.abs(td) + 0.01) ** 0.6  # eq. 4.11, 4.12
+        self.max_priority = max(self.max_priority, self.leaves.max())
+        mean_loss = (weights * loss).mean()
+        return {"loss": loss, "mean": mean_loss, "td": td, "q": q_tm1, "norm": norm, "importance": importance}
+
+
+def test_updates_are_those_of_the_equations_in_float64(tmp_path: Path):
+    """Batch, n-step return, importance and task weights, Huber loss, clipping, Adam, target, priorities, metrics."""
+    task_weights, agent, config = np.float32([1.0, 2.5]), LinearQ(), replace(LEARNER, learning_rate=0.1)
+    state, updates = fresh_state(agent, config), 7
+    oracle, seen = Float64Learner(np.asarray(state.params["w"]), task_weights), []
+    slots, priorities = np.array(list(DRAWN)), np.float32(list(DRAWN.values()))
+    tree = jax.device_get(sum_tree.set(sum_tree.init(REPLAY.num_slots), slots, priorities))
+    max_priority = np.float32(1.0)
+    for _ in range(updates):
+        stored = fresh_replay(tree=tree, max_priority=max_priority)
+        state, stored = compiled(agent=agent, config=config)(state, stored, task_weights)
+        max_priority = np.asarray(stored.max_priority)
+        seen.append(oracle.update())
+        np.testing.assert_allclose(state.params["w"], oracle.w, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(state.target_params["w"], oracle.target, rtol=1e-4, atol=1e-5)
+        leaves = np.asarray(sum_tree.get(stored.tree, np.arange(REPLAY.num_slots)))
+        np.testing.assert_allclose(leaves, oracle.leaves, rtol=1e-3, atol=1e-5)
+        np.testing.assert_allclose(max_priority, oracle.max_priority, rtol=1e-4)
+    assert int(state.num_updates) == updates
+    norms = [n["norm"] for n in seen]
+    assert min(norms) < 0.5 < max(norms), "some gradients are clipped and some are not"
+    assert {abs(td) < 1 for n in seen for td in n["td"]} == {True, False}, "both sides of the Huber loss"
 
     metrics, state = train_step.read_metrics(state, NAMES, tmp_path)
-    tasks = np.concatenate([n[4] for n in seen])
-    losses_seen, priorities, td_errors = (
-        np.concatenate([getattr(n[1], name) for n in seen]) for name in ("loss", "priority", "td_error")
-    )
+    loss, td, q = (np.concatenate([n[name] for n in seen]) for name in ("loss", "td", "q"))
     wanted = {
-        "loss": np.mean([n[0] for n in seen]),
-        "priority": priorities.mean(),
-        "td_error": np.abs(td_errors).mean(),
-        "q_mean": np.mean([n[1].q_tm1 for n in seen]),
-        "q_max": np.max([n[1].q_tm1 for n in seen]),
-        "grad_norm": np.mean([n[2] for n in seen]),
-        "grad_norm_max": np.max([n[2] for n in seen]),
-        "importance_weight": np.mean([n[3].weights for n in seen]),
+        "loss": np.mean([n["mean"] for n in seen]),
+        "priority": np.abs(td).mean(),
+        "td_error": np.abs(td).mean(),
+        "q_mean": q.mean(),
+        "q_max": q.max(),
+        "grad_norm": np.mean(norms),
+        "grad_norm_max": np.max(norms),
+        "importance_weight": np.mean([n["importance"] for n in seen]),
     }
+    tasks = np.tile(oracle.task, updates)
     for i, name in enumerate(NAMES):
         wanted[f"sample_share/{name}"] = np.mean(tasks == i)
-        wanted[f"loss/{name}"] = losses_seen[tasks == i].mean()
-        wanted[f"priority/{name}"] = priorities[tasks == i].mean()
-        wanted[f"td_error/{name}"] = np.abs(td_errors[tasks == i]).mean()
+        wanted[f"loss/{name}"] = loss[tasks == i].mean()
+        wanted[f"priority/{name}"] = wanted[f"td_error/{name}"] = np.abs(td[tasks == i]).mean()
     assert metrics.keys() == wanted.keys()
     for name, value in wanted.items():
         np.testing.assert_allclose(metrics[name], value, rtol=1e-3, atol=1e-5, err_msg=name)
