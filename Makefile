@@ -6,7 +6,7 @@ INTEROP := .venv-interop
 PEERS  := .venv-peers
 ARGS   ?=
 
-.PHONY: help install install-cuda train test test-fast test-slow test-browser test-interop pipeline lint format lock bench bench-peers bench-micro soak fuzz docs clean
+.PHONY: help install install-cuda train test test-fast test-slow test-isa test-browser test-interop learning-seeds pipeline lint format lock bench bench-peers bench-micro soak fuzz docs clean
 
 help:            ## show this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -34,6 +34,17 @@ test-fast: install ## unit tests that start no engine
 
 test-slow: install ## learning and fault tests that take minutes each
 	$(BIN)/python -m pytest -m slow --timeout 1800 $(ARGS)
+
+test-isa: install ## tests of learning and of the learner's numbers, as older processors compute them
+	for isa in AVX2 SSE4_2; do \
+	  XLA_FLAGS=--xla_cpu_max_isa=$$isa $(BIN)/python -m pytest -m "isa and not slow" -n 2 --dist loadgroup $(ARGS) || exit 1; \
+	done
+
+learning-seeds: install ## ten seeds of every test of learning under three instruction sets: the figures beside the tests
+	for flags in "" --xla_cpu_max_isa=AVX2 --xla_cpu_max_isa=SSE4_2; do \
+	  XLA_FLAGS=$$flags $(BIN)/python -m pytest tests/learner/test_learning.py --learning-seeds 10 \
+	    --timeout 1800 -q $(ARGS) || exit 1; \
+	done
 
 pipeline: install ## all four experiments at a thousandth of their size, and their report, in runs/pipeline
 	$(BIN)/gvz experiment run training_difficulty training_set_size algorithm_comparison rainbow_evaluation \

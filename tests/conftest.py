@@ -7,6 +7,10 @@ import os
 import shutil
 import tempfile
 
+import pytest
+
+from tests.learner import seeds
+
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ["XDG_RUNTIME_DIR"] = tempfile.mkdtemp(prefix="gvz-tests-")
 
@@ -18,6 +22,19 @@ def _clean_up() -> None:
 
     janitor.clean_dead_instances()
     shutil.rmtree(os.environ["XDG_RUNTIME_DIR"], ignore_errors=True)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    seeds.add_option(parser)
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    seeds.parametrize(metafunc)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    if terminalreporter.config.getoption("--learning-seeds"):
+        seeds.summarize(terminalreporter)
 
 
 def pytest_configure() -> None:

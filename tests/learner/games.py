@@ -79,7 +79,7 @@ def umbrella(length: int = 10, num_actions: int = 2) -> Game:
     return Game(reset, frame, step, (4, length + 1), num_actions, length, 1.0)
 
 
-def noisy_rewards(length: int = 4, num_actions: int = 8) -> Game:
+def noisy_rewards(length: int = 8, num_actions: int = 8) -> Game:
     """Every action pays N(0, 1), so every value is 0: what an agent believes beyond that is overestimation."""
 
     def step(s, action, key):
