@@ -1,8 +1,8 @@
-"""Configuration of the actor pool. Imports the standard library and gvz.errors only."""
+"""Configuration of the actor pool."""
 
 from dataclasses import dataclass
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 
 MAX_LANES = 2**16
 """games of a run: a step record numbers them with 16 bits"""

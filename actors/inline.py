@@ -1,4 +1,4 @@
-"""The pool of sync mode: the same acting loop in the learner's own process. Imports gvz (tier 0) and actors.
+"""The pool of sync mode: the same acting loop in the learner's own process.
 
 A game is played only inside `drain`, so a run is a function of its seed, and `state` holds all that is needed to go
 on bit for bit.
@@ -11,7 +11,7 @@ import numpy as np
 
 from actors.loop import ActorLoop
 from actors.pool import PoolConfig, PoolStatistics, num_decisions
-from gvz.errors import ResumeError
+from gvz.core.errors import ResumeError
 from gvz.transport.messages import STEP_DTYPE, EpisodeStats, Message, ParamsHeader, StepBlock, decode, encode
 from gvz.transport.ring import RingReader
 

@@ -1,4 +1,4 @@
-"""The acting loop: several games, one batched decision, step records out. Imports numpy, gvz (tiers 0-1), actors.
+"""The acting loop: several games, one batched decision, step records out.
 
 The same loop runs in a worker process and, in sync mode, inside the learner's.
 """
@@ -14,7 +14,7 @@ import numpy as np
 
 from actors.policy import make_policy
 from actors.preprocess import push_frame, start_stack
-from gvz.errors import ConfigError, ResumeError
+from gvz.core.errors import ConfigError, ResumeError
 from gvz.transport.messages import ActorSpec, EpisodeStats, Fault, Message, ParamsHeader
 from gvz.transport.ring import RingWriter, WriterState
 

@@ -1,6 +1,4 @@
-"""What chooses actions in an actor: the learner's exported acting function, or chance. Imports numpy; jax only when
-there is a function to load, so that a pool of random players starts without it.
-"""
+"""What chooses actions in an actor: the learner's exported acting function, or chance."""
 
 import itertools
 import math

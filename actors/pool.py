@@ -1,4 +1,4 @@
-"""The pool of actor processes: starts them, watches them, takes their records. Imports gvz (tier 0) and actors.
+"""The pool of actor processes: starts them, watches them, takes their records.
 
 `ActorPool` and `actors.inline.InlinePool` have one interface: `publish`, `drain`, `poll`, `state`, `statistics`,
 `close`. Neither starts a thread: all watching happens in `poll`, which the learner calls in every round.
@@ -13,15 +13,15 @@ import numpy as np
 
 from actors.config import ActorsConfig
 from actors.supervisor import SupervisedActor
-from gvz import janitor
-from gvz.errors import ConfigError, ResumeError
+from gvz.core import janitor
+from gvz.core.errors import ConfigError, ResumeError
 from gvz.transport.broadcast import BroadcastWriter, broadcast_bytes
 from gvz.transport.messages import ActorSpec, EpisodeStats, Message, ParamsHeader, StepBlock
 from gvz.transport.ring import WriterStatus, ring_bytes
 
 STOP_TIMEOUT_S = 5.0
 _WAIT_SLEEP_S = 0.001
-_WORTHWHILE_SHARE = 1 / 8
+_MIN_DRAIN_SHARE = 1 / 8
 """of what the rings hold: with fewer records than that a drain rather waits, since it costs the same for one as for
 many (play at random on 2 cores: 12% more decisions/s than taking every record as it comes)"""
 
@@ -140,7 +140,7 @@ class ActorPool:
         """
         specs = config.actor_specs(episodes_to_begin_with(config, state))
         self._config = config
-        self._worthwhile = max(1, int(_WORTHWHILE_SHARE * config.num_actors * config.ring_capacity))
+        self._min_drain_records = max(1, int(_MIN_DRAIN_SHARE * config.num_actors * config.ring_capacity))
         self._actors: list[SupervisedActor] = []
         self._params: BroadcastWriter | None = None
         self._polled_at = time.monotonic()
@@ -179,7 +179,7 @@ class ActorPool:
             TransportError: a record was lost, repeated or torn.
         """
         start = time.monotonic()
-        worthwhile = min(max_records, self._worthwhile)
+        worthwhile = min(max_records, self._min_drain_records)
         while self._num_unread() < worthwhile and time.monotonic() - start < wait_s:
             time.sleep(_WAIT_SLEEP_S)
         if wait_s > 0.0:
@@ -192,7 +192,7 @@ class ActorPool:
             block = actor.ring.read(share)
             if len(block):
                 max_records -= len(block)
-                actor.note(block.steps)
+                actor.track_episodes(block.steps)
                 self._env_steps += num_decisions(block.steps)
                 blocks.append(block)
         return blocks
@@ -223,7 +223,7 @@ class ActorPool:
     def state(self) -> dict[str, Any]:
         """What the pool of a resumed run begins with: lanes go on with new episodes."""
         for actor in self._actors:
-            actor.note_unread()
+            actor.track_unread()
         return {"next_episodes": [episode for actor in self._actors for episode in actor.next_episodes]}
 
     def statistics(self) -> PoolStatistics:

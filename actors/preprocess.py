@@ -1,4 +1,4 @@
-"""Stacks of frames as the acting network sees them: oldest first along the channel axis. Imports numpy only."""
+"""Stacks of frames as the acting network sees them: oldest first along the channel axis."""
 
 import numpy as np
 

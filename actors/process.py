@@ -1,4 +1,4 @@
-"""One actor process as its parent sees it: start, signs of life, end. Imports gvz (tier 0), platformdirs.
+"""One actor process as its parent sees it: start, signs of life, end.
 
 Started with `subprocess` (an exec: nothing of a JAX process is inherited by fork) in a session of its own, so that a
 Ctrl-C reaches the learner alone. It dies with the *thread* that started it.
@@ -11,8 +11,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from gvz import janitor
-from gvz.cache import xla_cache_directory
+from gvz.core import janitor
+from gvz.core.cache import xla_cache_directory
 from gvz.transport.broadcast import BroadcastWriter
 from gvz.transport.channel import Channel
 from gvz.transport.messages import ActorSpec, Message, Stop

@@ -1,7 +1,4 @@
-"""One actor over the lives of its processes: watched, ended when stuck, replaced within a budget.
-
-Imports gvz (tier 0) and actors.
-"""
+"""One actor over the lives of its processes: watched, ended when stuck, replaced within a budget."""
 
 import dataclasses
 from collections import deque
@@ -10,8 +7,8 @@ import numpy as np
 
 from actors.config import ActorsConfig
 from actors.process import ActorProcess, log_path, read_log_tail
-from gvz import janitor
-from gvz.errors import TransportError, WorkerError
+from gvz.core import janitor
+from gvz.core.errors import TransportError, WorkerError
 from gvz.transport.broadcast import BroadcastWriter
 from gvz.transport.messages import ActorSpec, EpisodeStats, Fault, Message, Ready
 from gvz.transport.ring import RingReader, WriterState
@@ -97,16 +94,16 @@ class SupervisedActor:
             self._kill_at = now + _DUMP_S
         return messages
 
-    def note(self, steps: np.ndarray) -> None:
+    def track_episodes(self, steps: np.ndarray) -> None:
         """Keeps track of the episodes that have begun, from records of the ring."""
         for game, lane in enumerate(self._spec.lanes):
             episodes = steps["episode"][steps["lane"] == lane]
             if episodes.size:
                 self.next_episodes[game] = max(self.next_episodes[game], int(episodes[-1]) + 1)
 
-    def note_unread(self) -> None:
+    def track_unread(self) -> None:
         """As `note`, from what is still in the ring."""
-        self.note(self.ring.peek(self.ring.capacity).steps)
+        self.track_episodes(self.ring.peek(self.ring.capacity).steps)
 
     def _check(self, received: list[Message]) -> None:
         """Raises TransportError: an episode of a game that is not this actor's."""
@@ -171,7 +168,7 @@ class SupervisedActor:
     def _renumber(self) -> None:
         """The next process plays new episodes: also in lanes that have written nothing, for the seed of such an
         episode may be what their engine cannot start with."""
-        self.note_unread()
+        self.track_unread()
         begun = [first + 1 for first in self._spec.first_episodes]
         self.next_episodes = [max(pair) for pair in zip(self.next_episodes, begun, strict=True)]
         self._spec = dataclasses.replace(self._spec, first_episodes=list(self.next_episodes))

@@ -15,8 +15,8 @@ import time
 import traceback
 
 from actors.loop import ActorLoop
-from gvz import janitor
-from gvz.errors import EngineError, WaitTimeoutError
+from gvz.core import janitor
+from gvz.core.errors import EngineError, WaitTimeoutError
 from gvz.transport.broadcast import BroadcastReader
 from gvz.transport.channel import Channel
 from gvz.transport.messages import ActorSpec, Fault, Ready, Stop

@@ -10,7 +10,7 @@ from pathlib import Path
 import tyro
 
 from benchmarks import rounds, runner
-from gvz.errors import GvzError
+from gvz.core.errors import GvzError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,8 +25,8 @@ def measure(budget: Budget) -> list[Row]:
     import jax.numpy as jnp
 
     from actors.process import one_core
-    from gvz.assemble import assemble
-    from learner.policy import flatten_params
+    from gvz.run.assemble import assemble
+    from learner.export import flatten_params
 
     cores, config = len(os.sched_getaffinity(0)), workload.run_config(budget)
     num_engines = 1 if budget.quick else 2 * cores

@@ -19,7 +19,7 @@ from benchmarks.rounds import Budget, Row, absent, alternate, goal, rates, ratio
 
 def measure(budget: Budget) -> list[Row]:
     """Rates of all candidates in alternating rounds, and the goals' ratios."""
-    from gvz.assemble import assemble
+    from gvz.run.assemble import assemble
 
     cores = len(os.sched_getaffinity(0))
     config = workload.run_config(budget)

@@ -110,7 +110,7 @@ def _replay(budget: Budget) -> list[Row]:
 
 def _updates(budget: Budget, sizes: Sequence[int], change: Callable[[Any, int], Any]) -> dict[float, list[float]]:
     """Seconds of a gradient step over a size, with a replay of two thousand records of full frames."""
-    from gvz.assemble import assemble
+    from gvz.run.assemble import assemble
 
     bodies = {}
     with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
@@ -143,7 +143,7 @@ def _parameters(budget: Budget) -> list[Row]:
 
     import jax
 
-    from gvz.assemble import run_agent
+    from gvz.run.assemble import run_agent
     from gvz.transport.broadcast import BroadcastWriter
     from gvz.transport.messages import ParamsHeader
 
@@ -181,7 +181,7 @@ def _play(budget: Budget, config: Any) -> list[float]:
 
 def _actors(budget: Budget) -> list[Row]:
     """A pool's rate over its actors, each with four games; the pools run one after the other, each alone."""
-    from gvz.assemble import assemble
+    from gvz.run.assemble import assemble
 
     cores = len(os.sched_getaffinity(0))
     counts = (1, 2) if budget.quick else sorted({1, cores, cores + cores // 2, 2 * cores})
@@ -203,9 +203,9 @@ def _tasks(budget: Budget) -> list[Row]:
     """A pool's rate over its tasks, of all scenarios, a game a task at least; an actor a core."""
     from actors.pool import PoolConfig
     from gvz.actions import num_actions
-    from gvz.probe import ensure_loads
+    from gvz.core.env_config import EnvConfig
+    from gvz.engine.probe import ensure_loads
     from gvz.scenarios.compiler import compile_task
-    from gvz.specs import EnvConfig
     from gvz.tasks import named_tasks
 
     cores, tasks = (1 if budget.quick else len(os.sched_getaffinity(0))), named_tasks()

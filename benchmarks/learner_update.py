@@ -25,7 +25,7 @@ def measure(budget: Budget) -> list[Row]:
     """Rates of all candidates, the goals, and our profile."""
     import jax
 
-    from gvz.assemble import assemble
+    from gvz.run.assemble import assemble
     from learner.train_step import default_num_updates
 
     on_cpu, config = jax.default_backend() == "cpu", workload.run_config(budget)

@@ -1,4 +1,4 @@
-"""The plots of docs/PERFORMANCE.md, drawn from records. Imports matplotlib."""
+"""The plots of docs/PERFORMANCE.md, drawn from records."""
 
 from collections.abc import Sequence
 from pathlib import Path

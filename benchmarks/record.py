@@ -1,7 +1,4 @@
-"""A benchmark's record: one JSON file with what was measured, where, when, with what and by which command.
-
-Imports psutil, gvz.{errors,machine} and the standard library; jax only to ask for its devices.
-"""
+"""A benchmark's record: one JSON file with what was measured, where, when, with what and by which command."""
 
 import json
 import os
@@ -12,8 +9,8 @@ from typing import Any
 import psutil
 
 from benchmarks.rounds import Row
-from gvz import machine
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
+from gvz.run import machine
 
 SCHEMA = 1
 """Stands in every record; raised by one when a record's meaning changes."""

@@ -1,8 +1,6 @@
 """docs/RELIABILITY.md from the committed records of the soak and of the fuzzing: tables between markers, and a plot.
 
-    python -m benchmarks.reliability
-
-Imports benchmarks.{record,report,soak}; matplotlib only to draw.
+python -m benchmarks.reliability
 """
 
 import json
@@ -13,7 +11,7 @@ from typing import Any
 from benchmarks import record
 from benchmarks.report import between
 from benchmarks.soak import DIRECTORY, SCHEMA, kill_ratios, summary
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 
 PAGE = record.ROOT / "docs" / "RELIABILITY.md"
 RECORDS = (DIRECTORY / "soak.json", DIRECTORY / "fuzz.json")

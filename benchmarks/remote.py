@@ -1,7 +1,7 @@
 """A body that runs in a process of its own, often under another interpreter: ours, or the peers'.
 
 The process prints one JSON object about itself, and then one for every line of JSON arguments it is sent (see
-`benchmarks/peers/serve.py`). Imports the standard library only.
+`benchmarks/peers/serve.py`).
 """
 
 import contextlib

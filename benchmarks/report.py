@@ -2,8 +2,7 @@
 
     python -m benchmarks.report
 
-What stands outside of the markers is written by hand. Imports benchmarks.record, benchmarks.rounds; matplotlib only to
-draw.
+What stands outside of the markers is written by hand.
 """
 
 import sys
@@ -13,7 +12,7 @@ from pathlib import Path
 from benchmarks import record, rounds
 from benchmarks.record import Record
 from benchmarks.rounds import Row, Spread
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 
 PAGE = record.ROOT / "docs" / "PERFORMANCE.md"
 PLOTS = record.ROOT / "docs" / "images"

@@ -1,4 +1,4 @@
-"""Alternating rounds, and the rows that a benchmark gives back. Imports numpy and the standard library only.
+"""Alternating rounds, and the rows that a benchmark gives back.
 
 A row is plain data: `kind` says which of the four it is, and every measured quantity in it is a `Spread`. Ratios are
 made within a round, of bodies that ran one after the other, and only then summed up.

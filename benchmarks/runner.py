@@ -1,8 +1,7 @@
 """Finds the benchmarks, and runs each in a process of its own, so that none can sink, slow or outlive the rest.
 
 A benchmark is a file of this package with a docstring and a function `measure(budget) -> list of rows`; its file name
-is its name. Imports the standard library, gvz.{cache,errors,janitor,machine,registry}, learner.memory and
-benchmarks.{record,rounds}.
+is its name.
 """
 
 import contextlib
@@ -19,11 +18,11 @@ from types import ModuleType
 
 from benchmarks import record, rounds
 from benchmarks.rounds import Budget
-from gvz import janitor
-from gvz.cache import xla_cache_directory
-from gvz.errors import ConfigError
-from gvz.machine import versions
-from gvz.registry import discover
+from gvz.core import janitor
+from gvz.core.cache import xla_cache_directory
+from gvz.core.errors import ConfigError
+from gvz.core.registry import discover
+from gvz.run.machine import versions
 from learner.memory import keep_freed_memory
 
 TIMEOUT_S = 900.0
@@ -52,7 +51,7 @@ def chosen(names: tuple[str, ...]) -> list[str]:
 
 def run_in_process(name: str, budget: Budget, command: str) -> record.Record:
     """Measures one benchmark here and now. Nothing in this process has used jax before."""
-    keep_freed_memory()  # as gvz/train.py does, and as early: threads that have allocated keep their arenas
+    keep_freed_memory()  # as gvz/run/train.py does, and as early: threads that have allocated keep their arenas
     import jax
 
     jax.config.update("jax_compilation_cache_dir", str(xla_cache_directory()))

@@ -6,7 +6,7 @@
 The run is the real command. Stretches with kills take turns with short ones without: the price of the kills is the
 ratio of a stretch to those beside it, within one run on one machine whose own speed drifts. Memory, descriptors, shared
 memory and processes are sampled all the time; at the end the run is stopped by SIGTERM, and what it left behind
-counted. Imports psutil and gvz.
+counted.
 """
 
 import contextlib
@@ -29,8 +29,8 @@ from rich.console import Console
 
 from benchmarks import record
 from benchmarks.whole import end_run, tree_bytes
-from gvz import machine
-from gvz.rundir import read_records
+from gvz.run import machine
+from gvz.run.rundir import read_records
 
 SCHEMA = 1
 """of the records in DIRECTORY, those of the fuzzing too"""

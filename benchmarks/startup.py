@@ -83,7 +83,7 @@ def _first_episode_s(directory: Path, budget: Budget) -> float:
 
 def _actor_start_s(directory: Path, budget: Budget) -> float:
     """Processor seconds that one actor and its engines have taken when it is ready to play."""
-    from gvz.assemble import assemble
+    from gvz.run.assemble import assemble
 
     parts = assemble(workload.run_config(budget), directory)
     before = workload.processor_s()

@@ -38,7 +38,7 @@ def measure(budget: Budget) -> list[Row]:
     """Alternates the run, the learner alone and the actors alone."""
     import jax
 
-    from gvz.assemble import assemble
+    from gvz.run.assemble import assemble
 
     config = workload.four_task_config(budget)
     num_runs, updates, period = (1, 400, 100) if budget.quick else (3, _MEASURED_UPDATES, _LOG_PERIOD_UPDATES)
@@ -82,7 +82,7 @@ def measure(budget: Budget) -> list[Row]:
         ]
         for name, summed in (("mean", statistics.fmean), ("p95", statistics.median), ("max", max))
     }
-    bill, batch_size = parts.bill.memory_bytes, config.learner.batch_size
+    bill, batch_size = parts.footprint.memory_bytes, config.learner.batch_size
     peaks = [max(run["seen"]) for run in firsts]
     cores = [_cores(run) for run in runs]
     for found, (u, d) in zip(cores, together, strict=True):

@@ -1,7 +1,6 @@
 """What several benchmarks put to work: a pool that is drained, a replay that is full, and how much a network computes.
 
-Everything is sized as `rainbow_4task` is, on one task, so that a peer that plays a single task is comparable. Imports
-jax and the machine's own modules inside functions: whoever starts processes first does not pay for them.
+Everything is sized as `rainbow_4task` is, on one task, so that a peer that plays a single task is comparable.
 """
 
 import contextlib
@@ -19,15 +18,15 @@ from benchmarks.rounds import Budget, Row, measured
 
 if TYPE_CHECKING:
     from actors.pool import ActorPool, PoolConfig
-    from gvz.assemble import Parts
-    from gvz.config import RunConfig
+    from gvz.run.assemble import RunParts
+    from gvz.run.config import RunConfig
     from learner.agents.base import Agent
     from learner.replay import ReplaySpec, ReplayState
 
 TASK = "defend_the_center/default"
 _START_TIMEOUT_S = 600.0
 _DRAIN_RECORDS, _DRAIN_WAIT_S = 256, 0.02
-"""as in gvz/train.py"""
+"""as in gvz/run/train.py"""
 _UPDATES_IN_FLIGHT = 16
 """calls handed to the device before the next wait: the clock is not to run away from it"""
 _SETTLE_S = 0.3
@@ -53,7 +52,7 @@ QUICK: dict[str, dict[str, Any]] = {
 
 def four_task_config(budget: Budget) -> "RunConfig":
     """`rainbow_4task`; in a quick run with the smallest network and replay."""
-    from gvz.config import load_config
+    from gvz.run.config import load_config
 
     config = load_config("rainbow_4task.py")
     changes = QUICK if budget.quick else {}
@@ -190,14 +189,14 @@ def filled_replay(spec: "ReplaySpec") -> "ReplayState":
 
 
 class Learner:
-    """The learner of a run without the run: its state, a full replay, and the jitted functions of gvz/train.py."""
+    """The learner of a run without the run: its state, a full replay, and the jitted functions of gvz/run/train.py."""
 
-    def __init__(self, config: "RunConfig", parts: "Parts"):
+    def __init__(self, config: "RunConfig", parts: "RunParts"):
         import jax
 
         from learner import replay, train_step
+        from learner.export import flatten_params
         from learner.ingest import Ingest
-        from learner.policy import flatten_params
 
         self.config, self.parts = config, parts
         self.state = train_step.init(parts.learner.agent, parts.learner.replay_spec, config.learner, jax.random.key(0))

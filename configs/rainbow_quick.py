@@ -4,8 +4,8 @@ Against `rainbow_4task`: grey frames of 48x84, two small convolutions, 128 hidde
 replay, warm-up and target period in proportion to a run of 20,000 gradient steps.
 """
 
-from gvz.config import CheckpointConfig, RunConfig
-from gvz.specs import EnvConfig
+from gvz.core.env_config import EnvConfig
+from gvz.run.config import CheckpointConfig, RunConfig
 from learner.config import AgentConfig, LearnerConfig, ReplayConfig
 
 CONFIG = RunConfig(

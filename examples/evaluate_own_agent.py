@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from gvz.evaluation.metrics import bootstrap
+from gvz.core.env_config import EnvConfig
+from gvz.evaluation.episode_log import evaluate_player
 from gvz.evaluation.play import Row
 from gvz.evaluation.players import FramePlayer
-from gvz.evaluation.record import evaluate_player
-from gvz.specs import EnvConfig
+from gvz.evaluation.statistics import bootstrap
 from gvz.tasks import Task, named_tasks
 
 ATTACK, TURN_LEFT, TURN_RIGHT = range(3)

@@ -13,8 +13,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack
 
 import gvz
+from gvz.evaluation.episode_log import evaluate_player
 from gvz.evaluation.players import FramePlayer
-from gvz.evaluation.record import evaluate_player
 from gvz.tasks import named_tasks
 
 

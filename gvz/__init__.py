@@ -1,12 +1,14 @@
 """GViZDoom: graded visual generalization in Doom, and a trainer for it.
 
+Tier 1. The modules beside this file are the benchmark's, but for the commands `launch` and `cli`, which are tier 3.
+
 `import gvz` makes every named task known to Gymnasium: gymnasium.make("GViZDoom/DefendTheCenter-Gore-v0").
 """
 
 from typing import TYPE_CHECKING, Any
 
+from gvz.core.env_config import LABEL_CLASSES
 from gvz.registration import register_with_gymnasium
-from gvz.specs import LABEL_CLASSES
 
 if TYPE_CHECKING:
     from gvz.env import DoomEnv
@@ -21,7 +23,7 @@ def make(task: "str | Task", **options: Any) -> "DoomEnv":
 
     Args:
         task: `<scenario>/<attribute>+<attribute>...`, for example "defend_the_center/gore+mossy_bricks".
-        **options: arguments of gvz.env.DoomEnv and fields of gvz.specs.EnvConfig.
+        **options: arguments of gvz.env.DoomEnv and fields of gvz.core.env_config.EnvConfig.
     """
     from gvz.env import DoomEnv  # here, so that `import gvz` loads nothing
 

@@ -1,10 +1,10 @@
-"""Discrete actions: which buttons each of a scenario's actions holds. Imports gvz.scenarios.base and gvz.tasks."""
+"""Discrete actions: which buttons each of a scenario's actions holds."""
 
 from itertools import chain, combinations
 from typing import assert_never
 
+from gvz.core.env_config import ActionSet
 from gvz.scenarios.base import Scenario
-from gvz.specs import ActionSet
 from gvz.tasks import scenarios
 
 _CONTRADICTORY = ({"TURN_LEFT", "TURN_RIGHT"}, {"MOVE_LEFT", "MOVE_RIGHT"}, {"MOVE_FORWARD", "MOVE_BACKWARD"})

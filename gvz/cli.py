@@ -1,6 +1,4 @@
-"""The `gvz` command: finds the commands in gvz/commands/ and runs one. Imports neither jax nor vizdoom: a command
-imports what it needs once it runs.
-"""
+"""The `gvz` command: finds the commands in gvz/commands/ and runs one."""
 
 import functools
 import operator
@@ -12,8 +10,8 @@ from typing import Annotated, Any
 import tyro
 
 import gvz
-from gvz.errors import GvzError
-from gvz.registry import discover
+from gvz.core.errors import GvzError
+from gvz.core.registry import discover
 
 EXIT_BROKEN_PIPE = 141
 """what a shell says of a program that SIGPIPE ended"""

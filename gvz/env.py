@@ -1,7 +1,4 @@
-"""A task as a Gymnasium environment: observation, actions, reward, time-out, seeds, an engine that may crash.
-
-Imports gymnasium, numpy and all of tier 1; no jax, and vizdoom only by way of gvz.engine.
-"""
+"""A task as a Gymnasium environment: observation, actions, reward, time-out, seeds, an engine that may crash."""
 
 import dataclasses
 import time
@@ -15,18 +12,18 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Discrete
 
 from gvz.actions import action_buttons, num_actions
-from gvz.engine import Engine, EngineConfig, check_config
-from gvz.errors import ConfigError, EngineError
+from gvz.core.env_config import EnvConfig, typed
+from gvz.core.errors import ConfigError, EngineError
+from gvz.engine.engine import Engine, EngineConfig, check_config
+from gvz.engine.probe import ensure_loads
 from gvz.observation import Observation, observation_space, observe_buffers, observe_screen
-from gvz.probe import ensure_loads
 from gvz.scenarios.base import BOOKKEEPING, Task
 from gvz.scenarios.compiler import compile_task, task_content
-from gvz.specs import EnvConfig, typed
 from gvz.tasks import parse_task
 from gvz.viewer import Window
 
 if TYPE_CHECKING:
-    from gvz.engine import GameState, Label
+    from gvz.engine.engine import GameState, Label
 
 TICS_PER_SECOND = 35
 _WEAPON_UP_TIC = 10

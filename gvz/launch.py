@@ -14,10 +14,10 @@ from typing import Annotated
 
 import tyro
 
-from gvz.config import RunConfig, load_config
-from gvz.errors import GvzError
-from gvz.rundir import RunDir, move_aside
-from gvz.stop import StopRequest
+from gvz.core.errors import GvzError
+from gvz.core.stop import StopRequest
+from gvz.run.config import RunConfig, load_config
+from gvz.run.rundir import RunDir, move_aside
 
 DEFAULT_CONFIG = "rainbow_4task.py"
 
@@ -83,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 config = resumed_config(run, launch.run)
                 run.check_resumable(config)
                 stop.importing = True
-                from gvz.train import train  # imports jax: only once the input is known to be good
+                from gvz.run.train import train  # imports jax: only once the input is known to be good
 
                 stop.importing = False
                 return train(config, run, stop)

@@ -1,4 +1,4 @@
-"""From what the engine renders to what the agent observes: sizes, colours, buffers. Imports cv2, gymnasium, numpy."""
+"""From what the engine renders to what the agent observes: sizes, colours, buffers."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from gymnasium import spaces
 
-from gvz.specs import LABEL_CLASSES, EnvConfig
+from gvz.core.env_config import LABEL_CLASSES, EnvConfig
 
 if TYPE_CHECKING:
-    from gvz.engine import GameState
+    from gvz.engine.engine import GameState
 
 Observation = np.ndarray | dict[str, np.ndarray]
 """uint8 [H, W, C]; with `EnvConfig.buffers` a dict of `screen` and those."""

@@ -1,4 +1,4 @@
-"""Gymnasium ids of the named tasks. Imports the standard library; gymnasium and gvz.tasks when it registers."""
+"""Gymnasium ids of the named tasks."""
 
 import sys
 from importlib.machinery import ModuleSpec

@@ -1,10 +1,10 @@
-"""Tasks by name: ids, levels, the named tasks, training and test sets. Imports gvz.errors, registry, scenarios."""
+"""Tasks by name: ids, levels, the named tasks, training and test sets."""
 
 from functools import cache
 from typing import get_args
 
-from gvz.errors import TaskError
-from gvz.registry import discover
+from gvz.core.errors import TaskError
+from gvz.core.registry import discover
 from gvz.scenarios.base import Scenario, Split, Task, nearest
 
 __all__ = ["Scenario", "Split", "Task", "named_tasks", "parse_task", "scenario_named", "scenarios"]

@@ -1,10 +1,10 @@
-"""A window that shows a game to people. Imports pygame (when a window opens), numpy, gvz.errors."""
+"""A window that shows a game to people."""
 
 import os
 
 import numpy as np
 
-from gvz.errors import ResourceError
+from gvz.core.errors import ResourceError
 
 _MIN_HEIGHT = 480
 _UNSEEN_DRIVERS = ("dummy", "offscreen")

@@ -1,1 +1,1 @@
-"""The learning side: replay, losses, agents, the jitted update. May import gvz tier 0 only."""
+"""Tier 2. The learning side: replay, losses, agents, the jitted update."""

@@ -1,5 +1,4 @@
-"""Checkpoints: orbax arrays, a msgpack host state, and a manifest that proves the whole. May import gvz tier 0,
-learner.memory.
+"""Checkpoints: orbax arrays, a msgpack host state, and a manifest that proves the whole.
 
     checkpoints/<updates>/  arrays/ (orbax)  host.msgpack  manifest.json   the whole state, `keep` of them
     policies/<updates>/     the same, parameters only, never pruned         what evaluation reads
@@ -28,8 +27,8 @@ import msgpack
 import numpy as np
 import orbax.checkpoint as ocp
 
-from gvz.durable import fsync, fsync_tree
-from gvz.errors import CheckpointError, WaitTimeoutError
+from gvz.core.durable import fsync, fsync_tree
+from gvz.core.errors import CheckpointError, WaitTimeoutError
 from learner.memory import release_freed_memory
 
 CHECKPOINT_SCHEMA = 1

@@ -1,9 +1,9 @@
-"""Configuration of agent, replay and learner. Imports the standard library and gvz.errors only (no jax)."""
+"""Configuration of agent, replay and learner."""
 
 from dataclasses import dataclass
 from typing import Literal
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 
 Noisy = Literal["off", "factorized", "independent"]
 ConvForm = Literal["auto", "direct", "shifted"]

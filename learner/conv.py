@@ -1,4 +1,4 @@
-"""Valid strided convolution in two forms with the same parameters: `direct` and `shifted`. May import jax, flax.
+"""Valid strided convolution in two forms with the same parameters: `direct` and `shifted`.
 
 XLA's own convolution is right on a GPU. On a CPU a few large matrix products are much faster, above all for the
 first layer (few input channels, large kernel, large stride).

@@ -1,4 +1,4 @@
-"""From the actors' blocks to the replay's: one fixed size, checked and counted. Imports numpy, gvz tier 0, replay.
+"""From the actors' blocks to the replay's: one fixed size, checked and counted.
 
 What is handed on stands in fresh memory that nothing writes to again. JAX on a CPU may use an aligned numpy array as
 it is, without a copy, and runs behind its caller; a staging buffer filled anew for the next records would change the
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gvz.errors import TransportError
+from gvz.core.errors import TransportError
 from gvz.transport.messages import STEP_DTYPE, StepBlock
 from learner.replay import ReplaySpec, StepArrays
 

@@ -1,6 +1,6 @@
-"""What a learner is to the training loop: step records in, gradient steps, parameters out. Imports gvz.transport.
+"""What a learner is to the training loop: step records in, gradient steps, parameters out.
 
-The loop in gvz/train.py knows this protocol alone. How records are kept and drawn (a replay, rollouts) and on which
+The loop in gvz/run/train.py knows this protocol alone. How records are kept and drawn (a replay, rollouts) and on which
 device is the learner's own matter. `learner.off_policy` learns from a replay.
 """
 

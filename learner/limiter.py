@@ -1,4 +1,4 @@
-"""Holds actors and learner to one ratio of decisions to gradient steps. Imports the standard library only.
+"""Holds actors and learner to one ratio of decisions to gradient steps.
 
 Without it two runs with one seed are different experiments on different machines. The limiter is two counters and a
 window; it waits for nobody. The learner does no update that is not paid for with decisions, and takes no decision

@@ -1,4 +1,4 @@
-"""The losses of DQN and Rainbow as pure functions over a batch, in the papers' symbols. May import jax and chex.
+"""The losses of DQN and Rainbow as pure functions over a batch, in the papers' symbols.
 
 Every function returns one number (or distribution) per sample; means and weights are the train step's work.
 Subscripts: `tm1` is time t - 1, where the action was taken; `t` is where the n-step window ended. `discount_t` is

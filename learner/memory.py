@@ -1,4 +1,4 @@
-"""How the learner's process handles memory that was freed. Imports the standard library only.
+"""How the learner's process handles memory that was freed.
 
 A train step on a CPU takes some 85 MB of scratch memory and frees them again. glibc gives blocks of that size back to
 the kernel at once, so that every step has them mapped, cleared and faulted in anew, 4 KB at a time: 21,000 page faults

@@ -1,4 +1,4 @@
-"""The Q-network: convolutions, then one or two streams of (noisy) dense layers. May import jax, flax, learner.conv.
+"""The Q-network: convolutions, then one or two streams of (noisy) dense layers.
 
 One module with switches serves every agent. Parameters are float32; activations may be bfloat16; outputs are
 float32. Noise is explicit: `add_noise` moves the parameters, or the network is given what `draw_noise` drew.
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 from learner.config import AgentConfig, Noisy
 from learner.conv import Conv
 

@@ -1,7 +1,6 @@
 """The learner of transitions from a replay: records -> replay -> gradient steps -> priorities.
 
-May import jax and learner's own modules. Nothing here waits for the device but `acting_params`, `take_metrics` and
-`check_finite`.
+Nothing here waits for the device but `acting_params`, `take_metrics` and `check_finite`.
 """
 
 from collections.abc import Sequence
@@ -18,10 +17,10 @@ from gvz.transport.messages import StepBlock
 from learner import replay, train_step
 from learner.agents.base import Agent, Params
 from learner.config import AgentConfig, LearnerConfig, ReplayConfig
+from learner.export import flatten_params
 from learner.ingest import Ingest, Staleness
+from learner.kpi import TaskKpis
 from learner.limiter import RateLimiter
-from learner.metrics import TaskKpis
-from learner.policy import flatten_params
 from learner.replay import ReplaySpec
 
 

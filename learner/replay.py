@@ -1,4 +1,4 @@
-"""The replay: step records in, batches of n-step transitions out, all of it on the device. Imports jax and sum_tree.
+"""The replay: step records in, batches of n-step transitions out, all of it on the device.
 
 Pure functions over `ReplayState`; jit them once at the edge, with the state donated. They read an array that they
 also write only where what is written depends on what was read: then XLA writes in place, else it copies the array.
@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 from learner import sum_tree
 from learner.sum_tree import SumTree
 

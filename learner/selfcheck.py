@@ -1,4 +1,4 @@
-"""A fixed tiny problem, learnt by the real learner, against recorded numbers. Imports jax, learner's modules.
+"""A fixed tiny problem, learnt by the real learner, against recorded numbers.
 
 Float32 sums come out differently on processors with other instruction sets, in the last digits. This says whether
 the learner of this machine agrees with the recorded one up to those digits: replay, sum tree, noise, loss, gradient,

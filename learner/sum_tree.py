@@ -1,4 +1,4 @@
-"""A sum tree in pure JAX: draws leaves in proportion to their values. Imports jax and numpy only.
+"""A sum tree in pure JAX: draws leaves in proportion to their values.
 
 The tree is FANOUT wide and lies in one flat array, the topmost row first, the leaves last; a node's children are
 one aligned row of the level below. Its sum is never stored for the root: the total is the sum of the first row.

@@ -1,4 +1,4 @@
-"""One jitted, donated call: sample -> loss -> update -> priorities. May import jax, optax, learner's own modules.
+"""One jitted, donated call: sample -> loss -> update -> priorities.
 
 Everything the loop needs lives on the device in two pytrees, `LearnerState` and the replay's state; nothing comes to
 the host between log periods. `read_metrics` is the only reader.
@@ -15,7 +15,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from gvz.errors import NonFiniteError
+from gvz.core.errors import NonFiniteError
 from learner import replay
 from learner.agents.base import Agent, AgentLoss, Params
 from learner.config import LearnerConfig, ReplayConfig

@@ -18,7 +18,7 @@ os.environ["XDG_RUNTIME_DIR"] = tempfile.mkdtemp(prefix="gvz-tests-")
 @atexit.register
 def _clean_up() -> None:
     """Removes what tests that kill with SIGKILL have left, as the next start would; then the records of it."""
-    from gvz import janitor
+    from gvz.core import janitor
 
     janitor.clean_dead_instances()
     shutil.rmtree(os.environ["XDG_RUNTIME_DIR"], ignore_errors=True)

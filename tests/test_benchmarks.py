@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from benchmarks import plots, record, remote, report, rounds, runner
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 
 ROOT = Path(__file__).parent.parent
 NO_PEERS = Path("no-peers/bin/python")
@@ -179,7 +179,7 @@ def test_the_arithmetic_of_a_decision_is_that_of_its_layers():
     import jax.numpy as jnp
 
     from benchmarks import workload
-    from gvz.assemble import run_agent
+    from gvz.run.assemble import run_agent
 
     agent = run_agent(workload.run_config(dataclasses.replace(QUICK, quick=False)))
     params = jax.eval_shape(agent.init, jax.random.key(0))

@@ -9,7 +9,7 @@ from importlib.metadata import version
 import pytest
 
 from gvz import cli
-from gvz.registry import discover
+from gvz.core.registry import discover
 
 
 def test_help_loads_neither_jax_nor_vizdoom_nor_anything_heavy():

@@ -16,8 +16,8 @@ from gymnasium.error import ResetNeeded
 
 import gvz
 from gvz import LABEL_CLASSES
+from gvz.core.errors import ConfigError, ResourceError, TaskError
 from gvz.env import DoomEnv, is_solved, make_env
-from gvz.errors import ConfigError, ResourceError, TaskError
 from gvz.tasks import parse_task
 from tests.episodes import TURN, fingerprint, idle_to_the_end, play
 

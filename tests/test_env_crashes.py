@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 
+from gvz.core.errors import EngineError
 from gvz.env import DoomEnv
-from gvz.errors import EngineError
 from tests.episodes import TURN, fingerprint, idle_to_the_end
 
 pytestmark = pytest.mark.engine

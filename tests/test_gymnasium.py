@@ -62,7 +62,7 @@ def test_every_named_task_is_registered():
     [
         ("import gymnasium, gvz", ""),
         ("import gvz, gymnasium", ""),
-        ("import gvz.errors, gymnasium.spaces", ""),
+        ("import gvz.core.errors, gymnasium.spaces", ""),
         ("import gymnasium", "gvz:"),
         ("import gvz, gymnasium", "gvz:"),
     ],

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gvz.evaluation.metrics import Estimate, bootstrap
+from gvz.evaluation.statistics import Estimate, bootstrap
 from gvz.tasks import named_tasks
 
 ROOT = Path(__file__).parent.parent

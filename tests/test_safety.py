@@ -16,16 +16,16 @@ import numpy as np
 import pytest
 import vizdoom
 
-from gvz import janitor
-from gvz.config import RunConfig, config_to_dict
-from gvz.errors import CheckpointError, ConfigError, EngineError, GvzError
-from gvz.evaluation.frame import collect_evaluations
-from gvz.evaluation.record import read_rows
-from gvz.evaluation.trained import trained_entrant
-from gvz.probe import probe_wad
+from gvz.core import janitor
+from gvz.core.errors import CheckpointError, ConfigError, EngineError, GvzError
+from gvz.engine.probe import probe_wad
+from gvz.evaluation.dataset import collect_evaluations
+from gvz.evaluation.episode_log import read_rows
+from gvz.evaluation.trained import trained_player
 from gvz.reports.results import read_results
-from gvz.rundir import RunDir
-from gvz.telemetry import Telemetry
+from gvz.run.config import RunConfig, config_to_dict
+from gvz.run.rundir import RunDir
+from gvz.run.telemetry import Telemetry
 from gvz.wad.acs import compile_acs
 from gvz.wad.lumps import Lump, read_wad, write_wad
 from learner import checkpoint
@@ -38,10 +38,10 @@ UNPICKLERS = {"pickle", "_pickle", "cPickle", "cloudpickle", "dill", "joblib", "
 EXECUTORS = {"eval", "exec", "compile", "__import__", "os.system", "os.popen"}
 EXECUTING_METHODS = {"import_module", "exec_module", "load_module", "run_path", "run_module"}
 ALLOWED = {
-    ("gvz/config.py", "exec"): "a config file, which the user names",
-    ("gvz/config.py", "compile"): "likewise",
+    ("gvz/run/config.py", "exec"): "a config file, which the user names",
+    ("gvz/run/config.py", "compile"): "likewise",
     ("learner/agents/base.py", "exec_module"): "an agent's file, which the user names",
-    ("gvz/registry.py", "import_module"): "modules of our own packages, found on the disk",
+    ("gvz/core/registry.py", "import_module"): "modules of our own packages, found on the disk",
     ("actors/loop.py", "import_module"): "the environment's class, which the learner names to the actor it started",
 }
 PROCESS_POOLS = {"gvz/evaluation/play.py": "pickles what the parent gives to the workers it started, and their rows"}
@@ -219,7 +219,7 @@ def test_a_run_directory_of_pickles_is_told_of_and_not_unpickled(tmp_path: Path)
     (run / "more.jsonl.gz").write_bytes(gzip.compress(bomb))
     (run / "config.json").write_text(json.dumps(config_to_dict(CONFIG)))
     with pytest.raises(CheckpointError, match=r"no readable manifest\.json"):
-        trained_entrant(run, CONFIG, 10)
+        trained_player(run, CONFIG, 10)
     frame, problems = collect_evaluations([run])
     assert frame.is_empty()
     assert problems

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import gvz
 import gvz.scenarios
-from gvz.errors import TaskError
+from gvz.core.errors import TaskError
 from gvz.scenarios.base import Attribute, Content, Task, Textures
 from gvz.scenarios.compiler import task_content
 from gvz.tasks import named_tasks, parse_task, scenario_named, scenarios

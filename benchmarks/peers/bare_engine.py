@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from serve import serve
 
-from gvz.engine import Engine
+from gvz.engine.engine import Engine
 from gvz.env import DoomEnv
 
 _NUM_ACTIONS = 4096

@@ -1,4 +1,4 @@
-"""`gvz completion`: completion of commands and flags in a shell. Imports gvz.{cli,launch} once it runs."""
+"""`gvz completion`: completion of commands and flags in a shell."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -1,4 +1,4 @@
-"""`gvz doctor`: is this machine fit for a run? Imports gvz.{doctor,janitor} once it runs."""
+"""`gvz doctor`: is this machine fit for a run?"""
 
 import dataclasses
 import json
@@ -20,7 +20,8 @@ class Doctor:
 
     def run(self) -> int:
         """Prints the findings."""
-        from gvz import doctor, janitor
+        from gvz.core import janitor
+        from gvz.run import doctor
 
         if self.clean:
             for line in janitor.clean_dead_instances():

@@ -1,6 +1,4 @@
-"""`gvz evaluate`: plays evaluation episodes and prints the scores. Imports gvz.{selection,specs}; what plays only
-once it runs.
-"""
+"""`gvz evaluate`: plays evaluation episodes and prints the scores."""
 
 import dataclasses
 import json
@@ -15,14 +13,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from gvz.errors import ConfigError
+from gvz.core.env_config import EnvConfig, Profile, SimplePlayer
+from gvz.core.errors import ConfigError
+from gvz.evaluation.selection import ALL_TASKS, TaskSelection
 from gvz.scenarios.base import Task
-from gvz.selection import ALL_TASKS, TaskSelection
-from gvz.specs import EnvConfig, Profile, SimplePlayer
 
 if TYPE_CHECKING:
-    from gvz.evaluation.play import Entrant, Row
-    from gvz.evaluation.record import RecordFile
+    from gvz.evaluation.episode_log import RecordFile
+    from gvz.evaluation.play import PlayerSpec, Row
 
 EXIT_INTERRUPTED = 130
 LINE_PERIOD_S = 10.0
@@ -68,20 +66,20 @@ class Evaluate:
         """Plays what the record files do not hold yet, with a progress bar, and prints the scores."""
         workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
         self._check(workers)
-        from gvz.evaluation.record import missing_jobs, play_and_record, wanted_episodes
+        from gvz.evaluation.episode_log import missing_jobs, play_and_record, wanted_episodes
 
-        entrants = self._entrants()
+        player_specs = self._player_specs()
         files: dict[Path, RecordFile] = {}
         handler = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
         try:
-            held = {entrant: _open(files, out) for entrant, (_, out) in entrants.items()}
+            held = {player_spec: _open(files, out) for player_spec, (_, out) in player_specs.items()}
             jobs = []
-            for entrant, (tasks, _) in entrants.items():
+            for player_spec, (tasks, _) in player_specs.items():
                 wanted = wanted_episodes(tasks, self.episodes, self.seeds)
-                jobs += missing_jobs({entrant: held[entrant]}, wanted)
+                jobs += missing_jobs({player_spec: held[player_spec]}, wanted)
             _show_progress(play_and_record(held, jobs, num_workers=workers), len(jobs))
-            for entrant, (tasks, _) in entrants.items():
-                self._print_scores(entrant, tasks, held[entrant].rows)
+            for player_spec, (tasks, _) in player_specs.items():
+                self._print_scores(player_spec, tasks, held[player_spec].rows)
         except KeyboardInterrupt:
             print("interrupted; the same command goes on from here", file=sys.stderr)
             return EXIT_INTERRUPTED
@@ -100,14 +98,14 @@ class Evaluate:
         if any(seed < 0 for seed in self.seeds) or not self.seeds:
             raise ConfigError(f"--seeds: got {list(self.seeds)}, want numbers of at least 0")
 
-    def _entrants(self) -> "dict[Entrant, tuple[tuple[Task, ...], Path]]":
+    def _player_specs(self) -> "dict[PlayerSpec, tuple[tuple[Task, ...], Path]]":
         """Who plays -> what, and the record file."""
-        from gvz.evaluation.record import simple_entrant
-        from gvz.evaluation.trained import check_tasks, find_checkpoints, read_run_config, trained_entrant
+        from gvz.evaluation.episode_log import simple_player
+        from gvz.evaluation.trained import check_tasks, find_checkpoints, read_run_config, trained_player
 
         if self.player is not None:
             out = Path("evaluation.jsonl") if self.out is None else self.out
-            return {simple_entrant(self.player, EnvConfig(profile=self.profile)): (self.select.resolve(), out)}
+            return {simple_player(self.player, EnvConfig(profile=self.profile)): (self.select.resolve(), out)}
         found = {}
         for run_dir in dict.fromkeys(self.run_dirs):
             config = read_run_config(run_dir, self.agent)
@@ -115,16 +113,16 @@ class Evaluate:
             check_tasks(config, tasks)
             out = run_dir / "evaluation.jsonl" if self.out is None else self.out
             for num_updates in find_checkpoints(run_dir, self.checkpoints):
-                found[trained_entrant(run_dir, config, num_updates)] = (tasks, out)
+                found[trained_player(run_dir, config, num_updates)] = (tasks, out)
         return found
 
-    def _print_scores(self, entrant: "Entrant", tasks: Sequence[Task], rows: "Sequence[Row]") -> None:
+    def _print_scores(self, player_spec: "PlayerSpec", tasks: Sequence[Task], rows: "Sequence[Row]") -> None:
         from gvz.evaluation.table import score_lines, score_row, scores
 
-        player = entrant.identity["player"]
+        player = player_spec.identity["player"]
         for base_seed in self.seeds:
             chosen = [row for row in rows if row.get("base_seed", 0) == base_seed]
-            found = scores(chosen, entrant.identity, tasks, self.episodes)
+            found = scores(chosen, player_spec.identity, tasks, self.episodes)
             if self.json:
                 for one in found:
                     print(json.dumps({"player": player, "base_seed": base_seed, **score_row(one)}))
@@ -147,7 +145,7 @@ def run_tasks(select: TaskSelection, scenario: str) -> tuple[Task, ...]:
 
 def _open(files: "dict[Path, RecordFile]", path: Path) -> "RecordFile":
     """The record file at `path`, opened once."""
-    from gvz.evaluation.record import RecordFile
+    from gvz.evaluation.episode_log import RecordFile
 
     if path not in files:
         files[path] = RecordFile(path)
@@ -160,7 +158,7 @@ def _show_progress(rows: "Iterator[Row]", total: int) -> None:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
     from rich.table import Column
 
-    from gvz.progress import format_duration
+    from gvz.run.progress import format_duration
 
     console = Console(stderr=True)
     columns = (

@@ -1,4 +1,4 @@
-"""`gvz experiment list | plan | run | status`: the experiments of gvz/experiments. Imports them once it runs."""
+"""`gvz experiment list | plan | run | status`: the experiments of gvz/experiments."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -53,7 +53,7 @@ class List:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ask:
+class PlanFlags:
     """What is asked for."""
 
     names: Annotated[
@@ -91,7 +91,7 @@ class PlanCommand:
     Hours are by rates measured on this machine, once for each config: some minutes the first time.
     """
 
-    ask: Annotated[Ask, tyro.conf.arg(name="")] = Ask()
+    ask: Annotated[PlanFlags, tyro.conf.arg(name="")] = PlanFlags()
     measure: bool = False
     """measure the rates again"""
     json: bool = False
@@ -143,7 +143,7 @@ class RunCommand:
     Example: gvz experiment run training_set_size rainbow_evaluation --results results --shard 1/4
     """
 
-    ask: Annotated[Ask, tyro.conf.arg(name="")] = Ask()
+    ask: Annotated[PlanFlags, tyro.conf.arg(name="")] = PlanFlags()
 
     def run(self) -> int:
         """0 all done, 1 some failed, 130 or 143 stopped."""
@@ -170,7 +170,7 @@ class Status:
 
     def run(self) -> int:
         """Reads logs and records."""
-        from gvz.experiments import progress
+        from gvz.experiments import inventory as progress
         from gvz.experiments.plan import parse_shard, read_plan
 
         plan = read_plan(self.results)

@@ -1,4 +1,4 @@
-"""`gvz export`: records of runs as tables. Imports gvz.{errors,rundir}; polars, gvz.evaluation.frame once it runs."""
+"""`gvz export`: records of runs as tables."""
 
 import json
 import sys
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from gvz.errors import ConfigError
-from gvz.rundir import RECORD_FILES, START_RECORDS, read_records
+from gvz.core.errors import ConfigError
+from gvz.run.rundir import RECORD_FILES, START_RECORDS, read_records
 
 if TYPE_CHECKING:
     import polars as pl
@@ -38,7 +38,7 @@ class Export:
         """Writes the tables that have rows; says where they are, and what could not be read."""
         if not self.run_dirs:
             raise ConfigError("export: got no run directory, want at least one")
-        from gvz.evaluation.frame import collect_evaluations
+        from gvz.evaluation.dataset import collect_evaluations
 
         problems: list[str] = []
         tables = {Path(name).stem: run_table(self.run_dirs, name, problems) for name in (*RECORD_FILES, START_RECORDS)}

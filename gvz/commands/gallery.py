@@ -1,9 +1,9 @@
-"""`gvz gallery`: pictures of the tasks. Imports gvz.gallery once it runs."""
+"""`gvz gallery`: pictures of the tasks."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 from gvz.tasks import scenario_named, scenarios
 
 
@@ -25,7 +25,7 @@ class Gallery:
             self.out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigError(f"--out: {self.out} cannot be made: {error.strerror}") from error
-        from gvz.gallery import write_contact_sheet, write_moving_picture
+        from gvz.evaluation.gallery import write_contact_sheet, write_moving_picture
 
         for scenario in chosen:
             print(write_contact_sheet(scenario, self.out))

@@ -1,4 +1,4 @@
-"""`gvz record`: an episode as a video. Imports gvz.evaluation.cast; what plays and draws once it runs."""
+"""`gvz record`: an episode as a video."""
 
 import contextlib
 import sys
@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from gvz.errors import ConfigError
-from gvz.evaluation.cast import UNCAST, Cast, make_panel
+from gvz.core.errors import ConfigError
+from gvz.evaluation.choice import ANY_EPISODE, EpisodeChoice, make_panel
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-    from gvz.evaluation.performance import Moment
+    from gvz.evaluation.playback import Moment
 
 EXIT_INTERRUPTED = 130
 ANIMATION_S = 20.0
@@ -36,7 +36,7 @@ class Record:
 
     out: Path
     """file to write: .mp4, .webp or .gif"""
-    cast: Annotated[Cast, tyro.conf.arg(name="")] = UNCAST
+    cast: Annotated[EpisodeChoice, tyro.conf.arg(name="")] = ANY_EPISODE
     seconds: float | None = None
     """of game time, from the episode's start; default all of it (.gif, .webp: at most 20)"""
     tensorboard: bool = False
@@ -45,8 +45,8 @@ class Record:
     def run(self) -> int:
         """Plays and writes; says how the episode ended."""
         from gvz.env import TICS_PER_SECOND
-        from gvz.evaluation.performance import perform
         from gvz.evaluation.play import Episode
+        from gvz.evaluation.playback import perform
         from gvz.evaluation.video import add_to_tensorboard, check_video_file, write_video
 
         if self.seconds is not None and self.seconds <= 0:
@@ -54,16 +54,16 @@ class Record:
         if self.tensorboard and (self.out.suffix != ".gif" or self.cast.run_dir is None):
             raise ConfigError("--tensorboard: want a run directory and an --out that ends with .gif, which it can show")
         check_video_file(self.out)
-        entrant, task = self.cast.resolve()
-        panel, every_tic = make_panel(entrant, task), self.out.suffix == ".mp4"
+        player_spec, task = self.cast.resolve()
+        panel, every_tic = make_panel(player_spec, task), self.out.suffix == ".mp4"
         seconds = self.seconds if every_tic or self.seconds is not None else ANIMATION_S
-        timeout = task.scenario.timeout_frames(entrant.env.profile)
+        timeout = task.scenario.timeout_frames(player_spec.env.profile)
         num_tics = timeout if seconds is None else min(timeout, int(seconds * TICS_PER_SECOND))
         shown: list[Moment] = []
 
         def pictures() -> "Generator[Image, None, None]":
             episode = Episode(task.id, self.cast.episode, self.cast.seed)
-            with contextlib.closing(perform(entrant, episode)) as moments, _progress(num_tics) as advance:
+            with contextlib.closing(perform(player_spec, episode)) as moments, _progress(num_tics) as advance:
                 for moment in moments:
                     shown[:] = [moment]
                     picture = panel.draw(moment)
@@ -73,7 +73,7 @@ class Record:
                     if moment.frames >= num_tics:
                         return
 
-        rate = Fraction(TICS_PER_SECOND, 1 if every_tic else entrant.env.frame_skip)
+        rate = Fraction(TICS_PER_SECOND, 1 if every_tic else player_spec.env.frame_skip)
         try:
             with contextlib.closing(pictures()) as drawn:
                 write_video(self.out, drawn, rate)
@@ -82,10 +82,10 @@ class Record:
             return EXIT_INTERRUPTED
         if self.tensorboard and self.cast.run_dir is not None:
             events = self.cast.run_dir / "tensorboard" / "episodes"
-            add_to_tensorboard(self.out, events, f"episode/{task.id}", entrant.identity["num_updates"])
+            add_to_tensorboard(self.out, events, f"episode/{task.id}", player_spec.identity["num_updates"])
         [last] = shown
         how = "died" if last.terminated else "reached the time-out" if last.truncated else "was cut off"
-        print(f"{self.out}: {entrant.identity['player']} {how} at tic {last.frames}, score {last.score:g}")
+        print(f"{self.out}: {player_spec.identity['player']} {how} at tic {last.frames}, score {last.score:g}")
         return 0
 
 

@@ -1,4 +1,4 @@
-"""`gvz report`: makes a report of results. Imports gvz.errors; what draws only once it runs."""
+"""`gvz report`: makes a report of results."""
 
 import sys
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 
 
 @dataclass(frozen=True, kw_only=True)

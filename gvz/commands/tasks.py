@@ -1,4 +1,4 @@
-"""`gvz tasks`: the list of tasks. Imports gvz.{selection,registration,tasks}."""
+"""`gvz tasks`: the list of tasks."""
 
 import json
 from dataclasses import dataclass
@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 import tyro
 
+from gvz.evaluation.selection import ALL_TASKS, TaskSelection
 from gvz.scenarios.base import Task
-from gvz.selection import ALL_TASKS, TaskSelection
 from gvz.tasks import named_tasks
 
 

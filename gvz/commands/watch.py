@@ -1,4 +1,4 @@
-"""`gvz watch`: an episode in a window. Imports gvz.evaluation.cast; what plays and draws once it runs."""
+"""`gvz watch`: an episode in a window."""
 
 import contextlib
 import sys
@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from gvz.errors import ConfigError, ResourceError
-from gvz.evaluation.cast import UNCAST, Cast, make_panel
+from gvz.core.errors import ConfigError, ResourceError
+from gvz.evaluation.choice import ANY_EPISODE, EpisodeChoice, make_panel
 from gvz.scenarios.base import Task
 
 if TYPE_CHECKING:
-    from gvz.evaluation.play import Entrant
+    from gvz.evaluation.play import PlayerSpec
     from gvz.viewer import Window
 
 EXIT_INTERRUPTED = 130
@@ -31,7 +31,7 @@ class Watch:
               gvz watch --player random --task seek_and_kill/blue --episodes 3
     """
 
-    cast: Annotated[Cast, tyro.conf.arg(name="")] = UNCAST
+    cast: Annotated[EpisodeChoice, tyro.conf.arg(name="")] = ANY_EPISODE
     episodes: int | None = None
     """how many, one after the other; default until the window is closed"""
     speed: float = 1.0
@@ -43,12 +43,12 @@ class Watch:
             raise ConfigError(f"--episodes: got {self.episodes}, want at least 1")
         if self.speed <= 0:
             raise ConfigError(f"--speed: got {self.speed:g}, want more than 0")
-        entrant, task = self.cast.resolve()
+        player_spec, task = self.cast.resolve()
         from gvz.evaluation.panel import HEIGHT, WIDTH
         from gvz.viewer import Window
 
         try:
-            window = Window(f"{task.id}: {entrant.identity['player']}", WIDTH, HEIGHT)
+            window = Window(f"{task.id}: {player_spec.identity['player']}", WIDTH, HEIGHT)
         except ResourceError as error:
             raise ResourceError(
                 "watch: no window can be opened, there seems to be no display ($DISPLAY); "
@@ -58,23 +58,23 @@ class Watch:
         with contextlib.closing(window):
             try:
                 while not window.closed and (self.episodes is None or episode < self.cast.episode + self.episodes):
-                    self._show(window, entrant, task, episode)
+                    self._show(window, player_spec, task, episode)
                     episode += 1
             except KeyboardInterrupt:
                 print("interrupted", file=sys.stderr)
                 return EXIT_INTERRUPTED
         return 0
 
-    def _show(self, window: "Window", entrant: "Entrant", task: Task, episode: int) -> None:
+    def _show(self, window: "Window", player_spec: "PlayerSpec", task: Task, episode: int) -> None:
         """Plays an episode in the window, unless somebody closes it before."""
         import numpy as np
 
         from gvz.env import TICS_PER_SECOND
-        from gvz.evaluation.performance import perform
         from gvz.evaluation.play import Episode
+        from gvz.evaluation.playback import perform
 
-        panel, begun_s = make_panel(entrant, task), time.monotonic()
-        with contextlib.closing(perform(entrant, Episode(task.id, episode, self.cast.seed))) as moments:
+        panel, begun_s = make_panel(player_spec, task), time.monotonic()
+        with contextlib.closing(perform(player_spec, Episode(task.id, episode, self.cast.seed))) as moments:
             for moment in moments:
                 if moment.frames == 0:
                     begun_s = time.monotonic()  # the engines have started

@@ -3,7 +3,7 @@
     python -m gvz.evaluation.contrast
 
 measures it for Seek and Kill's `default` and for `complete` with each of its textures, and writes
-results/reference/contrast.json. Imports cv2, numpy, gvz.{env,specs,tasks}, gvz.evaluation.reference, gvz.scenarios.
+results/reference/contrast.json.
 """
 
 import json
@@ -12,10 +12,10 @@ from contextlib import closing
 import cv2
 import numpy as np
 
+from gvz.core.env_config import LABEL_CLASSES, EnvConfig
 from gvz.env import DoomEnv
 from gvz.evaluation.reference import RECORDS
 from gvz.scenarios.base import Task
-from gvz.specs import LABEL_CLASSES, EnvConfig
 from gvz.tasks import scenario_named
 
 FILE = RECORDS / "contrast.json"

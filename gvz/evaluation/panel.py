@@ -1,7 +1,4 @@
-"""A picture of a moment of an episode: the screen, and beside it what the player does and thinks.
-
-Imports numpy, pillow, gvz.evaluation.{performance,trained}, gvz.scenarios.
-"""
+"""A picture of a moment of an episode: the screen, and beside it what the player does and thinks."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -9,10 +6,10 @@ from functools import cache
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from gvz.evaluation.performance import SCREEN_HEIGHT, SCREEN_WIDTH, Moment
+from gvz.core.env_config import Profile
+from gvz.evaluation.playback import SCREEN_HEIGHT, SCREEN_WIDTH, Moment
 from gvz.evaluation.trained import Values
 from gvz.scenarios.base import Task
-from gvz.specs import Profile
 
 HEAD_HEIGHT, FOOT_HEIGHT, SIDE_WIDTH = 46, 120, 440
 WIDTH, HEIGHT = SCREEN_WIDTH + SIDE_WIDTH, HEAD_HEIGHT + SCREEN_HEIGHT + FOOT_HEIGHT

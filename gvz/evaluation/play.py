@@ -1,6 +1,5 @@
 """Plays evaluation episodes over the cores. An episode's seed follows from the task, the episode's number and the base
-seed alone, so that every player meets the same episodes. Imports gvz.{janitor,specs},
-actors.process, gvz.evaluation.players; gvz.env to play.
+seed alone, so that every player meets the same episodes.
 
 One game a process. A policy that decides for 4 or 8 games at once would save CPU time: with the network of
 `rainbow_4task` 3.37 -> 2.93 and 2.89 ms a decision, engine included, with that of `rainbow_quick` 2.00 -> 1.38 and
@@ -21,10 +20,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from actors.process import one_core
-from gvz import janitor
-from gvz.errors import EngineError, GvzError, WaitTimeoutError
+from gvz.core import janitor
+from gvz.core.env_config import EnvConfig
+from gvz.core.errors import EngineError, GvzError, WaitTimeoutError
 from gvz.evaluation.players import Player
-from gvz.specs import EnvConfig
 
 if TYPE_CHECKING:
     from gvz.env import DoomEnv
@@ -46,7 +45,7 @@ class Episode(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Entrant:
+class PlayerSpec:
     """Who plays, and by which rules."""
 
     make_player: Callable[[], Player]
@@ -110,7 +109,7 @@ def play_episode(env: "DoomEnv", player: Player, episode: int, base_seed: int = 
     raise EngineError(f"{task}, evaluation episode {episode} (seed {seed}): the engine died {MAX_ATTEMPTS} times")
 
 
-def play(jobs: Iterable[tuple[Entrant, Episode]], *, num_workers: int) -> Iterator[tuple[Entrant, Row]]:
+def play(jobs: Iterable[tuple[PlayerSpec, Episode]], *, num_workers: int) -> Iterator[tuple[PlayerSpec, Row]]:
     """Plays episodes and yields their rows as they come, in no order.
 
     Args:
@@ -124,8 +123,8 @@ def play(jobs: Iterable[tuple[Entrant, Episode]], *, num_workers: int) -> Iterat
     ordered = sorted(jobs, key=lambda job: (repr(job[0].env), job[1].task, id(job[0]), job[1][1:]))
     if num_workers == 0:
         with _Worker() as worker:
-            for entrant, episode in ordered:
-                yield entrant, worker.play(entrant, id(entrant), episode)
+            for player_spec, episode in ordered:
+                yield player_spec, worker.play(player_spec, id(player_spec), episode)
         return
     others = set(multiprocessing.active_children())
     executor = ProcessPoolExecutor(
@@ -168,21 +167,21 @@ class _Worker:
         self._env: DoomEnv | None = None
         self._recycle_episodes: int | None = None
 
-    def play(self, entrant: Entrant, key: int, episode: Episode) -> Row:
-        """Plays an episode. `key` is the same for the same entrant, however often it was pickled."""
+    def play(self, player_spec: PlayerSpec, key: int, episode: Episode) -> Row:
+        """Plays an episode. `key` is the same for the same player_spec, however often it was pickled."""
         if self._player is None or self._player[0] != key:
-            self._player = (key, entrant.make_player())
-        return play_episode(self._game(entrant, episode.task), self._player[1], episode.episode, episode.base_seed)
+            self._player = (key, player_spec.make_player())
+        return play_episode(self._game(player_spec, episode.task), self._player[1], episode.episode, episode.base_seed)
 
-    def _game(self, entrant: Entrant, task: str) -> "DoomEnv":
-        env = dataclasses.replace(entrant.env, reward_weights=())
-        wanted = (task, env, entrant.recycle_episodes)
+    def _game(self, player_spec: PlayerSpec, task: str) -> "DoomEnv":
+        env = dataclasses.replace(player_spec.env, reward_weights=())
+        wanted = (task, env, player_spec.recycle_episodes)
         if self._env is None or (self._env.task.id, self._env.config, self._recycle_episodes) != wanted:
             from gvz.env import DoomEnv
 
             self._close()
-            self._recycle_episodes = entrant.recycle_episodes
-            self._env = DoomEnv(task, env, recycle_episodes=entrant.recycle_episodes)
+            self._recycle_episodes = player_spec.recycle_episodes
+            self._env = DoomEnv(task, env, recycle_episodes=player_spec.recycle_episodes)
         return self._env
 
     def _close(self) -> None:
@@ -207,5 +206,5 @@ def _begin_worker(parent_pid: int) -> None:
     os.environ |= one_core()
 
 
-def _play(entrant: Entrant, key: int, episode: Episode) -> Row:
-    return _worker.play(entrant, key, episode)
+def _play(player_spec: PlayerSpec, key: int, episode: Episode) -> Row:
+    return _worker.play(player_spec, key, episode)

@@ -1,5 +1,5 @@
-"""Who plays an evaluation episode: chance, nobody, a sweep, a script, or any function of frames. Imports numpy,
-actors.preprocess, gvz.evaluation.scripted. The policy of a training run is in gvz.evaluation.trained.
+"""Who plays an evaluation episode: chance, nobody, a sweep, a script, or any function of frames. The policy of a
+training run is in gvz.evaluation.trained.
 """
 
 import dataclasses
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Protocol, assert_never
 import numpy as np
 
 from actors.preprocess import push_frame, start_stack
+from gvz.core.env_config import EnvConfig, SimplePlayer
 from gvz.evaluation.scripted import ScriptedPlayer, SweepPlayer
-from gvz.specs import EnvConfig, SimplePlayer
 
 if TYPE_CHECKING:
     from gvz.env import DoomEnv

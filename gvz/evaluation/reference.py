@@ -3,7 +3,7 @@
     python -m gvz.evaluation.reference [RECORDS ...]
 
 packs record files of `gvz evaluate` into results/reference/ (if any are given) and writes the tables anew from what is
-there. Imports numpy, gvz.evaluation.{metrics,play}, gvz.experiments, gvz.rundir, gvz.tasks.
+there.
 """
 
 import gzip
@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gvz.errors import ConfigError
-from gvz.evaluation.metrics import Estimate, bootstrap, mean
+from gvz.core.errors import ConfigError
 from gvz.evaluation.play import Row
+from gvz.evaluation.statistics import Estimate, bootstrap, mean
 from gvz.experiments.base import experiment_named
-from gvz.rundir import RECORDS_SCHEMA, read_records
+from gvz.run.rundir import RECORDS_SCHEMA, read_records
 from gvz.scenarios.base import Scenario, Task
 from gvz.tasks import named_tasks, scenarios
 

@@ -1,5 +1,5 @@
 """Simple players for each scenario, the floor that a trained agent is held against: a script, and a sweep, which looks
-at nothing. Imports numpy.
+at nothing.
 
 A script is a generator: it looks at `Sight`, which changes between its steps, and yields the button to hold. It is
 told names and places of what is in sight (the labels buffer), so it knows enemies, kits and missiles without having
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from gvz.engine import Label
+    from gvz.engine.engine import Label
     from gvz.env import DoomEnv
     from gvz.observation import Observation
 

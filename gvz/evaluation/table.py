@@ -1,6 +1,4 @@
-"""What an evaluation ends with: the score of each task, for a person and for a program. Imports numpy,
-gvz.evaluation.metrics.
-"""
+"""What an evaluation ends with: the score of each task, for a person and for a program."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from gvz.evaluation.metrics import Estimate, bootstrap, bootstrap_runs
 from gvz.evaluation.play import Row
+from gvz.evaluation.statistics import Estimate, bootstrap, bootstrap_runs
 from gvz.tasks import Task
 
 

@@ -1,7 +1,7 @@
 """The policies of a training run as players, read from its run directory.
 
-Imports gvz.config, gvz.evaluation.play; jax, gvz.assemble, learner where a policy is read. Nothing that a run directory
-holds or names is executed or unpickled; an agent in a file of its own is asked for by name.
+Nothing that a run directory holds or names is executed or unpickled; an agent in a file of its own is asked for by
+name.
 """
 
 import dataclasses
@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from actors.preprocess import push_frame, start_stack
-from gvz.config import RunConfig, config_from_dict
-from gvz.errors import CheckpointError, ConfigError
-from gvz.evaluation.play import Entrant
-from gvz.evaluation.record import row_identity
+from gvz.core.errors import CheckpointError, ConfigError
+from gvz.evaluation.episode_log import row_identity
+from gvz.evaluation.play import PlayerSpec
+from gvz.run.config import RunConfig, config_from_dict
 from gvz.tasks import Task
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def find_checkpoints(run_dir: Path, wanted: Sequence[str]) -> list[int]:
     return sorted(chosen)
 
 
-def trained_entrant(run_dir: Path, config: RunConfig, num_updates: int) -> Entrant:
+def trained_player(run_dir: Path, config: RunConfig, num_updates: int) -> PlayerSpec:
     """A policy of a run; its parameters are read, so that damage shows now.
 
     Args:
@@ -144,7 +144,7 @@ def trained_entrant(run_dir: Path, config: RunConfig, num_updates: int) -> Entra
         "num_updates": num_updates,
         "params": digest.hexdigest(),
     }
-    return Entrant(
+    return PlayerSpec(
         make_player=partial(TrainedPlayer, run_dir, num_updates, agent_file),
         env=config.env,
         identity=row_identity(player, config.env),
@@ -218,7 +218,7 @@ def _read_params(run_dir: Path, config: RunConfig, num_updates: int) -> "tuple[A
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     import jax
 
-    from gvz.assemble import run_agent
+    from gvz.run.assemble import run_agent
     from learner import checkpoint
 
     agent = run_agent(config)

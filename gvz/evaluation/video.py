@@ -1,7 +1,4 @@
-"""Pictures to a video file: H.264 in MP4 by PyAV, animated GIF and WebP by Pillow; a GIF to TensorBoard.
-
-Imports pillow; av to write MP4, tensorboardX to write events.
-"""
+"""Pictures to a video file: H.264 in MP4 by PyAV, animated GIF and WebP by Pillow; a GIF to TensorBoard."""
 
 import importlib.util
 import time
@@ -14,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 
 SUFFIXES = (".mp4", ".gif", ".webp")
 END_S = 1.5

@@ -1,4 +1,4 @@
-"""What an experiment is: a grid of training runs and what they are evaluated on. Imports gvz.{config,errors,tasks}.
+"""What an experiment is: a grid of training runs and what they are evaluated on.
 
 Source: thesis 5.1.1 (seeds, checkpoints, episodes) and 5.2 (the four experiments).
 """
@@ -9,11 +9,11 @@ from functools import cache
 from types import MappingProxyType
 from typing import Literal, get_args
 
-from gvz.config import load_config
-from gvz.errors import ConfigError
-from gvz.registry import discover
+from gvz.core.env_config import SimplePlayer
+from gvz.core.errors import ConfigError
+from gvz.core.registry import discover
+from gvz.run.config import load_config
 from gvz.scenarios.base import Split, nearest
-from gvz.specs import SimplePlayer
 from gvz.tasks import Task, named_tasks, scenario_named
 
 SCENARIOS = ("defend_the_center", "health_gathering", "seek_and_kill", "dodge_projectiles")

@@ -1,12 +1,12 @@
-"""What runs take: gradient steps, environment steps, episodes, and hours by measured rates. Imports gvz.experiments."""
+"""What runs take: gradient steps, environment steps, episodes, and hours by measured rates."""
 
 from dataclasses import dataclass
 
-from gvz.config import load_config
 from gvz.experiments.base import TrainingRun
 from gvz.experiments.plan import Evaluation
 from gvz.experiments.rates import Rates
 from gvz.experiments.scale import scaled_settings
+from gvz.run.config import load_config
 from gvz.tasks import scenario_named
 
 

@@ -1,7 +1,6 @@
 """A job: what is to be done for one run (train, then evaluate) or one player, and the process that does it now.
 
-The next command follows from what stands on the disk, so a job that was cut goes on. Imports
-gvz.{config,janitor,experiments}.
+The next command follows from what stands on the disk, so a job that was cut goes on.
 """
 
 import fcntl
@@ -16,13 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Protocol
 
-from gvz import janitor
-from gvz.config import load_config
-from gvz.experiments import progress
+from gvz.core import janitor
+from gvz.core.env_config import SimplePlayer
+from gvz.experiments import inventory as progress
 from gvz.experiments.base import TrainingRun
 from gvz.experiments.plan import Evaluation
 from gvz.experiments.scale import scaled_settings
-from gvz.specs import SimplePlayer
+from gvz.run.config import load_config
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -1,7 +1,4 @@
-"""What was asked for: experiments, scale, scenarios; the grid of runs that follows, and plan.json, which keeps it.
-
-Imports gvz.experiments.{base,scale}.
-"""
+"""What was asked for: experiments, scale, scenarios; the grid of runs that follows, and plan.json, which keeps it."""
 
 import dataclasses
 import json
@@ -12,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from gvz.errors import ConfigError
+from gvz.core.env_config import SimplePlayer
+from gvz.core.errors import ConfigError
 from gvz.experiments.base import Experiment, TrainingRun, experiment_named
 from gvz.experiments.scale import scaled
-from gvz.specs import SimplePlayer
 from gvz.tasks import scenario_named
 
 PLAN_SCHEMA = 1

@@ -1,7 +1,4 @@
-"""How fast this machine trains and evaluates: measured by really doing it for a short while, and remembered.
-
-Imports gvz.{cache,config,experiments,janitor,machine,rundir}.
-"""
+"""How fast this machine trains and evaluates: measured by really doing it for a short while, and remembered."""
 
 import dataclasses
 import hashlib
@@ -12,17 +9,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from gvz import janitor
-from gvz.cache import cache_directory
-from gvz.config import config_to_dict, load_config
-from gvz.errors import GvzError
-from gvz.experiments import progress
+from gvz.core import janitor
+from gvz.core.cache import cache_directory
+from gvz.core.errors import GvzError
+from gvz.experiments import inventory as progress
 from gvz.experiments.base import TrainingRun
 from gvz.experiments.jobs import Command, RunJob, RunningJob, Slot
 from gvz.experiments.plan import Evaluation
 from gvz.experiments.scale import CHECK_BELOW, CHECK_SETTINGS
-from gvz.machine import cpu_model
-from gvz.rundir import read_records
+from gvz.run.config import config_to_dict, load_config
+from gvz.run.machine import cpu_model
+from gvz.run.rundir import read_records
 
 MEASURE_S = 20.0
 """of updates, and again of evaluation"""

@@ -1,4 +1,4 @@
-"""Experiments made small: what `--scale` does, all of it. Imports gvz.experiments.base, gvz.config.
+"""Experiments made small: what `--scale` does, all of it.
 
 Budgets shrink in proportion, with floors below which nothing runs. Where budgets alone leave an experiment too large
 (starting and compiling a run takes some 20 s, however few its updates), the grid is thinned as well.
@@ -7,9 +7,9 @@ Budgets shrink in proportion, with floors below which nothing runs. Where budget
 import dataclasses
 from typing import Any
 
-from gvz.config import RunConfig
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 from gvz.experiments.base import Experiment
+from gvz.run.config import RunConfig
 
 ONE_SEED_BELOW = 0.1
 """a smaller scale has one seed"""

@@ -1,7 +1,4 @@
-"""Runs jobs over the machine's cores and GPUs, shows how far they are, and stops them in order.
-
-Imports gvz.experiments, gvz.stop; rich.
-"""
+"""Runs jobs over the machine's cores and GPUs, shows how far they are, and stops them in order."""
 
 import os
 import shutil
@@ -16,10 +13,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Column
 
-from gvz.errors import ConfigError
-from gvz.experiments import progress
+from gvz.core.errors import ConfigError
+from gvz.core.stop import StopRequest
+from gvz.experiments import inventory as progress
 from gvz.experiments.jobs import Job, RunningJob, Slot
-from gvz.stop import StopRequest
 
 POLL_S = 0.5
 PLAIN_PERIOD_S = 60.0

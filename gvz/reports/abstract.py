@@ -1,7 +1,4 @@
-"""What stands at the head of a report: what was run, with which budget, what beats what, and how far to believe it.
-
-Imports numpy, polars, gvz.evaluation.metrics, gvz.reports.
-"""
+"""What stands at the head of a report: what was run, with which budget, what beats what, and how far to believe it."""
 
 import itertools
 from collections.abc import Sequence
@@ -9,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import polars as pl
 
-from gvz.evaluation.metrics import difference
+from gvz.evaluation.statistics import difference
 from gvz.reports.document import count
 from gvz.reports.results import Results
 from gvz.reports.scenario_section import agents_of, played_tasks

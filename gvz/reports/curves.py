@@ -1,7 +1,4 @@
-"""Curves over gradient steps, as numbers: scores of training episodes and of evaluated checkpoints.
-
-Imports numpy, polars, gvz.evaluation.metrics, gvz.reports.scores.
-"""
+"""Curves over gradient steps, as numbers: scores of training episodes and of evaluated checkpoints."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from gvz.evaluation.metrics import bootstrap_runs
+from gvz.evaluation.statistics import bootstrap_runs
 from gvz.reports.results import Run
 from gvz.reports.scores import Scores, pick, redraw
 

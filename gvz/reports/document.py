@@ -1,4 +1,4 @@
-"""What a report consists of, as data: sections of text, tables and figures. Imports gvz.evaluation.metrics.
+"""What a report consists of, as data: sections of text, tables and figures.
 
 `gvz.reports.write` writes a document as HTML, Markdown, CSV and LaTeX.
 """
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from gvz.evaluation.metrics import Estimate
+from gvz.evaluation.statistics import Estimate
 
 Kind = Literal["text", "ours", "theirs", "missing"]
 

@@ -1,4 +1,4 @@
-"""Figures of a report. Imports matplotlib, numpy, gvz.reports.{curves,document}.
+"""Figures of a report.
 
 A figure is one panel about as wide as a telephone, so that a page can set as many side by side as it has room for.
 Each is written as SVG, PDF and PNG; the page holds the SVG.

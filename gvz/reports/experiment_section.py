@@ -1,7 +1,4 @@
-"""The section of an experiment: its table as in the thesis, aggregates, comparisons, curves.
-
-Imports polars, gvz.evaluation.metrics, gvz.experiments, gvz.reports.
-"""
+"""The section of an experiment: its table as in the thesis, aggregates, comparisons, curves."""
 
 import itertools
 from collections.abc import Sequence
@@ -10,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from gvz.evaluation.metrics import (
+from gvz.evaluation.statistics import (
     Statistic,
     difference,
     interquartile_mean,
@@ -20,18 +17,18 @@ from gvz.evaluation.metrics import (
     probability_of_improvement,
 )
 from gvz.experiments.base import Experiment, TrainingRun
-from gvz.experiments.progress import run_directory
+from gvz.experiments.inventory import run_directory
 from gvz.reports.curves import evaluation_curve, learning_curve
 from gvz.reports.document import Block, Cell, Figure, Section, Table, count, missing, theirs, words
 from gvz.reports.draw import draw_curves
-from gvz.reports.results import Asked, Results
+from gvz.reports.results import PlannedExperiment, Results
 from gvz.reports.scores import Scores, estimate, estimate_groups, pick
 from gvz.tasks import parse_task, scenario_named
 
 _COLUMN_TITLES = {"train1": "1 task", "train4": "4 tasks", "train8": "8 tasks"}
 
 
-def experiment_section(results: Results, asked: Asked, out: Path) -> Section:
+def experiment_section(results: Results, asked: PlannedExperiment, out: Path) -> Section:
     """Everything the report says of an experiment."""
     experiment = asked.experiment
     budget = (
@@ -59,7 +56,7 @@ def column_title(experiment: Experiment, column: str) -> str:
 
 
 def column_scores(
-    results: Results, asked: Asked, scenario: str, column: str, *, last_checkpoints: int | None = None
+    results: Results, asked: PlannedExperiment, scenario: str, column: str, *, last_checkpoints: int | None = None
 ) -> tuple[Scores, tuple[str, ...]]:
     """Scores of the runs of one column in one scenario, and the ids of the tasks they are over.
 
@@ -98,7 +95,7 @@ def column_runs(experiment: Experiment, scenario: str, column: str) -> list[Trai
             return [run for run in runs if run.config == column]
 
 
-def run_episodes(results: Results, asked: Asked, run: TrainingRun) -> pl.DataFrame:
+def run_episodes(results: Results, asked: PlannedExperiment, run: TrainingRun) -> pl.DataFrame:
     """The evaluation episodes of one run of the experiment."""
     return results.episodes.filter(run_dir=str(run_directory(asked.results, run)))
 
@@ -108,7 +105,7 @@ def _column_tasks(experiment: Experiment, run: TrainingRun, column: str) -> tupl
     return tuple(t for t in tasks if parse_task(t).level == int(column)) if experiment.columns == "level" else tasks
 
 
-def result_table(results: Results, asked: Asked) -> Table:
+def result_table(results: Results, asked: PlannedExperiment) -> Table:
     """Rows: for every scenario ours and, below, what others published; then the mean over scenarios."""
     experiment, columns = asked.experiment, asked.experiment.column_names
     rows = []
@@ -165,7 +162,7 @@ def _joined(statistic: Statistic) -> Statistic:
     return lambda *groups: statistic(np.concatenate(groups, axis=-1))
 
 
-def aggregate_table(results: Results, asked: Asked) -> Table:
+def aggregate_table(results: Results, asked: PlannedExperiment) -> Table:
     """Mean, interquartile mean and median over all scenarios' tasks."""
     experiment = asked.experiment
     rows = []
@@ -186,7 +183,7 @@ def aggregate_table(results: Results, asked: Asked) -> Table:
     )
 
 
-def comparison_table(results: Results, asked: Asked) -> Table:
+def comparison_table(results: Results, asked: PlannedExperiment) -> Table:
     """Each two columns: difference of the means, and how probable it is that the first is better."""
     experiment = asked.experiment
     rows = []
@@ -214,7 +211,7 @@ def comparison_table(results: Results, asked: Asked) -> Table:
 # ----------------------------------------------------------------------------------------------------- curves
 
 
-def _figures(results: Results, asked: Asked, out: Path) -> list[Figure]:
+def _figures(results: Results, asked: PlannedExperiment, out: Path) -> list[Figure]:
     experiment = asked.experiment
     figures: list[Figure] = []
     for scenario in experiment.scenarios:
@@ -227,7 +224,7 @@ def _figures(results: Results, asked: Asked, out: Path) -> list[Figure]:
     return figures
 
 
-def _learning_curves(results: Results, asked: Asked, scenario: str, out: Path) -> list[Figure]:
+def _learning_curves(results: Results, asked: PlannedExperiment, scenario: str, out: Path) -> list[Figure]:
     """Training scores by level, and those of each task of level 1 (thesis Figures 5.2 and 5.3)."""
     experiment, title = asked.experiment, scenario_named(scenario).title
     runs = column_runs(experiment, scenario, "0")
@@ -250,7 +247,7 @@ def what_id(text: str) -> str:
     return "".join(c if c.isalnum() else "_" for c in text)
 
 
-def _curves_by_level(results: Results, asked: Asked, scenario: str, out: Path) -> list[Figure]:
+def _curves_by_level(results: Results, asked: PlannedExperiment, scenario: str, out: Path) -> list[Figure]:
     """Evaluation scores of checkpoints by level (thesis Figure 5.6)."""
     experiment, title = asked.experiment, scenario_named(scenario).title
     runs = column_runs(experiment, scenario, "0")
@@ -264,7 +261,7 @@ def _curves_by_level(results: Results, asked: Asked, scenario: str, out: Path) -
     return [draw_curves(out, f"{experiment.name}_{scenario}_levels", title, curves, caption)]
 
 
-def _curves_by_task(results: Results, asked: Asked, scenario: str, out: Path) -> list[Figure]:
+def _curves_by_task(results: Results, asked: PlannedExperiment, scenario: str, out: Path) -> list[Figure]:
     """Evaluation scores of checkpoints on each test task, a line for each column (thesis Figures 5.4 and 5.5)."""
     experiment, title = asked.experiment, scenario_named(scenario).title
     figures = []
@@ -294,5 +291,5 @@ def _players(results: Results, task: str) -> dict[str, float]:
     return dict(means.iter_rows())
 
 
-def _episodes_of(results: Results, asked: Asked, runs: Sequence[TrainingRun]) -> pl.DataFrame:
+def _episodes_of(results: Results, asked: PlannedExperiment, runs: Sequence[TrainingRun]) -> pl.DataFrame:
     return results.episodes.filter(pl.col("run_dir").is_in([str(run_directory(asked.results, run)) for run in runs]))

@@ -1,11 +1,11 @@
-"""A report from results directories: reads, computes, draws, writes. Imports gvz.reports."""
+"""A report from results directories: reads, computes, draws, writes."""
 
 import platform
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 from gvz.reports.abstract import caveats, what_beats_what, what_was_run
 from gvz.reports.document import Block, Document, Section
 from gvz.reports.experiment_section import experiment_section

@@ -1,6 +1,6 @@
 """What a report is made of: evaluation episodes, training runs and plans, read from results directories.
 
-Imports polars, gvz.evaluation.frame, gvz.experiments, gvz.rundir, gvz.tasks. Reads records, never checkpoints.
+Reads records, never checkpoints.
 """
 
 import json
@@ -12,11 +12,11 @@ from typing import Any, get_args
 
 import polars as pl
 
-from gvz.errors import ConfigError
-from gvz.evaluation.frame import collect_evaluations, fits
+from gvz.core.errors import ConfigError
+from gvz.evaluation.dataset import collect_evaluations, fits
 from gvz.experiments.base import Experiment
 from gvz.experiments.plan import read_plan
-from gvz.rundir import read_records
+from gvz.run.rundir import read_records
 from gvz.scenarios.base import Split
 from gvz.tasks import named_tasks, scenarios
 
@@ -71,7 +71,7 @@ class Run:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Asked:
+class PlannedExperiment:
     """An experiment that a results directory was planned for."""
 
     results: Path
@@ -85,12 +85,12 @@ class Results:
 
     paths: tuple[Path, ...]
     episodes: pl.DataFrame
-    """`gvz.evaluation.frame`'s columns, with `agent` (who played, without seed and checkpoint) and `final` (of one of
+    """`gvz.evaluation.dataset`'s columns, with `agent` (who played, without seed and checkpoint) and `final` (of one of
     the last quarter of the run's evaluated checkpoints, by which agents are compared)"""
     runs: tuple[Run, ...]
     agents: dict[str, str]
     """run directory -> the agent its rows belong to"""
-    asked: tuple[Asked, ...]
+    asked: tuple[PlannedExperiment, ...]
     problems: tuple[str, ...]
 
 
@@ -117,7 +117,9 @@ def read_results(paths: Sequence[Path]) -> Results:
                 problems.append(f"{error}; its experiments are not in this report")
                 continue
             assert plan is not None, "the file is there"
-            asked += [Asked(results=file.parent, experiment=e, scale=plan.scale) for e in plan.experiments()]
+            asked += [
+                PlannedExperiment(results=file.parent, experiment=e, scale=plan.scale) for e in plan.experiments()
+            ]
     evaluated = set(episodes["run_dir"])
     for run in runs.values():
         if str(run.path) not in evaluated:

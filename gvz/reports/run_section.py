@@ -1,7 +1,4 @@
-"""Sections on the runs themselves: time and rates, configuration, raw records and videos.
-
-Imports polars, gvz.reports.
-"""
+"""Sections on the runs themselves: time and rates, configuration, raw records and videos."""
 
 import math
 import os
@@ -11,7 +8,7 @@ from typing import Any
 
 import polars as pl
 
-from gvz.evaluation.frame import evaluation_files
+from gvz.evaluation.dataset import evaluation_files
 from gvz.reports.document import Block, Link, Section, Table, count, missing, words
 from gvz.reports.results import Results, Run, training_time_s
 

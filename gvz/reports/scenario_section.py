@@ -1,7 +1,4 @@
-"""The section of a scenario: every agent and player on every task, by level and by attribute.
-
-Imports polars, gvz.evaluation.metrics, gvz.reports, gvz.tasks.
-"""
+"""The section of a scenario: every agent and player on every task, by level and by attribute."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -10,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from gvz.evaluation.frame import REWARD_PREFIX
-from gvz.evaluation.metrics import generalization_gap, interquartile_mean, mean, median, solved
+from gvz.evaluation.dataset import REWARD_PREFIX
+from gvz.evaluation.statistics import generalization_gap, interquartile_mean, mean, median, solved
 from gvz.reports.curves import evaluation_curve, learning_curve
 from gvz.reports.document import Block, Cell, Figure, Section, Table, missing, words
 from gvz.reports.draw import draw_bars, draw_curves, draw_heat_map, draw_histogram

@@ -1,6 +1,4 @@
-"""Scores of agents, picked from the evaluation episodes, and estimates of them. Imports polars, gvz.evaluation.metrics,
-gvz.reports.document.
-"""
+"""Scores of agents, picked from the evaluation episodes, and estimates of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from gvz.evaluation.metrics import Cells, Redraw, Statistic, bootstrap_runs, mean
+from gvz.evaluation.statistics import Cells, Redraw, Statistic, bootstrap_runs, mean
 from gvz.reports.document import Cell, missing, ours
 
 Seed = int | None

@@ -1,6 +1,4 @@
-"""Writes a document: one self-contained HTML page, Markdown, and every table as CSV and LaTeX. Imports jinja2,
-gvz.reports.document.
-"""
+"""Writes a document: one self-contained HTML page, Markdown, and every table as CSV and LaTeX."""
 
 import base64
 import csv

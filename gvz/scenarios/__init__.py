@@ -1,4 +1,4 @@
-"""Scenarios: one file each, discovered by its SCENARIO; the compiler that makes maps of their tasks.
+"""Tier 1. Scenarios: one file each, discovered by its SCENARIO; the compiler that makes maps of their tasks.
 
 What there is to add is data. An attribute is an entry in its scenario's `attributes`, a named task a word in its
 `tasks`, a scenario a file beside this one. With no file touched, the same from outside:

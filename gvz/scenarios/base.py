@@ -1,4 +1,4 @@
-"""What a scenario, an attribute and a task are. Imports gvz.wad, gvz.scenarios.rewards and tier 0.
+"""What a scenario, an attribute and a task are.
 
 A scenario is data: a base map, a script template and what they hold by default (`Content`). An attribute is the
 `Content` it changes. A task is a scenario with a set of attributes. `gvz.scenarios.compiler` makes a map of it.
@@ -11,9 +11,9 @@ from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Literal
 
-from gvz.errors import TaskError
+from gvz.core.env_config import EnvConfig, Profile
+from gvz.core.errors import TaskError
 from gvz.scenarios.rewards import Reward, Rewarder, check_weights, return_range
-from gvz.specs import EnvConfig, Profile
 from gvz.wad.udmf import UdmfMap
 
 

@@ -1,4 +1,4 @@
-"""Task -> WAD file: content of a task, its map, script and classes, and the cache. Imports gvz.scenarios.base, gvz.wad.
+"""Task -> WAD file: content of a task, its map, script and classes, and the cache.
 
 A WAD is always built anew (some 20 ms) and kept in the user's cache directory under the hash of its
 bytes, so a cached file is either what this version of the code builds, or not found. Nothing here starts an engine.
@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from string import Template
 
-from gvz.cache import cache_directory
-from gvz.errors import ResourceError, TaskError, WadError
+from gvz.core.cache import cache_directory
+from gvz.core.env_config import Profile
+from gvz.core.errors import ResourceError, TaskError, WadError
 from gvz.scenarios.base import Content, Task, Thing, Uniform, Value, nearest
-from gvz.specs import Profile
 from gvz.wad.acs import compile_acs
 from gvz.wad.decorate import declared_actors, declared_numbers, used_sprites
 from gvz.wad.lumps import read_maps, read_wad, write_map_wad

@@ -1,4 +1,4 @@
-"""Defend the Center: a turret in a round room. Imports gvz.scenarios.base and gvz.scenarios.rewards.
+"""Defend the Center: a turret in a round room.
 
 Ability tested: aiming, and telling who is nearest. The agent stands in the middle of a round room and cannot walk.
 Actions: ATTACK, TURN_LEFT, TURN_RIGHT.

@@ -1,5 +1,4 @@
-"""Dodge Projectiles: a shooting gallery with the agent as the target. Imports gvz.scenarios.base,
-rewards, gvz.wad.
+"""Dodge Projectiles: a shooting gallery with the agent as the target.
 
 Ability tested: seeing what flies towards one, and stepping aside in time.
 Actions: SPEED, MOVE_LEFT, MOVE_RIGHT; the agent faces the enemies and cannot turn.

@@ -1,4 +1,4 @@
-"""Health Gathering: staying alive on an acid floor. Imports gvz.scenarios.base and gvz.scenarios.rewards.
+"""Health Gathering: staying alive on an acid floor.
 
 Ability tested: finding what helps, avoiding what harms, walking round what stands in the way.
 Actions: MOVE_FORWARD, TURN_LEFT, TURN_RIGHT.

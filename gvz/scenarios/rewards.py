@@ -1,4 +1,4 @@
-"""Rewards as named events of one decision, each with a weight. Imports tier 0."""
+"""Rewards as named events of one decision, each with a weight."""
 
 import math
 from collections import deque
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any
 
-from gvz.errors import ConfigError
-from gvz.specs import EnvConfig, typed
+from gvz.core.env_config import EnvConfig, typed
+from gvz.core.errors import ConfigError
 
 Variables = Mapping[str, float]
 """What the game says after a decision: name of a game or bookkeeping variable -> value."""

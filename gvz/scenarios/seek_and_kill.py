@@ -1,4 +1,4 @@
-"""Seek and Kill: a hunt through a maze. Imports gvz.scenarios.base, rewards, gvz.wad.
+"""Seek and Kill: a hunt through a maze.
 
 Ability tested: exploring, telling enemies from everything else, aiming.
 Actions: ATTACK, SPEED, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT.

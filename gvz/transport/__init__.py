@@ -1,1 +1,1 @@
-"""All that actors and learner say to each other. Imports numpy, msgpack and the standard library only."""
+"""Tier 0. All that actors and learner say to each other."""

@@ -1,7 +1,5 @@
 """The parameter queue: one writer (the learner), many readers (actors), shared memory.
 
-Imports numpy, the standard library, gvz.errors and this package.
-
 A version of the parameters is one flat float32 vector. The writer fills the slots in turn and never waits; each slot
 has a ticket that is odd while the slot is written, so a reader that was overtaken sees it and takes the newer one.
 The number of publications is raised after a slot is whole: a writer that dies leaves the version before.
@@ -12,7 +10,7 @@ import time
 
 import numpy as np
 
-from gvz.errors import TransportError, WaitTimeoutError
+from gvz.core.errors import TransportError, WaitTimeoutError
 from gvz.transport.messages import ParamsHeader
 from gvz.transport.segment import ALIGN_BYTES, Fence, Segment, aligned, hash_layout
 

@@ -1,13 +1,10 @@
-"""Control messages over a stream socket: four bytes of length (little-endian), then msgpack.
-
-Imports the standard library, gvz.errors and this package.
-"""
+"""Control messages over a stream socket: four bytes of length (little-endian), then msgpack."""
 
 import select
 import socket
 import struct
 
-from gvz.errors import TransportError, WaitTimeoutError
+from gvz.core.errors import TransportError, WaitTimeoutError
 from gvz.transport.messages import Message, decode, encode
 
 MAX_MESSAGE_BYTES = 64 * 2**20

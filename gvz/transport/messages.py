@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import msgpack
 import numpy as np
 
-from gvz.errors import TransportError
+from gvz.core.errors import TransportError
 
 SCHEMA_VERSION = 2
 """Raised by one whenever the meaning or layout of anything in this file changes."""

@@ -1,7 +1,5 @@
 """A ring of step records in shared memory: one writer (an actor), one reader (the learner).
 
-Imports numpy, the standard library, gvz.errors and this package.
-
 Layout of the payload: control words, then STEP_DTYPE[capacity], then uint8[capacity, H, W, C]. Records and frames
 stand side by side so that a run of frames is one contiguous copy. Record number s lies in slot s mod capacity;
 `published` and `consumed` count records since the ring was made and never go back. Each is written by one side only,
@@ -18,7 +16,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from gvz.errors import TransportError, WaitTimeoutError
+from gvz.core.errors import TransportError, WaitTimeoutError
 from gvz.transport.messages import STEP_DTYPE, StepBlock
 from gvz.transport.segment import Fence, Segment, aligned, hash_layout
 

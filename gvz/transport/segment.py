@@ -1,4 +1,4 @@
-"""Anonymous shared memory with a header that proves what it is. Imports the standard library, numpy, gvz.errors.
+"""Anonymous shared memory with a header that proves what it is.
 
 A segment is a `memfd_create` file, mapped. It has no name in any directory: a process is given its descriptor when it
 is started, and the kernel frees the memory when the last process that maps it or holds its descriptor has ended. So
@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gvz.errors import ResourceError, TransportError
+from gvz.core.errors import ResourceError, TransportError
 from gvz.transport.messages import SCHEMA_VERSION
 
 MAGIC = int.from_bytes(b"GViZ-shm", "little")

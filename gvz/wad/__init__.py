@@ -1,4 +1,1 @@
-"""File formats of the Doom engine: WAD lumps, UDMF map text, ACS scripts, DECORATE names. No game logic.
-
-May import `gvz.errors`, numpy and the standard library; never vizdoom's compiled module, never jax.
-"""
+"""Tier 1. File formats of the Doom engine: WAD lumps, UDMF map text, ACS scripts, DECORATE names. No game logic."""

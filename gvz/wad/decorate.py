@@ -1,4 +1,4 @@
-"""DECORATE text: which actor classes it declares, which sprites it shows. Imports the standard library only."""
+"""DECORATE text: which actor classes it declares, which sprites it shows."""
 
 import re
 

@@ -1,8 +1,7 @@
 """WAD files: a header, lumps of bytes, a directory of their names. Works on bytes, never on files.
 
-Written here in place of omgifol, because that library collapses lumps of one name, writes what is added to a map
-behind its ENDMAP (where the engine does not look), opens files for writing, and takes damaged bytes for good ones.
-Imports gvz.errors and the standard library.
+Written here in place of omgifol, because that library collapses lumps of one name, writes what is added to a map behind
+its ENDMAP (where the engine does not look), opens files for writing, and takes damaged bytes for good ones.
 """
 
 import itertools
@@ -11,7 +10,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gvz.errors import WadError
+from gvz.core.errors import WadError
 
 HEADER = struct.Struct("<4sii")
 ENTRY = struct.Struct("<ii8s")

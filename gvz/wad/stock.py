@@ -9,7 +9,7 @@ import zipfile
 from functools import cache
 from pathlib import Path
 
-from gvz.errors import WadError
+from gvz.core.errors import WadError
 from gvz.wad.decorate import declared_actors
 from gvz.wad.lumps import read_wad
 from gvz.wad.textures import flats, wall_textures

@@ -1,11 +1,11 @@
-"""Names of textures: what a WAD has, what a map uses. Imports gvz.errors, gvz.wad.lumps, gvz.wad.udmf."""
+"""Names of textures: what a WAD has, what a map uses."""
 
 import difflib
 import re
 import struct
 from collections.abc import Collection, Sequence
 
-from gvz.errors import WadError
+from gvz.core.errors import WadError
 from gvz.wad.lumps import Lump
 from gvz.wad.udmf import UdmfMap
 

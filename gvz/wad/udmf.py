@@ -1,4 +1,4 @@
-"""UDMF, the map format: TEXTMAP text to lists of blocks and back. Imports gvz.errors and the standard library.
+"""UDMF, the map format: TEXTMAP text to lists of blocks and back.
 
 The engine ends the process on a map whose blocks refer to others that are not there, so references and required
 fields are checked when a map is read and again when it is written.
@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NoReturn
 
-from gvz.errors import WadError
+from gvz.core.errors import WadError
 
 Value = bool | int | float | str
 Block = dict[str, Value]

@@ -1,4 +1,4 @@
-"""What an agent is: four pure functions. May import jax, learner.networks, learner.replay, gvz.registry.
+"""What an agent is: four pure functions.
 
 A third agent is one file that sets `AGENT` to something callable as `AGENT(config, spec)` which returns an `Agent`.
 Beside this file its `agent.name` is its file name; anywhere else, its path. docs/AGENTS.md has a worked example.
@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
 
-from gvz.errors import ConfigError
-from gvz.registry import discover
+from gvz.core.errors import ConfigError
+from gvz.core.registry import discover
 from learner.config import AgentConfig
 from learner.networks import Params
 from learner.replay import Transitions

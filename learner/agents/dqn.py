@@ -1,4 +1,4 @@
-"""DQN: thesis 4.1, Algorithm 1. May import jax, learner.networks, learner.losses, learner.agents.base.
+"""DQN: thesis 4.1, Algorithm 1.
 
 The plain agent, written out: a target network, the Huber loss, epsilon-greedy exploration. Linear Q outputs (thesis
 4.1.5 speaks of a softmax over Q values, which cannot represent returns). The n-step return is the replay's.
@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 from learner import losses
 from learner.agents.base import AgentLoss, AgentSpec, Evaluation, Params, epsilon_greedy
 from learner.config import AgentConfig

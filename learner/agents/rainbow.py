@@ -1,4 +1,4 @@
-"""Rainbow: thesis 4.2, Hessel et al. 2018. May import jax, learner.networks, learner.losses, learner.agents.base.
+"""Rainbow: thesis 4.2, Hessel et al. 2018.
 
 Four of its six parts live here, each behind a switch of `AgentConfig`: double, dueling, noisy, distributional. The
 other two, prioritized replay and n-step returns, are the replay's. With all of them off it is DQN.
@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 from learner import losses
 from learner.agents.base import AgentLoss, AgentSpec, Evaluation, Params, epsilon_greedy
 from learner.config import AgentConfig

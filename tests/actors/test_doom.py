@@ -16,8 +16,8 @@ from watched_pool import segments
 from actors.config import ActorsConfig
 from actors.inline import InlinePool
 from actors.pool import ActorPool, PoolConfig
-from gvz import janitor
-from gvz.specs import EnvConfig
+from gvz.core import janitor
+from gvz.core.env_config import EnvConfig
 from gvz.transport.messages import EpisodeStats, Fault, Message, StepBlock
 
 pytestmark = pytest.mark.engine

@@ -17,7 +17,7 @@ from watched_pool import segments
 from actors.inline import InlinePool
 from actors.loop import derive_seed
 from actors.pool import PoolConfig
-from gvz.errors import ConfigError, ResumeError
+from gvz.core.errors import ConfigError, ResumeError
 from gvz.transport.messages import EpisodeStats, Fault, Message, ParamsHeader, StepBlock
 
 LENGTH = 7

@@ -17,7 +17,7 @@ from watched_pool import DEADLINE_S, Run, alive, segments
 
 from actors.config import ActorsConfig
 from actors.pool import ActorPool
-from gvz.errors import ConfigError, ResumeError
+from gvz.core.errors import ConfigError, ResumeError
 from gvz.transport.messages import EpisodeStats, ParamsHeader, Ready
 from gvz.transport.ring import WriterState
 

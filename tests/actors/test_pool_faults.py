@@ -18,7 +18,7 @@ from actors import supervisor
 from actors.config import ActorsConfig
 from actors.pool import ActorPool
 from actors.process import ActorProcess
-from gvz.errors import WorkerError
+from gvz.core.errors import WorkerError
 from gvz.transport.messages import EpisodeStats, Message, Ready
 
 

@@ -18,7 +18,7 @@ from fake_env import FRAME_SHAPE, config
 from actors import worker
 from actors.process import ActorProcess, log_path, read_log_tail
 from actors.worker import Worker
-from gvz.errors import WaitTimeoutError
+from gvz.core.errors import WaitTimeoutError
 from gvz.transport.broadcast import BroadcastWriter
 from gvz.transport.channel import Channel
 from gvz.transport.messages import ActorSpec, ParamsHeader, Ready, Stop

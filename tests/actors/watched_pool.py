@@ -8,7 +8,7 @@ from pathlib import Path
 from fake_env import Checker
 
 from actors.pool import ActorPool, PoolConfig
-from gvz import janitor
+from gvz.core import janitor
 from gvz.transport.messages import EpisodeStats, Fault, Message
 
 DEADLINE_S = 240.0

@@ -7,9 +7,9 @@ import jax
 import numpy as np
 import pytest
 
-from gvz.assemble import run_agent
-from gvz.config import RunConfig, config_to_dict
-from gvz.specs import EnvConfig
+from gvz.core.env_config import EnvConfig
+from gvz.run.assemble import run_agent
+from gvz.run.config import RunConfig, config_to_dict
 from learner import checkpoint
 from learner.config import AgentConfig
 

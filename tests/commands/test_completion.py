@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gvz.registry import discover
+from gvz.core.registry import discover
 
 # what bash does at Tab: the words, the cursor's, and the function that `complete` named for them
 ASK = """

@@ -6,7 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from gvz import cli, doctor
+from gvz import cli
+from gvz.run import doctor
 
 
 def test_json_has_a_line_for_every_check(capsys, monkeypatch):
@@ -33,7 +34,7 @@ def test_clean_removes_what_a_dead_run_left(capsys, monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setattr(doctor, "CHECKS", (doctor.check_leftovers,))
     segment = Path("/dev/shm") / f"gvz-test-doctor-{os.getpid()}"
-    code = f"from gvz import janitor; janitor.record('segment', {segment.name!r}); open({str(segment)!r}, 'w')"
+    code = f"from gvz.core import janitor; janitor.record('segment', {segment.name!r}); open({str(segment)!r}, 'w')"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
     assert cli.main(["doctor"]) == 0
     assert f"1: {segment.name}" in capsys.readouterr().out

@@ -10,8 +10,8 @@ import pytest
 
 from gvz import cli
 from gvz.commands.evaluate import run_tasks
-from gvz.evaluation.record import read_rows
-from gvz.selection import TaskSelection
+from gvz.evaluation.episode_log import read_rows
+from gvz.evaluation.selection import TaskSelection
 from gvz.tasks import named_tasks
 
 

@@ -7,7 +7,7 @@ import tempfile
 import pytest
 
 from gvz.cli import main
-from gvz.experiments import progress
+from gvz.experiments import inventory as progress
 from gvz.experiments.base import experiments
 from gvz.experiments.jobs import Slot
 from gvz.experiments.plan import Plan, write_plan

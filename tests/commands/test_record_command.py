@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from gvz import cli
-from gvz.evaluation.record import read_rows
+from gvz.evaluation.episode_log import read_rows
 from tests.tensorboard_events import read_events
 
 

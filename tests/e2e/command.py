@@ -13,8 +13,8 @@ import numpy as np
 import orbax.checkpoint as ocp
 import psutil
 
-from gvz import janitor
-from gvz.rundir import read_records
+from gvz.core import janitor
+from gvz.run.rundir import read_records
 
 SMALL = (
     "--actors.num-actors 2 --actors.games-per-actor 2 --env.frame-height 36 "
@@ -27,7 +27,7 @@ SMALL = (
 STARTED: list[subprocess.Popen[str]] = []
 """the runs of a test"""
 
-_PATCHED = "import sys, gvz.train, gvz.saver; {patch}; from gvz.launch import main; sys.exit(main())"
+_PATCHED = "import sys, gvz.run.train, gvz.run.saver; {patch}; from gvz.launch import main; sys.exit(main())"
 
 
 def launch(
@@ -37,7 +37,7 @@ def launch(
     environment: Mapping[str, str] | None = None,
     patch: str | None = None,
 ) -> subprocess.Popen[str]:
-    """Starts `python -m gvz.launch`; with a `patch` (such as gvz.saver.SAVE_RETRY_S = 0) that is done before it."""
+    """Starts `python -m gvz.launch`; with a `patch` (such as gvz.run.saver.SAVE_RETRY_S = 0) that is done before it."""
     program = ["-m", "gvz.launch"] if patch is None else ["-c", _PATCHED.format(patch=patch)]
     process = subprocess.Popen(
         [sys.executable, *program, "--config", config, *SMALL, "--run-dir", str(run), *extra],

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gvz import janitor
+from gvz.core import janitor
 
 sys.path.append(str(Path(__file__).parent))
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from gvz.experiments import progress
+from gvz.experiments import inventory as progress
 from gvz.experiments.plan import read_plan
 
 pytestmark = [pytest.mark.e2e, pytest.mark.engine, pytest.mark.timeout(1800)]

@@ -25,7 +25,9 @@ from command import (
 )
 from streams import check_streams
 
-from gvz import cli, doctor, janitor
+from gvz import cli
+from gvz.core import janitor
+from gvz.run import doctor
 from gvz.transport import ring
 from gvz.transport.ring import WriterState
 from gvz.transport.segment import HEADER_BYTES
@@ -211,9 +213,9 @@ def kill_and_wait(process: subprocess.Popen[str], children: list[psutil.Process]
     print(f"{len(children)} processes were gone after {time.monotonic() - start:.2f} s")
 
 
-@pytest.mark.parametrize("moment", ["actors.worker", "gvz.probe", "+viz_instance_id"])
+@pytest.mark.parametrize("moment", ["actors.worker", "gvz.engine.probe", "+viz_instance_id"])
 def test_a_launcher_killed_while_it_starts_leaves_nothing(tmp_path, moment):
-    cache = {"GVZ_CACHE_DIR": str(tmp_path / "cache")} if moment == "gvz.probe" else {}
+    cache = {"GVZ_CACHE_DIR": str(tmp_path / "cache")} if moment == "gvz.engine.probe" else {}
     process = launch(tmp_path / "run", environment=cache)
     wait_until(lambda: any(moment in arguments(p) for p in descendants(process)), moment)
     kill_and_wait(process, descendants(process))
@@ -262,7 +264,7 @@ def test_a_checkpoint_that_cannot_be_written_is_reported_tried_again_and_at_last
         (run / "policies" / str(step)).parent.mkdir(parents=True, exist_ok=True)
         (run / "policies" / str(step)).touch()
     flags = (*SYNC, "--learner.total-updates", "300")
-    code, err = finish(launch(run, *flags, patch="gvz.saver.SAVE_RETRY_S = 0.0"))
+    code, err = finish(launch(run, *flags, patch="gvz.run.saver.SAVE_RETRY_S = 0.0"))
     assert code == 1, err
     assert f"checkpoint failed, tried again within 0 s: checkpoint {run / 'policies' / '100'} could not be" in err
     assert 100 < checkpoint_steps(run / "policies")[0] < 200, "the first one was tried again soon"
@@ -304,7 +306,7 @@ def test_numbers_that_go_wrong_end_the_run_and_are_in_no_checkpoint(tmp_path):
 
 
 def test_a_learner_to_whom_nothing_comes_says_so(tmp_path):
-    process = launch(tmp_path / "run", patch="gvz.train.NO_RECORDS_TIMEOUT_S = 1.0")  # actors take longer to start
+    process = launch(tmp_path / "run", patch="gvz.run.train.NO_RECORDS_TIMEOUT_S = 1.0")  # actors take longer to start
     code, err = finish(process)
     assert code == 1, err
     message = err[err.rindex("error: ") :]

@@ -11,8 +11,8 @@ import pytest
 from command import SMALL
 
 from benchmarks import reliability, soak
-from gvz import janitor
-from gvz.errors import ConfigError
+from gvz.core import janitor
+from gvz.core.errors import ConfigError
 
 ROOT = Path(__file__).parent.parent.parent
 

@@ -7,7 +7,7 @@ import pytest
 
 from gvz.actions import action_buttons
 from gvz.evaluation.panel import ACCENT, BAR, GOOD, HEAD_HEIGHT, HEIGHT, WIDTH, Panel
-from gvz.evaluation.performance import SCREEN_HEIGHT, SCREEN_WIDTH, Moment
+from gvz.evaluation.playback import SCREEN_HEIGHT, SCREEN_WIDTH, Moment
 from gvz.evaluation.trained import Values
 from gvz.tasks import named_tasks, parse_task, scenarios
 

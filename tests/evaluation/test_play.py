@@ -8,12 +8,12 @@ import time
 import pytest
 
 import gvz.evaluation.play as play_module
+from gvz.core.env_config import EnvConfig
+from gvz.core.errors import EngineError, GvzError, WaitTimeoutError
 from gvz.env import DoomEnv
-from gvz.errors import EngineError, GvzError, WaitTimeoutError
-from gvz.evaluation.play import Entrant, Episode, episode_seed, play, play_episode
+from gvz.evaluation.episode_log import simple_player
+from gvz.evaluation.play import Episode, PlayerSpec, episode_seed, play, play_episode
 from gvz.evaluation.players import RandomPlayer, player_env
-from gvz.evaluation.record import simple_entrant
-from gvz.specs import EnvConfig
 from gvz.tasks import named_tasks
 
 TASK = "defend_the_center/fast_enemies"
@@ -35,7 +35,7 @@ def test_no_two_evaluation_episodes_share_a_seed():
 
 @pytest.mark.engine
 def test_rows_do_not_depend_on_how_episodes_are_shared_out():
-    random, scripted = simple_entrant("random", SMALL), simple_entrant("scripted", EnvConfig())
+    random, scripted = simple_player("random", SMALL), simple_player("scripted", EnvConfig())
     episodes = [Episode(TASK, 1), Episode(TASK, 0), Episode("defend_the_center/default", 0), Episode(TASK, 0, 7)]
     jobs = [(random, episode) for episode in episodes] + [(scripted, episodes[0])]
     here = list(play(jobs, num_workers=0))
@@ -51,11 +51,11 @@ def test_rows_do_not_depend_on_how_episodes_are_shared_out():
 
 @pytest.mark.engine
 def test_rewards_are_counted_by_the_profiles_weights_whatever_the_players_are():
-    entrants = [
-        simple_entrant("random", dataclasses.replace(SMALL, reward_weights=weights))
+    player_specs = [
+        simple_player("random", dataclasses.replace(SMALL, reward_weights=weights))
         for weights in ((), (("kill", 9.0),))
     ]
-    (_, default), (_, other) = play([(entrant, Episode(TASK, 0)) for entrant in entrants], num_workers=0)
+    (_, default), (_, other) = play([(player_spec, Episode(TASK, 0)) for player_spec in player_specs], num_workers=0)
     assert other == default
 
 
@@ -99,9 +99,9 @@ class Suicide:
 
 
 def test_a_worker_that_dies_is_an_error():
-    entrant = Entrant(make_player=Suicide, env=SMALL, identity={"player": "suicide"})
+    player_spec = PlayerSpec(make_player=Suicide, env=SMALL, identity={"player": "suicide"})
     with pytest.raises(GvzError, match="a worker process died; what it had not finished can be played again"):
-        list(play([(entrant, Episode(TASK, 0))], num_workers=1))
+        list(play([(player_spec, Episode(TASK, 0))], num_workers=1))
 
 
 class Sleeper:
@@ -113,7 +113,7 @@ class Sleeper:
 
 def test_workers_that_hang_are_killed_and_named(monkeypatch):
     monkeypatch.setattr(play_module, "EPISODE_TIMEOUT_S", 3.0)
-    entrant = Entrant(make_player=Sleeper, env=SMALL, identity={"player": "sleeper"})
+    player_spec = PlayerSpec(make_player=Sleeper, env=SMALL, identity={"player": "sleeper"})
     with pytest.raises(WaitTimeoutError, match=r"waited 3 s for one of 2 workers to end an episode; 3 are left"):
-        list(play([(entrant, Episode(TASK, number)) for number in range(3)], num_workers=2))
+        list(play([(player_spec, Episode(TASK, number)) for number in range(3)], num_workers=2))
     assert multiprocessing.active_children() == []

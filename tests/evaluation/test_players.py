@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from gvz.core.env_config import EnvConfig
 from gvz.env import DoomEnv
 from gvz.evaluation.play import play_episode
 from gvz.evaluation.players import SIMPLE_PLAYERS, FramePlayer, IdlePlayer, player_env
 from gvz.evaluation.scripted import SCRIPTS, SWEEPS
-from gvz.specs import EnvConfig
 from gvz.tasks import scenarios
 
 

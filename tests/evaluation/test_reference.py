@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 from gvz.evaluation.play import episode_seed
 from gvz.evaluation.reference import PAGE, PLAYERS, estimate, pack, read_reference, tables, with_tables
 from gvz.experiments.base import experiment_named

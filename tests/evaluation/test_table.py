@@ -1,6 +1,6 @@
 """The table that an evaluation ends with."""
 
-from gvz.evaluation.metrics import Estimate
+from gvz.evaluation.statistics import Estimate
 from gvz.evaluation.table import Score, score_lines, score_row, scores
 from gvz.tasks import named_tasks
 

@@ -9,18 +9,18 @@ import jax
 import numpy as np
 import pytest
 
-from gvz.assemble import run_agent
-from gvz.config import RunConfig, config_to_dict
+from gvz.core.env_config import EnvConfig
+from gvz.core.errors import CheckpointError, ConfigError
 from gvz.env import DoomEnv
-from gvz.errors import CheckpointError, ConfigError
-from gvz.evaluation.cast import Cast
-from gvz.evaluation.trained import TrainedPlayer, check_tasks, find_checkpoints, read_run_config, trained_entrant
-from gvz.rundir import RunDir
-from gvz.specs import EnvConfig
+from gvz.evaluation.choice import EpisodeChoice
+from gvz.evaluation.trained import TrainedPlayer, check_tasks, find_checkpoints, read_run_config, trained_player
+from gvz.run.assemble import run_agent
+from gvz.run.config import RunConfig, config_to_dict
+from gvz.run.rundir import RunDir
 from gvz.tasks import named_tasks, parse_task
 from learner import checkpoint
 from learner.config import AgentConfig
-from learner.policy import flatten_params
+from learner.export import flatten_params
 
 CONFIG = RunConfig(
     name="small",
@@ -75,7 +75,7 @@ def test_a_checkpoint_that_is_not_there_is_an_error(tmp_path, run):
 
 
 def test_rows_say_which_parameters_played(run):
-    old, new = (trained_entrant(run, CONFIG, step).identity for step in (10, 20))
+    old, new = (trained_player(run, CONFIG, step).identity for step in (10, 20))
     assert (new["player"], new["run"], new["run_seed"], new["num_updates"]) == ("small/seed_7@20", "small", 7, 20)
     assert old["params"] != new["params"]
     flat = np.asarray(flatten_params(write_policy(run, CONFIG, 20)))
@@ -88,7 +88,7 @@ def test_a_policy_acts_greedily_on_the_stack_it_was_trained_on(run, conditioned)
     config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, task_conditioned=conditioned))
     (run / "config.json").write_text(json.dumps(config_to_dict(config)))
     params, agent = write_policy(run, config, 30), run_agent(config)
-    player = pickle.loads(pickle.dumps(trained_entrant(run, config, 30))).make_player()
+    player = pickle.loads(pickle.dumps(trained_player(run, config, 30))).make_player()
     task = config.resolved_tasks()[1]
     env = DoomEnv(task, config.env)
     frame, info = env.reset(seed=1)
@@ -136,8 +136,8 @@ def test_the_reward_weights_of_a_run_are_shown_in_its_own_scenario_alone(run):
     config = dataclasses.replace(CONFIG, env=env)
     (run / "config.json").write_text(json.dumps(config_to_dict(config)))
     write_policy(run, config, 5)
-    its_own, _ = Cast(run_dir=run, checkpoint="5").resolve()
-    other, _ = Cast(run_dir=run, checkpoint="5", task="health_gathering/default").resolve()
+    its_own, _ = EpisodeChoice(run_dir=run, checkpoint="5").resolve()
+    other, _ = EpisodeChoice(run_dir=run, checkpoint="5", task="health_gathering/default").resolve()
     assert (its_own.env, other.env) == (env, dataclasses.replace(env, reward_weights=()))
 
 
@@ -161,8 +161,8 @@ def test_an_agents_file_is_executed_only_if_it_is_named(tmp_path, run):
     with pytest.raises(ConfigError, match="its agent is a Python file"):
         TrainedPlayer(run, 20)
     assert not mark.exists()
-    entrant = trained_entrant(run, read_run_config(run, source), 20)
-    assert pickle.loads(pickle.dumps(entrant)).make_player().values is None
+    player_spec = trained_player(run, read_run_config(run, source), 20)
+    assert pickle.loads(pickle.dumps(player_spec)).make_player().values is None
     assert mark.exists()
 
 
@@ -170,14 +170,14 @@ def test_a_damaged_policy_is_an_error_that_names_the_file(run):
     file = next(f for f in (run / "policies" / "20" / "arrays").rglob("*") if f.is_file() and f.stat().st_size > 100)
     file.write_bytes(file.read_bytes()[:-9])
     with pytest.raises(CheckpointError, match=r"policies/20/.*: cut short; evaluate another with --checkpoints"):
-        trained_entrant(run, CONFIG, 20)
-    assert trained_entrant(run, CONFIG, 10).identity["num_updates"] == 10
+        trained_player(run, CONFIG, 20)
+    assert trained_player(run, CONFIG, 10).identity["num_updates"] == 10
 
 
 def test_a_policy_of_another_configuration_is_an_error(run):
     wider = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, hidden_units=9))
     with pytest.raises(CheckpointError, match="it belongs to another configuration"):
-        trained_entrant(run, wider, 20)
+        trained_player(run, wider, 20)
 
 
 def test_an_agent_without_distributions_has_values_alone(run):

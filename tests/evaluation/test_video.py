@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 from gvz.evaluation.video import check_video_file, write_video
 
 GREYS = [0, 60, 120, 180, 240]

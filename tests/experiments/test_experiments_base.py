@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 from gvz.experiments.base import SCENARIOS, Experiment, TrainingRun, experiment_named, experiments
 from gvz.tasks import named_tasks, parse_task
 

@@ -2,13 +2,13 @@
 
 import pytest
 
-from gvz.config import config_to_dict
-from gvz.experiments import progress
+from gvz.experiments import inventory as progress
 from gvz.experiments.base import experiments
 from gvz.experiments.jobs import PlayerJob, RunJob, training_flags
 from gvz.experiments.plan import Evaluation
 from gvz.experiments.scale import scaled
 from gvz.launch import parse
+from gvz.run.config import config_to_dict
 
 EVALUATION = Evaluation(tasks=("defend_the_center/default",), episodes=2)
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 from gvz.experiments.base import experiments
 from gvz.experiments.plan import Evaluation, Plan, parse_shard, read_plan, shard, write_plan
 

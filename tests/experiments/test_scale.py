@@ -2,10 +2,10 @@
 
 import pytest
 
-from gvz.config import load_config
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 from gvz.experiments.base import experiments
 from gvz.experiments.scale import scaled, scaled_settings
+from gvz.run.config import load_config
 
 FULL = experiments()["training_set_size"]
 

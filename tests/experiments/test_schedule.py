@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from gvz.errors import ConfigError
-from gvz.experiments import progress
+from gvz.core.errors import ConfigError
+from gvz.experiments import inventory as progress
 from gvz.experiments.jobs import Command, Outlook, RunningJob, Slot
 from gvz.experiments.schedule import gpus, make_slots, run_jobs
 

@@ -1,7 +1,7 @@
 """The long form: coverage-guided fuzzing of every parser, `python -m tests.fuzz` (`make fuzz`).
 
 Each target has a process of its own under libFuzzer, by way of atheris; the record of them all is one JSON file.
-Imports atheris's version, tyro, gvz.{janitor,machine}.
+Imports atheris's version, tyro, gvz.core.janitor, gvz.run.machine.
 """
 
 import base64
@@ -19,7 +19,8 @@ from typing import Any
 
 import tyro
 
-from gvz import janitor, machine
+from gvz.core import janitor
+from gvz.run import machine
 from tests.fuzz.targets import TARGETS
 
 START_S = 300

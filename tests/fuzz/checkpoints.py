@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from gvz.errors import CheckpointError
+from gvz.core.errors import CheckpointError
 from learner import checkpoint
 from tests.fuzz.files import JSON_WORDS
 from tests.fuzz.target import Target

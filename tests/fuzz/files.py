@@ -13,19 +13,19 @@ from pathlib import Path
 import pytest
 
 from actors.config import MAX_LANES
-from gvz import janitor
 from gvz.commands.export import run_table, write_table
-from gvz.config import config_from_dict, config_to_dict, differences, load_config
-from gvz.errors import ConfigError, ResumeError
-from gvz.evaluation.frame import OPTIONAL, REQUIRED, collect_evaluations
-from gvz.evaluation.record import read_rows, rows_of, simple_entrant
+from gvz.core import janitor
+from gvz.core.env_config import EnvConfig
+from gvz.core.errors import ConfigError, ResumeError
+from gvz.evaluation.dataset import OPTIONAL, REQUIRED, collect_evaluations
+from gvz.evaluation.episode_log import read_rows, rows_of, simple_player
 from gvz.evaluation.trained import read_run_config
+from gvz.experiments.inventory import last_update, missing_player_episodes
 from gvz.experiments.plan import Evaluation, read_plan, write_plan
-from gvz.experiments.progress import last_update, missing_player_episodes
 from gvz.reports.results import read_results
 from gvz.reports.run_section import run_sections
-from gvz.rundir import RECORD_FILES, RECORDS_SCHEMA, RunDir, read_records
-from gvz.specs import EnvConfig
+from gvz.run.config import config_from_dict, config_to_dict, differences, load_config
+from gvz.run.rundir import RECORD_FILES, RECORDS_SCHEMA, RunDir, read_records
 from tests.fuzz.target import Target
 
 RESULTS = Path(__file__).parents[2] / "results"
@@ -105,7 +105,7 @@ def records(directory: Path) -> Target:
 def evaluation_records(directory: Path) -> Target:
     """Evaluation episodes: to be shown, and to be added to."""
     file = directory / "evaluation.jsonl"
-    entrant = simple_entrant("random", EnvConfig())
+    player_spec = simple_player("random", EnvConfig())
 
     def run(data: bytes) -> bool:
         file.write_bytes(data)
@@ -123,7 +123,7 @@ def evaluation_records(directory: Path) -> Target:
         kept = file.read_bytes()
         assert data.startswith(kept)
         assert kept[-1:] in (b"", b"\n")
-        assert len(rows_of(entrant, rows)) <= len(rows)
+        assert len(rows_of(player_spec, rows)) <= len(rows)
         return True
 
     seeds = [_examples("evaluation"), _examples("evaluation_random"), _examples("evaluation")[:-9]]

@@ -8,7 +8,7 @@ import re
 import struct
 from pathlib import Path
 
-from gvz.errors import AcsError, WadError
+from gvz.core.errors import AcsError, WadError
 from gvz.wad.acs import compile_acs
 from gvz.wad.acs.lexer import tokenize
 from gvz.wad.decorate import declared_actors

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gvz.errors import TransportError, WaitTimeoutError
+from gvz.core.errors import TransportError, WaitTimeoutError
 from gvz.transport import broadcast
 from gvz.transport.broadcast import BroadcastReader, BroadcastWriter
 from gvz.transport.channel import MAX_MESSAGE_BYTES, Channel

@@ -13,9 +13,9 @@ from wandb.proto.wandb_internal_pb2 import Record
 TWO_STARTS = """
 import sys
 from pathlib import Path
-from gvz.config import load_config
-from gvz.rundir import RunDir
-from gvz.telemetry import Telemetry
+from gvz.run.config import load_config
+from gvz.run.rundir import RunDir
+from gvz.run.telemetry import Telemetry
 with RunDir(Path(sys.argv[1])) as run:
     run.write_config(load_config("rainbow_quick"))
     for num_updates in (10, 20):

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gvz.errors import ConfigError
-from gvz.registry import discover
+from gvz.core.errors import ConfigError
+from gvz.core.registry import discover
 from learner.agents.base import Agent, AgentSpec, epsilon_greedy, make_agent
 from learner.config import AgentConfig
 from learner.networks import add_noise

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gvz.errors import CheckpointError, WaitTimeoutError
+from gvz.core.errors import CheckpointError, WaitTimeoutError
 from learner import checkpoint
 from learner.agents.base import AgentSpec, make_agent
 from learner.config import AgentConfig

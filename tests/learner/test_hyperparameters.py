@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from gvz.config import RunConfig, configs_directory, load_config
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
+from gvz.run.config import RunConfig, configs_directory, load_config
 from learner.config import AgentConfig, LearnerConfig, ReplayConfig
 
 

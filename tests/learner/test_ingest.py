@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from gvz.errors import TransportError
+from gvz.core.errors import TransportError
 from gvz.transport.messages import STEP_DTYPE, StepBlock
 from gvz.transport.ring import RingReader, RingWriter
 from learner import replay

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 from learner.config import AgentConfig
 from learner.networks import NoisyDense, QNetwork, add_noise, check_fits, draw_noise, initial_logits
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 from gvz.transport.messages import StepBlock
 from learner import replay, sum_tree
 from learner.ingest import Ingest

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gvz.errors import NonFiniteError
+from gvz.core.errors import NonFiniteError
 from learner import losses, replay, sum_tree, train_step
 from learner.agents.base import AgentLoss, AgentSpec, Evaluation, make_agent
 from learner.config import AgentConfig, LearnerConfig, ReplayConfig

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from gvz.engine import Engine
+from gvz.engine.engine import Engine
 from gvz.env import DoomEnv
 
 pytestmark = pytest.mark.engine

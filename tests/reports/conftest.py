@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from gvz.config import config_to_dict, load_config
 from gvz.experiments.base import TrainingRun
+from gvz.experiments.inventory import run_directory
 from gvz.experiments.plan import Plan, write_plan
-from gvz.experiments.progress import run_directory
+from gvz.run.config import config_to_dict, load_config
 from gvz.tasks import parse_task
 
 MISSING = "rainbow_4task/defend_the_center/train8/seed_1111"

@@ -7,7 +7,7 @@ import pytest
 from gvz.experiments.base import experiment_named
 from gvz.experiments.plan import Plan
 from gvz.reports.experiment_section import aggregate_table, comparison_table, result_table
-from gvz.reports.results import Asked, read_results
+from gvz.reports.results import PlannedExperiment, read_results
 from gvz.tasks import parse_task
 
 SEEDS = {1111: 0.0, 2222: 3.0, 3333: 6.0}
@@ -92,7 +92,7 @@ def test_an_experiment_without_any_results_is_a_table_of_missing_cells(tmp_path)
     experiment = experiment_named("algorithm_comparison")
     (tmp_path / "random.jsonl").touch()
     results = read_results([tmp_path])
-    asked = Asked(results=tmp_path, experiment=dataclasses.replace(experiment, published={}), scale=1.0)
+    asked = PlannedExperiment(results=tmp_path, experiment=dataclasses.replace(experiment, published={}), scale=1.0)
     rows = result_table(results, asked).rows
     assert len(rows) == 5
     assert {cell.text for row in rows for cell in row[2:]} == {"-"}

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 from gvz.reports.page import make_report
 
 FIGURES = {

@@ -7,7 +7,7 @@ import shutil
 import polars as pl
 import pytest
 
-from gvz.errors import ConfigError
+from gvz.core.errors import ConfigError
 from gvz.experiments.plan import Plan
 from gvz.reports.results import EACH, read_results, training_time_s
 

@@ -5,7 +5,7 @@ import io
 
 import pytest
 
-from gvz.evaluation.metrics import Estimate
+from gvz.evaluation.statistics import Estimate
 from gvz.reports.document import Block, Document, Figure, Link, Section, Table, missing, ours, theirs, words
 from gvz.reports.write import to_csv, to_html, to_latex, to_markdown, write_document
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from gvz.errors import AcsError, ResourceError, TaskError, WadError
+from gvz.core.errors import AcsError, ResourceError, TaskError, WadError
 from gvz.scenarios.base import Attribute, Content, Task, Textures, Thing, Uniform
 from gvz.scenarios.compiler import acs_value, build_wad, compile_task, map_source, task_content
 from gvz.tasks import named_tasks, parse_task, scenario_named

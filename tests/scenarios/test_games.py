@@ -10,7 +10,7 @@ from collections import Counter
 
 import pytest
 
-from gvz.engine import Engine, EngineConfig
+from gvz.engine.engine import Engine, EngineConfig
 from gvz.scenarios.base import BOOKKEEPING
 from gvz.scenarios.compiler import compile_task
 from gvz.tasks import named_tasks, parse_task, scenarios

@@ -10,12 +10,12 @@ from typing import get_args
 import numpy as np
 import pytest
 
+from gvz.core.env_config import EnvConfig, Profile, SimplePlayer
+from gvz.core.errors import ConfigError
 from gvz.env import DoomEnv
-from gvz.errors import ConfigError
 from gvz.evaluation.players import SIMPLE_PLAYERS, player_env
 from gvz.scenarios.base import Scenario
 from gvz.scenarios.rewards import Pace, Reward, living, return_range
-from gvz.specs import EnvConfig, Profile, SimplePlayer
 from gvz.tasks import scenario_named, scenarios
 
 ALIVE = {"KILLCOUNT": 0, "PLAYER_KILLS": 0, "AMMO2": 26, "HEALTH": 100, "POSITION_X": 0, "POSITION_Y": 0}

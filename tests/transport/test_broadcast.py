@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvz.errors import TransportError, WaitTimeoutError
+from gvz.core.errors import TransportError, WaitTimeoutError
 from gvz.transport import broadcast
 from gvz.transport.broadcast import BroadcastReader, BroadcastWriter, broadcast_bytes
 from gvz.transport.messages import ParamsHeader

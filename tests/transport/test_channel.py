@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvz.errors import TransportError, WaitTimeoutError
+from gvz.core.errors import TransportError, WaitTimeoutError
 from gvz.transport.channel import MAX_MESSAGE_BYTES, Channel
 from gvz.transport.messages import Fault, Ready, Stop, encode
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvz.errors import TransportError
+from gvz.core.errors import TransportError
 from gvz.transport.messages import (
     SCHEMA_VERSION,
     STEP_DTYPE,

@@ -16,7 +16,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from gvz.errors import TransportError, WaitTimeoutError
+from gvz.core.errors import TransportError, WaitTimeoutError
 from gvz.transport.messages import STEP_DTYPE, StepBlock
 from gvz.transport.ring import RingReader, RingWriter, WriterState, ring_bytes
 from gvz.transport.segment import HEADER_BYTES

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvz.errors import ResourceError, TransportError
+from gvz.core.errors import ResourceError, TransportError
 from gvz.transport.segment import HEADER_BYTES, Segment, hash_layout
 
 PAYLOAD, LAYOUT = 1000, hash_layout("test", 1)

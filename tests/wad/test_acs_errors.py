@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from gvz.errors import AcsError
+from gvz.core.errors import AcsError
 from gvz.wad.acs import compile_acs
 from gvz.wad.acs.cursor import MAX_NESTING
 

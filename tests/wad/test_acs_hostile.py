@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvz.errors import AcsError
+from gvz.core.errors import AcsError
 from gvz.wad.acs import compile_acs
 from gvz.wad.acs.lexer import tokenize
 from gvz.wad.lumps import read_maps, read_wad

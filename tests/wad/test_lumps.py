@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvz.errors import WadError
+from gvz.core.errors import WadError
 from gvz.wad.lumps import ENTRY, HEADER, Lump, read_maps, read_wad, write_map_wad, write_wad
 from gvz.wad.stock import scenario_wad
 

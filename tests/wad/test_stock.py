@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from gvz.errors import WadError
+from gvz.core.errors import WadError
 from gvz.wad.stock import engine_directory, scenario_wad, stock_actors, stock_editor_numbers, stock_sprites
 
 

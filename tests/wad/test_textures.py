@@ -4,7 +4,7 @@ import struct
 
 import pytest
 
-from gvz.errors import WadError
+from gvz.core.errors import WadError
 from gvz.wad.lumps import Lump, read_maps, read_wad
 from gvz.wad.stock import scenario_wad, stock_textures
 from gvz.wad.textures import check_textures, flats, used_textures, wall_textures

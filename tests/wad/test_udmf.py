@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvz.errors import WadError
+from gvz.core.errors import WadError
 from gvz.wad.lumps import read_maps, read_wad
 from gvz.wad.stock import engine_directory, scenario_wad
 from gvz.wad.udmf import Block, UdmfMap, is_inside, make_thing, parse_textmap, write_textmap

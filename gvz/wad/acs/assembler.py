@@ -1,4 +1,4 @@
-"""Instructions to bytes, in ACS's compact encoding. Imports the standard library only."""
+"""Instructions to bytes, in ACS's compact encoding."""
 
 import struct
 

@@ -1,7 +1,7 @@
 """The compiled object file: the layout of a BEHAVIOR lump as ACC's hybrid format has it.
 
-Hybrid means that old tools see a file without strings whose scripts do nothing, and the engine finds the real
-tables as chunks before the old directory. Imports the standard library only.
+Hybrid means that old tools see a file without strings whose scripts do nothing, and the engine finds the real tables as
+chunks before the old directory.
 """
 
 import struct

@@ -1,4 +1,4 @@
-"""Declarations to an object file; `compile_acs`. Imports gvz.wad.acs and gvz.wad.stock."""
+"""Declarations to an object file; `compile_acs`."""
 
 from collections.abc import Collection
 

@@ -1,6 +1,6 @@
-"""Expressions whose value must be known when the source is compiled. Imports gvz.wad.acs."""
+"""Expressions whose value must be known when the source is compiled."""
 
-from gvz.errors import AcsError
+from gvz.core.errors import AcsError
 from gvz.wad.acs.lexer import Position, error
 from gvz.wad.acs.symbols import ConstantSymbol, Unit
 from gvz.wad.acs.syntax import Binary, Expression, Name, Number, String, Unary

@@ -1,9 +1,9 @@
-"""A cursor over tokens, with the errors of a parser. Imports gvz.errors and the lexer."""
+"""A cursor over tokens, with the errors of a parser."""
 
 from collections.abc import Callable
 from typing import TypeVar
 
-from gvz.errors import AcsError
+from gvz.core.errors import AcsError
 from gvz.wad.acs.lexer import Position, Token, error
 
 MAX_NESTING = 64

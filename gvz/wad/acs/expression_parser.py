@@ -1,4 +1,4 @@
-"""Tokens to the syntax trees of expressions. Imports the cursor, the lexer and syntax."""
+"""Tokens to the syntax trees of expressions."""
 
 from gvz.wad.acs.cursor import KEYWORDS, Cursor
 from gvz.wad.acs.syntax import Binary, Call, Expression, Increment, Name, Number, String, Unary

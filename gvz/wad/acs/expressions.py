@@ -1,4 +1,4 @@
-"""Expressions, assignments and calls to instructions. Imports gvz.wad.acs."""
+"""Expressions, assignments and calls to instructions."""
 
 from gvz.wad.acs.classes import USED_AS_CLASS
 from gvz.wad.acs.constant_expressions import number_if_constant, refuse_zero_divisor

@@ -1,10 +1,10 @@
-"""ACS source text cut into tokens, each with its line and column. Imports gvz.errors only."""
+"""ACS source text cut into tokens, each with its line and column."""
 
 import re
 from dataclasses import dataclass
 from typing import Literal
 
-from gvz.errors import AcsError
+from gvz.core.errors import AcsError
 
 TokenKind = Literal["name", "number", "string", "symbol", "end"]
 

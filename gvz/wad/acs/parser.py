@@ -1,7 +1,4 @@
-"""Tokens to the syntax trees of declarations and statements. Knows the grammar of ACS, but no name's meaning.
-
-Imports gvz.wad.acs's cursor, expression parser, lexer and syntax.
-"""
+"""Tokens to the syntax trees of declarations and statements. Knows the grammar of ACS, but no name's meaning."""
 
 from gvz.wad.acs.cursor import KEYWORDS, SCRIPT_TYPES, TYPES, Cursor
 from gvz.wad.acs.expression_parser import parse_call, parse_expression, parse_parenthesized, parse_target

@@ -1,4 +1,4 @@
-"""Statements to instructions. Imports gvz.wad.acs."""
+"""Statements to instructions."""
 
 from gvz.wad.acs.assembler import Label
 from gvz.wad.acs.constant_expressions import constant, constant_number

@@ -1,4 +1,4 @@
-"""What is known of a source while it is compiled: names, strings, the script under way. Imports gvz.wad.acs."""
+"""What is known of a source while it is compiled: names, strings, the script under way."""
 
 import difflib
 from dataclasses import dataclass, field

@@ -1,0 +1,144 @@
+"""The vocabulary of sizes that game, actors and learner share, and the check of a field's type."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from gvz.core.errors import ConfigError
+
+ActionSet = Literal["buttons", "combinations", "unified"]
+Profile = Literal["thesis", "levdoom"]
+Buffer = Literal["depth", "labels", "automap"]
+Interpolation = Literal["linear", "area"]
+LABEL_CLASSES = (
+    *("wall", "plane", "weapon", "enemy", "projectile"),
+    *("kit", "poison", "scenery", "effect", "other"),
+)
+"""What a pixel of the buffer `labels` shows, by number: 0 walls and the HUD; 1 floors and ceilings; 2 the agent's
+own weapon; 3 living enemies; 4 their missiles and fire; 5 what heals; 6 vials of poison; 7 decorations, lights and
+corpses; 8 puffs, smoke and blood; 9 anything that is in none of our scenarios. A number never changes its meaning."""
+SimplePlayer = Literal["random", "idle", "sweep", "scripted"]
+"""who plays without training"""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class EnvConfig:
+    """How a task is rendered, stepped and rewarded. Sizes in pixels, `frame_skip` in game tics.
+
+    `reward_weights` may also be a mapping. It is kept as pairs, sorted by name.
+
+    Source: thesis 3.1.1 and 5.1 (84x84 RGB, frame skip 4). Differs: rendered at 256x144 instead of 640x480,
+    the same 16:9 field of view of 108 degrees at a fifth of the cost.
+    """
+
+    frame_height: int = 84
+    """height of an observation frame, pixels"""
+    frame_width: int = 84
+    """width of an observation frame, pixels"""
+    grayscale: bool = False
+    """one luminance channel instead of RGB"""
+    frame_skip: int = 4
+    """game tics an action is held; one decision = frame_skip frames"""
+    render_width: int = 256
+    """width the engine renders, pixels (must be a ViZDoom screen resolution with render_height)"""
+    render_height: int = 144
+    """height the engine renders, pixels"""
+    action_set: ActionSet = "buttons"
+    """buttons: one button held an action; combinations: all non-contradictory sets; unified: one space for all"""
+    profile: Profile = "thesis"
+    """whose numbers where they differ: the thesis's text, or LevDoom's maps and settings"""
+    interpolation: Interpolation = "linear"
+    """how the rendered screen is shrunk; linear is ten times cheaper and loses no enemy (see observation.py)"""
+    buffers: tuple[Buffer, ...] = ()
+    """more than the screen: observations become a dict of `screen` and these"""
+    reward_weights: tuple[tuple[str, float], ...] = ()
+    """reward components and their weights, in place of the profile's: kill 2 death 0"""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.reward_weights, Mapping):
+            object.__setattr__(self, "reward_weights", tuple(self.reward_weights.items()))
+        check_types(self, "env")
+        object.__setattr__(self, "reward_weights", tuple(sorted(self.reward_weights)))
+        names = [name for name, _ in self.reward_weights]
+        if len(set(names)) < len(names):
+            raise ConfigError(f"env.reward_weights: got {' '.join(names)}, want each component once")
+        for name, low, high in (
+            ("frame_height", 8, 1080),
+            ("frame_width", 8, 1920),
+            ("frame_skip", 1, 35),
+            ("render_width", 160, 1920),
+            ("render_height", 120, 1200),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ConfigError(f"env.{name}: got {value}, want {low}..{high}")
+
+    @property
+    def channels(self) -> int:
+        return 1 if self.grayscale else 3
+
+    @property
+    def frame_shape(self) -> tuple[int, int, int]:
+        """(H, W, C) of one observation frame, uint8."""
+        return (self.frame_height, self.frame_width, self.channels)
+
+
+_LARGEST_EXACT = 2**53
+"""integers up to this are floating-point numbers, too"""
+
+
+def typed(kind: Any, value: Any, where: str) -> Any:
+    """`value` as the type `kind`, which a field of a configuration is annotated with.
+
+    A number of numpy becomes Python's, an integer a float where a float is wanted, a list a tuple, a string a path.
+    Nothing else is converted: True is no 1, and 4.0 no 4.
+
+    Args:
+        kind: bool, int, float, str, Path, a Literal, a tuple, or one of these or None.
+        value: anything.
+        where: the field, for the error.
+
+    Raises:
+        ConfigError: it is of another type, none of the Literal's values, or not finite.
+    """
+    origin, args = get_origin(kind), get_args(kind)
+    if type(None) in args:
+        return None if value is None else typed(next(a for a in args if a is not type(None)), value, where)
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise ConfigError(f"{where}: got {value!r}, want a list")
+        if args[-1] is ...:
+            return tuple(typed(args[0], item, where) for item in value)
+        if len(value) != len(args):
+            raise ConfigError(f"{where}: got {value!r}, want {' and '.join(arg.__name__ for arg in args)}")
+        return tuple(typed(arg, item, f"{where}, {value!r}") for arg, item in zip(args, value, strict=True))
+    if origin is Literal:
+        if not any(type(value) is type(arg) and value == arg for arg in args):  # True and 1.0 equal 1, and are not it
+            raise ConfigError(f"{where}: got {value!r}, want one of {', '.join(map(str, args))}")
+        return value
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    is_number = issubclass(type(value), Real) and type(value) is not bool
+    is_integer = is_number and issubclass(type(value), Integral)
+    if kind is int and is_integer:
+        return int(value)
+    if kind is float and is_number:
+        if (is_integer and abs(value) > _LARGEST_EXACT) or not math.isfinite(value):
+            raise ConfigError(f"{where}: got {value}, want a finite float")
+        return float(value)
+    if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
+        raise ConfigError(f"{where}: got {value!r}, want {kind.__name__}")
+    return value
+
+
+def check_types(config: Any, prefix: str) -> None:
+    """Gives each field of a frozen dataclass the type that it is annotated with; for its `__post_init__`.
+
+    Raises:
+        ConfigError: as `typed`; names the field behind `prefix`.
+    """
+    for name, kind in get_type_hints(type(config)).items():
+        object.__setattr__(config, name, typed(kind, getattr(config, name), f"{prefix}.{name}"))

@@ -1,0 +1,73 @@
+"""Every error a caller may handle.
+
+Arguments that are simply wrong raise `ValueError`; a broken own invariant is an `assert`. Everything else that
+can go wrong at run time has a class here, and its message says what, where, got, wanted, and what to do.
+"""
+
+
+class GvzError(Exception):
+    """Base of all errors of this project."""
+
+    exit_code = 1
+    """of a command that ends with this error: 2 if what the user gave cannot be run, else 1"""
+
+
+class ConfigError(GvzError, ValueError):
+    """A configuration that cannot be run: names the field, the value, what is allowed."""
+
+    exit_code = 2
+
+
+class TaskError(GvzError, ValueError):
+    """An unknown scenario, task or attribute, or a set of attributes that cannot be combined."""
+
+    exit_code = 2
+
+
+class AcsError(GvzError, ValueError):
+    """ACS source text that cannot be compiled. Carries the 1-based `line` and `column`."""
+
+    def __init__(self, message: str, *, line: int, column: int):
+        super().__init__(f"line {line}, column {column}: {message}")
+        self.line = line
+        self.column = column
+
+
+class WadError(GvzError, ValueError):
+    """Bytes that are not the WAD, lump or UDMF text they should be."""
+
+
+class EngineError(GvzError):
+    """The ViZDoom engine did not start, died, or stopped answering."""
+
+
+class TransportError(GvzError):
+    """A shared-memory segment is not what it should be (schema, layout, size, sequence)."""
+
+
+class WaitTimeoutError(GvzError, TimeoutError):
+    """A wait reached its time-out. The message says who waited for whom, for what, how long."""
+
+
+class WorkerError(GvzError):
+    """An actor failed for good: its restart budget is spent. Carries the last log lines in its message."""
+
+
+class ResourceError(GvzError):
+    """The run does not fit this machine (memory, /dev/shm, disk): says how much is needed and how to get it."""
+
+    exit_code = 2
+
+
+class CheckpointError(GvzError):
+    """A checkpoint cannot be written or read."""
+
+
+class ResumeError(GvzError):
+    """A run directory cannot be continued with this configuration: names every differing field."""
+
+    exit_code = 2
+
+
+class NonFiniteError(GvzError):
+    """A loss, gradient or parameter is NaN or infinite: the run stops and the batch is saved."""

@@ -1,0 +1,120 @@
+"""An evaluation episode, moment by moment, to be shown or filmed.
+
+What a player sees must not depend on how large the picture is: so the episode is played in two games side by side, the
+player's own, and one that draws large and takes the same actions, tic by tic. The engine is deterministic; should
+the two ever part, that is an error.
+"""
+
+import dataclasses
+from collections.abc import Generator
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gvz.core.errors import EngineError
+from gvz.env import DoomEnv
+from gvz.evaluation.play import Episode, PlayerSpec, episode_seed
+from gvz.evaluation.trained import TrainedPlayer, Values
+
+SCREEN_WIDTH, SCREEN_HEIGHT = 800, 450
+"""of the large game's screen, pixels; a resolution of ViZDoom's"""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Moment:
+    """What there is to be seen at a game tic."""
+
+    screen: np.ndarray
+    """uint8[SCREEN_HEIGHT, SCREEN_WIDTH, 3]"""
+    decided: bool
+    """the player has just decided, or the episode has just begun: `action`, `values` are new"""
+    action: int | None
+    """that is held; None before the first"""
+    values: Values | None
+    """what a policy thought of its actions when it decided"""
+    reward: float
+    """since the episode's start"""
+    reward_components: dict[str, float]
+    """likewise"""
+    score: float
+    frames: int
+    """tics since the episode's start"""
+    terminated: bool
+    truncated: bool
+
+
+def perform(player_spec: PlayerSpec, episode: Episode) -> Generator[Moment, None, None]:
+    """Plays an episode: the first moment is its start, then comes one a tic.
+
+    Raises:
+        EngineError: an engine died, or the two games parted.
+    """
+    seed = episode_seed(*episode)
+    player = player_spec.make_player()
+    large = dataclasses.replace(
+        player_spec.env, frame_skip=1, render_width=SCREEN_WIDTH, render_height=SCREEN_HEIGHT, buffers=()
+    )
+    with (
+        closing(DoomEnv(episode.task, player_spec.env, recycle_episodes=player_spec.recycle_episodes)) as env,
+        closing(DoomEnv(episode.task, large, render_mode="rgb_array")) as stage,
+    ):
+        observation, info = env.reset(options={"episode_seed": seed})
+        stage_info = stage.reset(options={"episode_seed": seed})[1]
+        player.begin(env, observation, info, seed)
+        rewards: dict[str, float] = dict.fromkeys(info["reward_components"], 0.0)
+        yield _moment(stage, stage_info, rewards, decided=True)
+        ended = False
+        while not ended:
+            action = np.int64(player.act())
+            values = player.values if isinstance(player, TrainedPlayer) else None
+            observation, _, terminated, truncated, info = env.step(action)
+            ended = terminated or truncated
+            before = rewards
+            rewards = {name: before[name] + value for name, value in info["reward_components"].items()}
+            for tic in range(player_spec.env.frame_skip):
+                _, _, stage_terminated, stage_truncated, stage_info = stage.step(action)
+                stage_ended = stage_terminated or stage_truncated
+                done = (stage_info["episode_frames"], stage_ended) == (info["episode_frames"], ended)
+                yield _moment(
+                    stage,
+                    stage_info,
+                    rewards if done else before,
+                    decided=tic == 0,
+                    action=int(action),
+                    values=values,
+                    terminated=stage_terminated,
+                    truncated=stage_truncated,
+                )
+                if done or stage_ended:
+                    break
+            _check_together(episode, info, stage_info)
+            player.observe(observation, info)
+
+
+def _moment(stage: DoomEnv, info: dict[str, Any], rewards: dict[str, float], **fields: Any) -> Moment:
+    screen = stage.render()
+    assert screen is not None, "the stage renders"
+    defaults: dict[str, Any] = {"action": None, "values": None, "terminated": False, "truncated": False}
+    return Moment(
+        screen=screen,
+        reward=sum(rewards.values()),
+        reward_components=rewards,
+        score=float(info["score"]),
+        frames=int(info["episode_frames"]),
+        **{**defaults, **fields},
+    )
+
+
+def _check_together(episode: Episode, info: dict[str, Any], stage_info: dict[str, Any]) -> None:
+    """Raises EngineError unless both games are at the same point."""
+    where = f"{episode.task}, episode {episode.episode}, tic {info['episode_frames']}"
+    if info["engine_crash"] or stage_info["engine_crash"]:
+        raise EngineError(f"{where}: the engine died; try again")
+    for name in ("episode_frames", "score", "variables"):
+        if info[name] != stage_info[name]:
+            raise EngineError(
+                f"{where}: the game that draws parted from the player's: {name}: got {stage_info[name]}, "
+                f"want {info[name]}"
+            )

@@ -1,0 +1,1 @@
+"""Tier 3. A training run: its configuration, its loop, its records, its checkpoints."""

@@ -1,0 +1,229 @@
+"""What a machine must have for a run, checked one by one: `gvz doctor`.
+
+The engine and jax are tried in sub-processes, since a broken one can end the process that tries it.
+"""
+
+import dataclasses
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import Literal
+
+import psutil
+
+from gvz.core import janitor
+from gvz.core.cache import cache_directory
+from gvz.run.footprint import ACTOR_MEMORY_BYTES, ENGINE_SHM_BYTES, LEARNER_MEMORY_BYTES, format_bytes
+from gvz.run.machine import instruction_set
+
+State = Literal["ok", "note", "bad"]
+"""bad: runs will fail; note: they work, less well"""
+
+TESTED_PYTHONS = ((3, 11), (3, 12), (3, 13))
+_TRY_TIMEOUT_S = 280
+_ENGINE = """
+import time, gvz
+begin = time.monotonic()
+env = gvz.make("defend_the_center/default")
+frame, info = env.reset(seed=1)
+for _ in range(10):
+    frame = env.step(0)[0]
+env.close()
+assert frame.any(), "the screen is black"
+print(f"10 decisions of defend_the_center/default, started and ended in {time.monotonic() - begin:.1f} s")
+"""
+_DEVICES = """
+import jax, jax.numpy as jnp
+assert float(jnp.ones(8).sum()) == 8.0
+print(jax.default_backend(), "|", ", ".join(d.device_kind for d in jax.devices()))
+"""
+_LEARNER = """
+import os
+os.environ["JAX_PLATFORMS"] = "cpu"
+from learner import selfcheck
+selfcheck.main([])
+"""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Finding:
+    """One check's outcome."""
+
+    name: str
+    state: State
+    found: str
+    remedy: str = ""
+    """what to do about it, if anything"""
+
+
+def check_python() -> Finding:
+    """The interpreter."""
+    found = f"{platform.python_version()} at {sys.executable}"
+    if sys.version_info[:2] not in TESTED_PYTHONS:
+        remedy = "tests run on 3.11 to 3.13; if something fails, try one of these"
+        return Finding(name="python", state="note", found=found, remedy=remedy)
+    return Finding(name="python", state="ok", found=found)
+
+
+def check_system() -> Finding:
+    """The operating system: /dev/shm, /proc and parent-death signals are Linux's."""
+    found = f"{platform.system()} {platform.release()} {platform.machine()}"
+    if platform.system() != "Linux":
+        remedy = "the trainer needs Linux (/dev/shm, prctl); use a container or WSL 2"
+        return Finding(name="system", state="bad", found=found, remedy=remedy)
+    return Finding(name="system", state="ok", found=found)
+
+
+def check_packages() -> Finding:
+    """Every required package is installed."""
+    try:
+        wanted = [re.split(r"[ ;<>=!~\[]", line)[0] for line in requires("gvizdoom") or () if "extra ==" not in line]
+    except PackageNotFoundError:
+        remedy = "run `make install`, or `pip install .` in the checkout"
+        return Finding(name="packages", state="bad", found="gvizdoom is not installed", remedy=remedy)
+    missing = []
+    for name in wanted:
+        try:
+            version(name)
+        except PackageNotFoundError:
+            missing.append(name)
+    if missing:
+        remedy = f"pip install {' '.join(missing)}"
+        return Finding(name="packages", state="bad", found=f"missing: {', '.join(missing)}", remedy=remedy)
+    shown = ", ".join(f"{name} {version(name)}" for name in ("gvizdoom", "vizdoom", "gymnasium", "jax"))
+    return Finding(name="packages", state="ok", found=f"{shown} and {len(wanted) - 3} more")
+
+
+def check_cores() -> Finding:
+    """Cores this process may use."""
+    cores = len(os.sched_getaffinity(0))
+    load = os.getloadavg()[0]
+    found = f"{cores} of {os.cpu_count()}, load {load:.1f}"
+    if cores < 2:
+        remedy = "learner and actors will share one core; give the process more"
+        return Finding(name="cores", state="note", found=found, remedy=remedy)
+    if load > cores:
+        return Finding(name="cores", state="note", found=found, remedy="other work is running; rates will be lower")
+    return Finding(name="cores", state="ok", found=found)
+
+
+def check_memory() -> Finding:
+    """Free memory, against the smallest run with one actor a core."""
+    free = int(psutil.virtual_memory().available)
+    need = LEARNER_MEMORY_BYTES + len(os.sched_getaffinity(0)) * ACTOR_MEMORY_BYTES
+    found = f"{format_bytes(free)} available; a small run takes {format_bytes(need)}"
+    if free < need:
+        remedy = "end other programs, or train with --actors.num-actors 1 and a smaller --replay.capacity"
+        return Finding(name="memory", state="bad", found=found, remedy=remedy)
+    return Finding(name="memory", state="ok", found=found)
+
+
+def check_shared_memory() -> Finding:
+    """Free space in /dev/shm, against four games a core."""
+    free = shutil.disk_usage(janitor.SHM_DIR).free
+    games = 4 * len(os.sched_getaffinity(0))
+    need = games * ENGINE_SHM_BYTES + 64 * 2**20
+    found = f"{format_bytes(free)} free; {games} games take {format_bytes(need)}"
+    if free < need:
+        size = -(-need // 2**20)
+        remedy = f"docker run --shm-size={size}m ..., or as root: mount -o remount,size={size}m /dev/shm"
+        return Finding(name="/dev/shm", state="bad", found=found, remedy=remedy)
+    return Finding(name="/dev/shm", state="ok", found=found)
+
+
+def check_temporary_directory() -> Finding:
+    """Engines are launched from a script in the temporary directory."""
+    directory = Path(tempfile.gettempdir())
+    with tempfile.TemporaryDirectory(prefix="gvz-doctor-") as inside:
+        script = Path(inside) / "run"
+        script.write_text("#!/bin/sh\nexit 0\n")
+        script.chmod(0o700)
+        try:
+            subprocess.run([script], check=True, timeout=10)
+        except (OSError, subprocess.SubprocessError) as error:
+            remedy = "it may be mounted noexec: set TMPDIR to a directory that may hold programs"
+            return Finding(name="tmp", state="bad", found=f"{directory}: {error}", remedy=remedy)
+    return Finding(name="tmp", state="ok", found=f"{directory}, {format_bytes(shutil.disk_usage(directory).free)} free")
+
+
+def check_cache() -> Finding:
+    """Compiled maps and XLA programs are kept between starts."""
+    directory = cache_directory()
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=directory):
+            pass
+    except OSError as error:
+        remedy = "set GVZ_CACHE_DIR to a directory you can write to"
+        return Finding(name="cache", state="bad", found=f"{directory}: {error.strerror}", remedy=remedy)
+    return Finding(name="cache", state="ok", found=str(directory))
+
+
+def check_engine() -> Finding:
+    """ViZDoom starts and plays one of our maps."""
+    remedy = "the line above is the engine's own; it often lacks a system library: see ViZDoom's installation page"
+    return _try("vizdoom", _ENGINE, remedy)
+
+
+def check_devices() -> Finding:
+    """JAX computes, and on what."""
+    finding = _try("jax", _DEVICES, "reinstall jax; for a GPU: `make install-cuda` and a driver that CUDA 12 accepts")
+    if finding.state == "ok" and finding.found.startswith("cpu") and shutil.which("nvidia-smi"):
+        remedy = "there is an NVIDIA driver but JAX does not use it: `make install-cuda`"
+        return Finding(name="jax", state="note", found=finding.found, remedy=remedy)
+    return finding
+
+
+def check_learner() -> Finding:
+    """The learner computes what it should on this processor (learner/selfcheck.py), by its instruction set."""
+    remedy = "send this line and those of system and packages with your question: scores of this machine may be wrong"
+    finding = _try("learner", _LEARNER, remedy)
+    return dataclasses.replace(finding, found=f"{instruction_set()}: {finding.found}")
+
+
+def check_video() -> Finding:
+    """`gvz record` writes mp4 by FFmpeg's libraries, which PyAV brings along; GIF and WebP need nothing."""
+    remedy = "pip install 'gvizdoom[video]', or record to .gif or .webp"
+    finding = _try("video", "import av; av.Codec('libx264', 'w'); print(f'PyAV {av.__version__}')", remedy)
+    return dataclasses.replace(finding, state="note") if finding.state == "bad" else finding
+
+
+def check_leftovers() -> Finding:
+    """What dead runs left behind."""
+    dead = janitor.dead_instances()
+    if dead:
+        shown = ", ".join(dead[:3]) + (f" and {len(dead) - 3} more" if len(dead) > 3 else "")
+        remedy = "gvz doctor --clean (the next run does it, too)"
+        return Finding(name="leftovers", state="note", found=f"{len(dead)}: {shown}", remedy=remedy)
+    return Finding(name="leftovers", state="ok", found="none")
+
+
+CHECKS: tuple[Callable[[], Finding], ...] = (
+    *(check_system, check_python, check_packages, check_cores, check_memory, check_shared_memory),
+    *(check_temporary_directory, check_cache, check_leftovers, check_engine, check_devices, check_learner),
+    check_video,
+)
+"""in the order of what depends on what"""
+
+
+def _try(name: str, code: str, remedy: str) -> Finding:
+    """Runs code in a process of its own; its last line is what was found."""
+    command = [sys.executable, "-c", code]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_TRY_TIMEOUT_S, check=False)
+    except subprocess.TimeoutExpired:
+        return Finding(name=name, state="bad", found=f"no answer within {_TRY_TIMEOUT_S} s", remedy=remedy)
+    finally:
+        janitor.clean_dead_instances()  # a crashed process cleans up nothing
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        return Finding(name=name, state="bad", found=f"exit code {done.returncode}: {last}", remedy=remedy)
+    return Finding(name=name, state="ok", found=done.stdout.strip().splitlines()[-1])

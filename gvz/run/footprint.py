@@ -1,0 +1,102 @@
+"""What a run will take, printed before it starts, and refused with advice when the machine has not got it."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from gvz.core.errors import ResourceError
+
+SHARED_MEMORY = Path("/dev/shm")
+ENGINE_SHM_BYTES = 11_000_000
+"""the engine's own shared files; measured 10.8 MB at every render size (vizdoom 1.3.2)"""
+ENGINE_MEMORY_BYTES = 20_000_000
+"""proportional set size of one engine and its client side, without shared files (measured 2026-11, x86-64)"""
+ACTOR_MEMORY_BYTES = 270_000_000
+"""proportional set size of an actor process with jax loaded (measured 2026-11, x86-64)"""
+LEARNER_MEMORY_BYTES = 700_000_000
+"""proportional set size of the learner with its compiled programs, without replay (measured 2026-11, x86-64)"""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Footprint:
+    """Bytes and processes of a run."""
+
+    replay_bytes: int
+    replay_on_host: bool
+    params_bytes: int
+    num_actors: int
+    num_games: int
+    transport_bytes: int
+    """rings and parameter queue"""
+
+    @property
+    def shm_bytes(self) -> int:
+        """What the engines take of /dev/shm. (Rings and parameter queue are anonymous memory, not files in it.)"""
+        return self.num_games * ENGINE_SHM_BYTES
+
+    @property
+    def snapshot_bytes(self) -> int:
+        """Host memory while a checkpoint is written: a second copy of replay and learner state."""
+        return self.replay_bytes + 4 * self.params_bytes
+
+    @property
+    def memory_bytes(self) -> int:
+        """Host memory in all, shared memory included."""
+        return (
+            LEARNER_MEMORY_BYTES
+            + (self.replay_bytes if self.replay_on_host else 0)
+            + self.snapshot_bytes
+            + self.num_actors * (ACTOR_MEMORY_BYTES + 2 * self.params_bytes)
+            + self.num_games * ENGINE_MEMORY_BYTES
+            + self.transport_bytes
+            + self.shm_bytes
+        )
+
+    def lines(self) -> list[str]:
+        """The footprint as a person reads it."""
+        where = "host" if self.replay_on_host else "device"
+        return [
+            f"replay {format_bytes(self.replay_bytes)} ({where}), checkpoint copy {format_bytes(self.snapshot_bytes)}",
+            f"/dev/shm {format_bytes(self.shm_bytes)}, rings and parameter queue {format_bytes(self.transport_bytes)}, "
+            f"host memory in all {format_bytes(self.memory_bytes)}",
+            f"processes: 1 learner, {self.num_actors} actors, {self.num_games} engines",
+        ]
+
+
+def check(footprint: Footprint, *, shm_free: int | None = None, memory_free: int | None = None) -> None:
+    """Refuses what does not fit.
+
+    Args:
+        footprint: of the run.
+        shm_free: bytes free in /dev/shm; default: read now.
+        memory_free: bytes of memory available; default: read now.
+
+    Raises:
+        ResourceError: says what is too small, by how much, and how to get it.
+    """
+    shm_free = shutil.disk_usage(SHARED_MEMORY).free if shm_free is None else shm_free
+    memory_free = int(psutil.virtual_memory().available) if memory_free is None else memory_free
+    if footprint.shm_bytes > shm_free:
+        need = -(-footprint.shm_bytes // 2**20)
+        raise ResourceError(
+            f"shared memory: /dev/shm has {format_bytes(shm_free)} free, want {format_bytes(footprint.shm_bytes)}. "
+            f"In Docker start with --shm-size={need}m; elsewhere `mount -o remount,size={need}m /dev/shm` as root; "
+            "or lower --actors.games-per-actor."
+        )
+    if footprint.memory_bytes > memory_free:
+        raise ResourceError(
+            f"memory: {format_bytes(memory_free)} available, this run needs {format_bytes(footprint.memory_bytes)} "
+            f"({'; '.join(footprint.lines())}). Lower --replay.capacity, --actors.num-actors or the frame size "
+            "(--env.frame-height, --env.frame-width, --env.grayscale)."
+        )
+
+
+def format_bytes(count: float) -> str:
+    """1.5 GB, in powers of ten."""
+    for unit in ("B", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}"
+        count /= 1000
+    return f"{count:.2f} GB"

@@ -1,0 +1,254 @@
+"""THE data flow of training, an arrow a line: pool -> learner -> pool, round after round.
+
+What is laid round it (supervision, records, checkpoints, resume) calls into the modules that do the work. How records
+become gradient steps is the learner's matter (`learner.learner`), where games are played is the pool's. Nothing here
+waits for the device between log periods but a publication, which copies the parameters to the host, and a checkpoint.
+"""
+
+import contextlib
+import dataclasses
+import time
+
+import jax
+import jax.numpy as jnp
+
+from actors.inline import InlinePool
+from actors.pool import STOP_TIMEOUT_S, ActorPool
+from gvz.core import janitor
+from gvz.core.cache import xla_cache_directory
+from gvz.core.errors import CheckpointError, GvzError, WaitTimeoutError, WorkerError
+from gvz.core.stop import StopRequest
+from gvz.core.watchdog import Watchdog
+from gvz.run import footprint, machine
+from gvz.run.assemble import Pool, RunParts, assemble
+from gvz.run.config import RunConfig
+from gvz.run.monitor import Counts, Monitor
+from gvz.run.progress import Progress
+from gvz.run.rundir import START_RECORDS, RunDir
+from gvz.run.saver import Saver, Snapshot
+from gvz.run.telemetry import Telemetry
+from gvz.transport.messages import EpisodeStats, Fault, ParamsHeader
+from learner.checkpoint import Restored, restore_newest
+from learner.learner import Learner
+from learner.memory import keep_freed_memory
+from learner.off_policy import OffPolicyLearner
+
+DRAIN_RECORDS = 256
+"""most records taken between two looks at the limiter"""
+DRAIN_WAIT_S = 0.02
+"""longest wait for a record before the loop looks after its actors again"""
+NO_RECORDS_TIMEOUT_S = 900.0
+"""a run whose actors deliver nothing for so long is stopped; a stuck actor is replaced long before"""
+LONGEST_ROUND_S = 1800.0
+"""a learner that is at one round for so long (it compiles in one, too) is stuck in the device, and ended"""
+
+
+class Trainer:
+    """One run, from its first update or its newest checkpoint to its last. `close` ends all that it started."""
+
+    def __init__(self, config: RunConfig, run: RunDir, parts: RunParts, progress: Progress, restored: Restored | None):
+        host = None if restored is None else restored.host
+        self._config, self._run, self._parts, self._progress = config, run, parts, progress
+        self._counts = Counts() if host is None else Counts(**host["counts"])
+        self._learner: Learner = OffPolicyLearner(
+            parts.learner,
+            jax.random.key(config.seed),
+            parts.pool_config.tasks,
+            run.path,
+            None if restored is None else (restored.arrays, restored.host),
+        )
+        self._published_params = self._learner.acting_params() if restored is None else restored.arrays["acting"]
+        self._telemetry = Telemetry(
+            run,
+            tasks=parts.pool_config.tasks,
+            upper_bound=config.resolved_scenario().upper_bound(config.env.profile),
+            tensorboard=config.log.tensorboard,
+            num_updates=self._counts.updates,
+            wandb=config.log.wandb,
+        )
+        if host is not None:
+            self._telemetry.restore(host["telemetry"])
+        self._monitor = Monitor(config, parts, progress, self._telemetry)
+        self._saver = Saver(run, config.checkpoint, self._counts, self._snapshot, self._report_failed_save)
+        self._collected_s, self._without_records_s = time.monotonic(), 0.0
+        pool = InlinePool if config.mode == "sync" else ActorPool
+        self._pool: Pool = pool(parts.pool_config, None if host is None else host["pool"])
+        self._send()
+
+    def run(self, stop: StopRequest) -> None:
+        """Trains until the last update, or until asked to stop; then writes a checkpoint.
+
+        The last row of metrics of an interrupted run stands after what its checkpoint vouches for: a resumed run sets
+        it aside, and its next row has the whole log period.
+
+        Raises:
+            WorkerError, WaitTimeoutError: the actors failed for good; a checkpoint is written first.
+            NonFiniteError: the learner's numbers went wrong; the checkpoints before it stand.
+            CheckpointError: the last checkpoint could not be written.
+        """
+        # rates count from here
+        self._monitor.look(self._counts, self._pool.statistics(), self._learner.take_staleness)
+        try:
+            with Watchdog("the learner", LONGEST_ROUND_S) as watchdog:
+                while self._counts.updates < self._config.learner.total_updates and not stop.requested:
+                    watchdog.beat()
+                    self._collect()
+                    self._supervise()
+                    self._counts.updates += self._learner.update()
+                    self._broadcast()
+                    self._record()
+                    self._saver.save_when_due()
+        except (WorkerError, WaitTimeoutError):
+            # a failed save is already reported; the first error is raised
+            with contextlib.suppress(CheckpointError, WaitTimeoutError):
+                self._saver.save_last(self._record_row)
+            raise
+        self._progress.say("stopping: writing a checkpoint" if stop.requested else "done: writing the last checkpoint")
+        self._saver.save_last(self._record_row)
+
+    def close(self, *, abandon_save: bool = False) -> None:
+        """Ends every actor, waits for the checkpoint (or abandons both), closes the records. Can be repeated."""
+        if abandon_save:
+            self._saver.abandon()
+        self._pool.close(grace_s=0.0 if abandon_save else STOP_TIMEOUT_S)
+        try:
+            self._saver.wait()
+        finally:
+            self._telemetry.close()
+
+    def _collect(self) -> None:
+        """Rings -> learner, as far as it allows."""
+        ready_to_learn = self._learner.can_update()
+        allowed = min(self._learner.num_steps_allowed(), DRAIN_RECORDS)
+        blocks = self._pool.drain(allowed, wait_s=0.0 if ready_to_learn else DRAIN_WAIT_S)
+        self._counts.env_steps += self._learner.add(blocks, self._counts.version)
+        self._counts.records += sum(map(len, blocks))
+        # a round's length at most: the time in which this process was stopped is not the actors' silence
+        waited_s, self._collected_s = min(time.monotonic() - self._collected_s, 1.0), time.monotonic()
+        self._without_records_s = 0.0 if blocks or ready_to_learn else self._without_records_s + waited_s
+        if self._without_records_s > NO_RECORDS_TIMEOUT_S:
+            raise WaitTimeoutError(
+                f"learner waited {self._without_records_s:.0f} s for the actors' next step record; their logs are in "
+                f"{self._run.work}, what was done about them in faults.jsonl"
+            )
+
+    def _supervise(self) -> None:
+        """Actors' messages -> records; dead and stuck actors are replaced by the pool."""
+        for message in self._pool.poll():
+            if isinstance(message, EpisodeStats):
+                self._telemetry.episode(message, num_updates=self._counts.updates, env_steps=self._counts.env_steps)
+                if not message.cut:
+                    self._learner.add_episode(message.task, message.score)
+            elif isinstance(message, Fault):
+                self._telemetry.fault(message, num_updates=self._counts.updates)
+                self._progress.say(f"fault: {message.message}")
+
+    def _broadcast(self) -> None:
+        """Parameters -> actors, every period, and once when warm-up ends: actors then act by the agent."""
+        counts, learner = self._counts, self._config.learner
+        warmed_up = counts.published_env_steps < learner.warmup_steps <= counts.env_steps
+        if warmed_up or counts.updates >= counts.published_updates + learner.publish_period_updates:
+            self._published_params = self._learner.acting_params()
+            counts.version += 1
+            counts.published_updates, counts.published_env_steps = counts.updates, counts.env_steps
+            self._send()
+
+    def _send(self) -> None:
+        """Epsilon follows from the decisions at the publication, so a resumed run sends what was sent before."""
+        header = ParamsHeader(
+            version=self._counts.version,
+            num_updates=self._counts.published_updates,
+            epsilon=self._learner.epsilon(self._counts.published_env_steps),
+            layout_hash=self._parts.pool_config.layout_hash,
+        )
+        self._pool.publish(self._published_params, header)
+
+    def _record(self) -> None:
+        """Counters -> panel; metrics -> records every log period and at the last update."""
+        counts, period = self._counts, self._config.log.period_updates
+        due = counts.updates // period > counts.logged_updates // period  # at its multiples, also after an interruption
+        if due or counts.updates == self._config.learner.total_updates:
+            self._record_row()
+        elif counts.updates == 0:
+            self._monitor.look(counts, self._pool.statistics(), self._learner.take_staleness)
+
+    def _record_row(self) -> None:
+        """A row of what came since the last one, if anything did. Waits for the device."""
+        counts = self._counts
+        if counts.updates > counts.logged_updates:
+            counts.logged_updates = counts.updates
+            metrics = self._learner.take_metrics()
+            self._monitor.log(counts, self._pool.statistics(), self._learner.take_staleness(), metrics)
+
+    def _snapshot(self) -> Snapshot:
+        """The whole state; raises NonFiniteError instead of saving numbers that went wrong."""
+        self._learner.check_finite()
+        host = {
+            "counts": dataclasses.asdict(self._counts),
+            "telemetry": self._telemetry.state(),
+            "pool": self._pool.state(),
+            "records": self._run.record_lengths(),
+            **self._learner.state(),
+        }
+        return Snapshot({**self._learner.arrays(), "acting": self._published_params}, self._learner.params, host)
+
+    def _report_failed_save(self, failure: str, retry_s: float) -> None:
+        self._progress.say(f"checkpoint failed, tried again within {retry_s:.0f} s: {failure}")
+        self._monitor.fault("checkpoint", failure, self._counts.updates)
+
+
+def train(config: RunConfig, run: RunDir, stop: StopRequest) -> int:
+    """Trains, resuming if the run directory holds a checkpoint.
+
+    Args:
+        config: of the run.
+        run: where it is kept.
+        stop: entered; from when there is a trainer on, the first signal no longer ends things at once.
+
+    Returns: 0 when all updates are done; 130 or 143 when a signal stopped the run, which is then saved.
+
+    Raises:
+        ResourceError: the machine is too small. GvzError: what a user can do something about.
+        KeyboardInterrupt: a second signal, or a first one before the trainer was there; nothing is left running.
+    """
+    keep_freed_memory()
+    jax.config.update("jax_compilation_cache_dir", str(xla_cache_directory()))
+    with Progress() as progress:
+        for line in janitor.clean_dead_instances():
+            progress.say(f"removed what a dead run left: {line}")
+        parts = assemble(config, run.work)
+        for line in parts.footprint.lines():
+            progress.say(line)
+        footprint.check(parts.footprint)
+        acting = jax.ShapeDtypeStruct((parts.pool_config.num_params,), jnp.float32)
+        restored = restore_newest(run.checkpoints, {**parts.learner.array_shapes(), "acting": acting})
+        if restored is None:
+            progress.say(f"new run in {run.path}")
+            run.truncate_records(dict.fromkeys(run.record_lengths(), 0))
+        else:
+            for damage in restored.damage:
+                progress.say(f"damaged checkpoint passed over: {damage}")
+            progress.say(f"run in {run.path} goes on from update {restored.num_updates}")
+        run.write_config(config)
+        started_from = 0 if restored is None else restored.num_updates
+        run.append(START_RECORDS, {"num_updates": started_from, "time_s": time.time(), **machine.describe()})
+        stop.at_once = False
+        try:
+            if restored is not None:
+                run.truncate_records(restored.host["records"])
+            trainer = Trainer(config, run, parts, progress, restored)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            if restored is None or isinstance(error, GvzError):
+                raise
+            raise CheckpointError(
+                f"{run.checkpoints / str(started_from)}: its host state is not one of a run ({error!r}); move it "
+                "aside, and the run goes on from the checkpoint before it"
+            ) from error
+        del restored
+        with contextlib.closing(trainer):
+            try:
+                trainer.run(stop)
+            except KeyboardInterrupt:
+                trainer.close(abandon_save=True)
+                raise
+        return stop.exit_code if stop.requested else 0

@@ -1,0 +1,56 @@
+"""The acting function as bytes, and parameters as one flat vector.
+
+The bytes are `jax.export` of the agent's own acting function (StableHLO in a flatbuffer, not a pickle), lowered for a
+CPU wherever the learner runs. An actor calls them without importing this package.
+"""
+
+import hashlib
+
+import jax
+import jax.numpy as jnp
+from jax import export
+from jaxtyping import Array, Float
+
+from learner.agents.base import Agent, Params
+
+
+def flatten_params(params: Params) -> Float[Array, "P"]:
+    """All leaves in tree order, which is the order that `export_policy` takes them in, as one float32 vector."""
+    return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(params)])
+
+
+def layout_hash(params: Params) -> int:
+    """64 bits that differ when any path, shape, dtype or the order of the leaves does."""
+    leaves = jax.tree_util.tree_leaves_with_path(params)
+    layout = [(jax.tree_util.keystr(path), tuple(leaf.shape), str(leaf.dtype)) for path, leaf in leaves]
+    return int.from_bytes(hashlib.blake2b(repr(layout).encode(), digest_size=8).digest(), "little")
+
+
+def export_policy(agent: Agent, template: Params, batch_size: int) -> bytes:
+    """Serializes the acting function for a CPU.
+
+    Args:
+        agent: whose acting function.
+        template: parameters (values do not matter) or their ShapeDtypeStructs.
+        batch_size: games acted on in one call.
+
+    Returns:
+        Bytes for `jax.export.deserialize`; `.call` takes (the parameters' leaves as a list, obs u8[B, H, W, C],
+        task i32[B], key u32[2], epsilon f32[]) and returns the actions, i32[B]. A flat vector is cut into leaves by
+        the caller, once a version: within the function it would be copied in every call (27 MB, 2.5 ms).
+    """
+    template_leaves, treedef = jax.tree.flatten(template)
+
+    def policy(leaves: list[Array], obs: Array, task: Array, key_data: Array, epsilon: Array) -> Array:
+        params = jax.tree.unflatten(treedef, leaves)
+        key = jax.random.wrap_key_data(key_data, impl="threefry2x32")
+        return agent.act(params, key, obs, task, epsilon)
+
+    arguments = (
+        [jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in template_leaves],
+        jax.ShapeDtypeStruct((batch_size, *agent.spec.obs_shape), jnp.uint8),
+        jax.ShapeDtypeStruct((batch_size,), jnp.int32),
+        jax.ShapeDtypeStruct((2,), jnp.uint32),
+        jax.ShapeDtypeStruct((), jnp.float32),
+    )
+    return bytes(export.export(jax.jit(policy), platforms=["cpu"])(*arguments).serialize())

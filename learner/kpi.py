@@ -1,0 +1,71 @@
+"""Key performance indicators of the tasks and the loss weights made of them."""
+
+import numpy as np
+
+from learner.config import LearnerConfig
+
+
+class TaskKpis:
+    """Running mean of each task's score, and the weight of its samples.
+
+    KPI_j is the mean of task j's last `kpi_window_episodes` scores (fewer until there are so many), and
+    w_j = max_i KPI_i / KPI_j. Source: thesis eq. 4.19, 4.20. Differs: a weight is at most `kpi_max_weight` (the
+    thesis divides by zero for KPI 0), and all weights are 1 until every task has finished an episode.
+    """
+
+    def __init__(self, num_tasks: int, config: LearnerConfig):
+        self._config = config
+        self._scores = np.zeros((num_tasks, config.kpi_window_episodes), np.float64)  # written in a circle
+        self._num_episodes = np.zeros(num_tasks, np.int64)
+
+    def add(self, task: int, score: float) -> None:
+        """Counts one finished episode.
+
+        Args:
+            task: index of its task.
+            score: the scenario's metric, >= 0.
+
+        Raises:
+            ValueError: no such task, or a score that is negative or not finite.
+        """
+        num_tasks, window = self._scores.shape
+        if not 0 <= task < num_tasks:
+            raise ValueError(f"TaskKpis.add: got task {task}, want 0..{num_tasks - 1}")
+        if not (np.isfinite(score) and score >= 0):
+            raise ValueError(f"TaskKpis.add: got score {score} for task {task}, want a finite number >= 0")
+        self._scores[task, self._num_episodes[task] % window] = score
+        self._num_episodes[task] += 1
+
+    def kpis(self) -> np.ndarray:
+        """float64[num_tasks]: mean score over the window; NaN for a task without an episode."""
+        counts = np.minimum(self._num_episodes, self._scores.shape[1])
+        return np.where(counts > 0, self._scores.sum(axis=1) / np.maximum(counts, 1), np.nan)
+
+    def weights(self) -> np.ndarray:
+        """float32[num_tasks]: what a sample's loss is multiplied by; all 1 if `kpi_weighting` is off."""
+        kpis = self.kpis()
+        ones = np.ones(len(kpis), np.float32)
+        if not self._config.kpi_weighting or np.isnan(kpis).any() or kpis.max() == 0:
+            return ones
+        bound = self._config.kpi_max_weight
+        # max / KPI >= bound is KPI <= max / bound: no division by a KPI of 0.
+        return np.where(kpis * bound <= kpis.max(), bound, kpis.max() / np.maximum(kpis, 1e-300)).astype(np.float32)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Copies of all that is remembered, for a checkpoint."""
+        return {"scores": self._scores.copy(), "num_episodes": self._num_episodes.copy()}
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Takes back what `state` gave.
+
+        Raises:
+            ValueError: it was made for other tasks or another window.
+        """
+        for name, mine in (("scores", self._scores), ("num_episodes", self._num_episodes)):
+            if state[name].shape != mine.shape:
+                raise ValueError(
+                    f"TaskKpis.restore: {name} has shape {state[name].shape}, want {mine.shape} "
+                    "(number of tasks, kpi_window_episodes)"
+                )
+        self._scores[:] = state["scores"]
+        self._num_episodes[:] = state["num_episodes"]

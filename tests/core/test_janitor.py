@@ -1,0 +1,335 @@
+"""The janitor removes what dead owners left, and nothing else."""
+
+import contextlib
+import json
+import mmap
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+import vizdoom
+
+from gvz.core import janitor
+from gvz.core.errors import ResourceError
+from gvz.engine import process
+
+WRAPPER = Path(process.__file__).with_name("wrapper.py")
+STOCK_WAD = Path(vizdoom.scenarios_path) / "defend_the_center.wad"
+
+
+@pytest.fixture
+def registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A registry of this test's own, so that records can be forged."""
+    tmp_path.chmod(0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return janitor.runtime_dir()
+
+
+@pytest.fixture
+def directory(tmp_path: Path) -> Path:
+    """A private directory, as `temporary_directory` names it."""
+    path = tmp_path / "gvz-test-0123456789abcdef"
+    path.mkdir()
+    return path
+
+
+def run_until_killed(code: str) -> str:
+    """Runs code in a process of its own, kills it with SIGKILL at its first line of output, returns that line."""
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline().strip()
+        process.kill()
+    return line
+
+
+def change_record(registry: Path, **changes: object) -> None:
+    (path,) = registry.glob("*.json")
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def wait_until_gone(pid: int) -> bool:
+    deadline = time.monotonic() + 5
+    while janitor.process_start(pid) is not None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return janitor.process_start(pid) is None
+
+
+def test_records_are_private(registry: Path):
+    janitor.record("directory", "/tmp/gvz-test-0123456789abcdef")
+    (path,) = registry.glob("*.json")
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert registry.stat().st_mode & 0o777 == 0o700
+    janitor.forget("directory", "/tmp/gvz-test-0123456789abcdef")
+    assert list(registry.iterdir()) == []
+    janitor.forget("directory", "/tmp/gvz-test-0123456789abcdef")  # again, and of what was never recorded
+
+
+def test_a_temporary_directory_goes_with_its_block_or_with_the_next_start(registry: Path):
+    with janitor.temporary_directory("test") as directory:
+        (directory / "file").touch()
+        assert directory.stat().st_mode & 0o777 == 0o700
+        assert janitor.clean_dead_instances() == []
+    assert not directory.exists()
+    code = "from gvz.core import janitor\nwith janitor.temporary_directory('test') as d: print(d, flush=True); input()"
+    killed = Path(run_until_killed(code))
+    assert janitor.dead_instances() == [str(killed)]
+    assert janitor.clean_dead_instances() == [f"directory {killed}"]
+    assert not killed.exists()
+    assert list(registry.iterdir()) == []
+
+
+def test_a_record_half_written_long_ago_is_removed(registry: Path):
+    for name, age_s in (("new.partial", 60), ("old.partial", 7200)):
+        (registry / name).write_text("{")
+        os.utime(registry / name, times=(time.time() - age_s,) * 2)
+    assert janitor.clean_dead_instances() == []
+    assert [path.name for path in registry.iterdir()] == ["new.partial"]
+
+
+def test_what_a_living_owner_has_is_left_alone(registry: Path, directory: Path):
+    janitor.record("directory", str(directory))
+    assert janitor.clean_dead_instances() == []
+    assert directory.exists()
+    assert len(list(registry.glob("*.json"))) == 1
+
+
+def test_a_dead_owners_directory_is_removed(registry: Path, directory: Path):
+    run_until_killed(
+        f"from gvz.core import janitor; janitor.record('directory', {str(directory)!r}); print(1, flush=True); input()"
+    )
+    assert len(list(registry.glob("*.json"))) == 1
+    assert janitor.clean_dead_instances() == [f"directory {directory}"]
+    assert not directory.exists()
+    assert list(registry.iterdir()) == []
+    assert janitor.clean_dead_instances() == []
+
+
+def test_a_reused_process_id_is_not_the_owner(registry: Path, directory: Path):
+    janitor.record("directory", str(directory))
+    start = janitor.process_start(os.getpid())
+    assert start is not None
+    change_record(registry, owner_start=start - 1)
+    assert janitor.clean_dead_instances() == [f"directory {directory}"]
+
+
+def test_records_of_another_machine_are_left_alone(registry: Path, directory: Path):
+    janitor.record("directory", str(directory))
+    change_record(registry, owner_start=1, machine="another boot")
+    assert janitor.clean_dead_instances() == []
+    assert directory.exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        ("segment", "gvz-x"),
+        ("directory", ""),
+        ("engine", "gvz-engine-relative"),
+        ("engine", "/tmp/gvz-engine-x/../../home"),
+        ("engine", "/home/someone"),
+        ("directory", "/tmp/x"),
+        ("directory", "gvz-test-0123456789abcdef"),
+        ("directory", "/tmp/gvz-test-0123456789abcdef/.."),
+        ("directory", "/tmp/gvz-engine-x"),
+        ("file", "/tmp/gvz-test-0123456789abcdef"),
+    ],
+)
+def test_forged_records_delete_nothing(registry: Path, directory: Path, kind: str, name: str):
+    janitor.record("directory", str(directory))
+    change_record(registry, owner_start=1, kind=kind, name=name)
+    (line,) = janitor.clean_dead_instances()
+    assert line.startswith("left alone: unreadable record")
+    assert directory.exists()
+    with pytest.raises(ValueError, match="record of kind"):
+        janitor.record(kind, name)
+
+
+def forged(**changes: object) -> str:
+    machine = janitor._machine()
+    record = {
+        "kind": "directory",
+        "name": "/tmp/gvz-test-0123456789abcdef",
+        "owner_pid": 1,
+        "owner_start": 1,
+        "machine": machine,
+    }
+    return json.dumps({**record, **changes})
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "[" * 100_000,
+        "[]",
+        forged(owner_pid="../self"),
+        forged(owner_start=None),
+        forged(kind="engine", name=f"/{'a' * 300}/gvz-engine-x"),
+    ],
+    ids=range(6),
+)
+def test_a_record_that_is_damaged_is_reported_and_left(registry: Path, text: str):
+    path = registry / "directory-1-1-x.json"
+    path.write_text(text)
+    assert len(janitor.dead_instances()) <= 1  # a name can be too long only for the disk
+    (line,) = janitor.clean_dead_instances()
+    assert str(path) in line
+    assert path.exists()
+
+
+def test_a_process_without_the_instance_id_is_not_killed(registry: Path, tmp_path: Path):
+    directory = tmp_path / "gvz-engine-x"
+    directory.mkdir()
+    with subprocess.Popen(["sleep", "60"]) as bystander:
+        start = janitor.process_start(bystander.pid)
+        (directory / janitor.INSTANCE_FILE).write_text(f"{bystander.pid} {start} Abc123\n")
+        janitor.record("engine", str(directory))
+        change_record(registry, owner_start=1)
+        assert janitor.clean_dead_instances() == [f"directory {directory}"]
+        assert bystander.poll() is None
+        bystander.kill()
+
+
+def test_an_instance_file_that_is_not_ours_is_reported(registry: Path, tmp_path: Path):
+    directory = tmp_path / "gvz-engine-x"
+    directory.mkdir()
+    (directory / janitor.INSTANCE_FILE).write_text("1 2 ../../etc\n")
+    janitor.record("engine", str(directory))
+    change_record(registry, owner_start=1)
+    (line,) = janitor.clean_dead_instances()
+    assert "want process id, start time, instance id" in line
+    assert directory.exists()
+
+
+@pytest.mark.engine
+def test_a_killed_client_takes_its_engine_along_and_the_janitor_the_rest(registry: Path):
+    line = run_until_killed(
+        "from pathlib import Path; from gvz.engine.engine import Engine, EngineConfig\n"
+        f"e = Engine(EngineConfig(wad=Path({str(STOCK_WAD)!r}), buttons=(), variables=()))\n"
+        "print(e.pid, e.instance_id, e.log.parent, flush=True); input()"
+    )
+    pid, instance_id, directory = line.split()
+    assert wait_until_gone(int(pid)), "the engine outlived its client"
+    left = {path.name for path in janitor.SHM_DIR.glob(f"*{instance_id}")}
+    assert left == {f"ViZDoom{part}{instance_id}" for part in ("SM", "MQCtr", "MQDoom")}
+    removed = janitor.clean_dead_instances()
+    assert sorted(removed) == sorted([*(f"shared memory {name}" for name in left), f"directory {directory}"])
+    assert not list(janitor.SHM_DIR.glob(f"*{instance_id}"))
+    assert not Path(directory).exists()
+    assert list(registry.glob("*.json")) == []
+
+
+@pytest.mark.engine
+def test_an_engine_killed_before_it_was_one_leaves_nothing(registry: Path):
+    """What its client had made by then is known from the launcher."""
+    code = (
+        "from pathlib import Path; from gvz.engine.engine import Engine, EngineConfig\n"
+        f"Engine(EngineConfig(wad=Path({str(STOCK_WAD)!r}), buttons=(), variables=()))"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE) as client:
+        wrappers: list[psutil.Process] = []
+        while not wrappers and client.poll() is None:
+            with contextlib.suppress(psutil.Error):
+                children = psutil.Process(client.pid).children()
+                wrappers = [child for child in children if str(WRAPPER) in child.cmdline()[:3]]
+        wrappers[0].kill()
+        assert client.wait(120) != 0
+    (directory,) = (Path(json.loads(path.read_text())["name"]) for path in registry.glob("*.json"))
+    assert not (directory / janitor.INSTANCE_FILE).exists()
+    instance_id = (directory / janitor.ARGUMENTS_FILE).read_text().split("+viz_instance_id ")[1].split()[0]
+    assert len(list(janitor.SHM_DIR.glob(f"ViZDoomMQ*{instance_id}"))) == 2
+    janitor.clean_dead_instances()
+    assert not list(janitor.SHM_DIR.glob(f"*{instance_id}"))
+    assert not directory.exists()
+
+
+def test_what_a_client_had_made_when_it_died_before_the_launch_is_what_nobody_holds(registry: Path, tmp_path: Path):
+    directory = tmp_path / f"{janitor.ENGINE_DIR_PREFIX}0123456789abcdef"
+    janitor.record("engine", str(directory))
+    change_record(registry, owner_start=1)
+    directory.mkdir()
+    names = [f"ViZDoomMQ{part}" for part in ("Ctrlost", "Doomlost", "Ctrheld", "Ctrran", "Ctrold")] + ["ViZDoomSMran"]
+    files = {name: janitor.SHM_DIR / f"{name}{os.getpid()}" for name in names}
+    try:
+        files["ViZDoomMQCtrold"].write_bytes(b"queue")
+        time.sleep(0.05)
+        (directory / janitor.LAUNCHER_FILE).touch()
+        for name in set(files) - {"ViZDoomMQCtrold"}:
+            files[name].write_bytes(b"queue")
+        with files["ViZDoomMQCtrheld"].open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ):
+            removed = janitor.clean_dead_instances()
+        lost = [files[name].name for name in ("ViZDoomMQCtrlost", "ViZDoomMQDoomlost")]
+        assert removed == [*(f"shared memory {name}" for name in lost), f"directory {directory}"]
+    finally:
+        for file in files.values():
+            file.unlink(missing_ok=True)
+
+
+def test_a_launched_engine_without_a_client_removes_what_that_had_made(tmp_path: Path):
+    queue = janitor.SHM_DIR / f"ViZDoomMQCtrtest{os.getpid()}"
+    queue.touch()
+    words = [sys.executable, "-IS", WRAPPER, "1", tmp_path, tmp_path / "log", "true"]
+    done = subprocess.run([*words, "+viz_instance_id", f"test{os.getpid()}"], check=False)
+    assert (done.returncode, queue.exists()) == (1, False)
+
+
+@pytest.mark.engine
+def test_an_engine_that_outlived_its_owner_is_ended(registry: Path):
+    from gvz.engine.engine import Engine, EngineConfig
+
+    engine = Engine(EngineConfig(wad=STOCK_WAD, buttons=(), variables=()))
+    change_record(registry, owner_start=1)
+    assert f"engine {engine.instance_id} (pid {engine.pid})" in janitor.clean_dead_instances()
+    assert wait_until_gone(engine.pid)
+    engine.close()
+
+
+def test_a_zombie_is_dead():
+    process = subprocess.Popen(["true"])
+    deadline = time.monotonic() + 5
+    while janitor.process_start(process.pid) is not None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert Path(f"/proc/{process.pid}").exists(), "not reaped yet"
+    assert janitor.process_start(process.pid) is None
+    process.wait()
+
+
+def test_a_stopped_process_lives():
+    with subprocess.Popen(["sleep", "60"]) as process:
+        process.send_signal(signal.SIGSTOP)
+        assert janitor.process_start(process.pid) is not None
+        process.kill()
+
+
+def test_a_runtime_directory_that_others_can_enter_is_refused(registry: Path):
+    registry.chmod(0o755)
+    with pytest.raises(ResourceError, match=r"want a directory of user \d+ that nobody else can enter"):
+        janitor.runtime_dir()
+
+
+def test_a_runtime_directory_that_is_a_link_is_refused(registry: Path, tmp_path: Path):
+    registry.rmdir()
+    registry.symlink_to(tmp_path)
+    with pytest.raises(ResourceError, match="that nobody else can enter"):
+        janitor.runtime_dir()
+
+
+def test_a_runtime_directory_that_cannot_be_made_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    file = tmp_path / "file"
+    file.touch(mode=0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(file))
+    with pytest.raises(ResourceError, match="set TMPDIR to a writable directory"):
+        janitor.runtime_dir()
+
+
+def test_without_a_users_runtime_directory_the_temporary_one_is_taken(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/nowhere")
+    assert janitor.runtime_dir() == Path(tempfile.gettempdir()) / f"gvizdoom-{os.getuid()}"

@@ -1,0 +1,73 @@
+"""A process that is stuck in one call is ended with its stacks; a slow, a beating and a stopped one are left alone."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from gvz.core.watchdog import Watchdog
+
+STUCK = """
+import ctypes, threading, time
+from gvz.core.watchdog import Watchdog
+
+def wait_for_the_device():
+    lock = threading.Lock()
+    lock.acquire()
+    lock.acquire()
+
+def hold_the_interpreter():
+    ctypes.PyDLL(None).sleep(600)
+
+with Watchdog("the learner", 1.0) as watchdog:
+    print("begun", flush=True)
+    {body}
+"""
+
+
+def begin(body: str) -> subprocess.Popen[str]:
+    code = STUCK.format(body=body)
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "begun\n"
+    return process
+
+
+@pytest.mark.parametrize("where", ["wait_for_the_device", "hold_the_interpreter"])
+def test_a_stuck_process_is_ended_and_shows_where_it_hangs(where):
+    """Also in C code that lets no other Python thread run."""
+    with begin(f"{where}()") as process:
+        _, err = process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGVTALRM
+    assert err.startswith("error: the learner gave no sign of life for 1 s and is ended; the stacks of its threads")
+    assert f"in {where}" in err
+
+
+def test_the_watchdog_of_a_killed_process_ends_with_it():
+    with begin("wait_for_the_device()") as process:
+        process.kill()
+        _, err = process.communicate(timeout=60)  # until nobody can write to it any more
+    assert err == ""
+
+
+def test_one_that_beats_is_left_alone():
+    with begin("[(watchdog.beat(), time.sleep(0.1)) for _ in range(25)]") as process:
+        _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (0, "")
+
+
+def test_the_time_in_which_it_was_stopped_does_not_count():
+    with begin("[(watchdog.beat(), time.sleep(0.1)) for _ in range(10)]") as process:
+        process.send_signal(signal.SIGSTOP)
+        time.sleep(2.0)
+        process.send_signal(signal.SIGCONT)
+        _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (0, "")
+
+
+def test_one_that_has_left_is_not_watched():
+    with Watchdog("this test", 0.2):
+        pass
+    time.sleep(0.8)  # it would end this very process

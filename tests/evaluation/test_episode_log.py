@@ -1,0 +1,164 @@
+"""Record files of evaluations: what is there is not played again, what is half there is."""
+
+import json
+
+import pytest
+
+from gvz.core.env_config import EnvConfig
+from gvz.core.errors import ConfigError, TaskError
+from gvz.evaluation.episode_log import (
+    RecordFile,
+    evaluate_player,
+    missing_jobs,
+    play_and_record,
+    read_rows,
+    simple_player,
+    wanted_episodes,
+)
+from gvz.evaluation.play import Episode
+from gvz.evaluation.players import IdlePlayer, RandomPlayer, player_env
+from gvz.tasks import parse_task
+
+TASK = parse_task("defend_the_center/fast_enemies")
+IDLE = simple_player("idle", EnvConfig())
+
+
+def row(player: str, episode: int, **fields) -> dict:
+    return {**IDLE.identity, "player": player, "task": TASK.id, "episode": episode, **fields}
+
+
+@pytest.fixture
+def file(tmp_path):
+    file = RecordFile(tmp_path / "evaluation.jsonl")
+    yield file
+    file.close()
+
+
+def test_each_base_seed_has_episodes_of_its_own():
+    wanted = wanted_episodes([TASK], 2, [0, 5])
+    assert wanted == [(TASK.id, 0, 0), (TASK.id, 1, 0), (TASK.id, 0, 5), (TASK.id, 1, 5)]
+
+
+def test_only_rows_of_the_same_player_rules_and_base_seed_count(file):
+    for line in (
+        row("idle", 0),  # as written before there were base seeds
+        row("random", 1),
+        row("idle", 2, profile="levdoom"),
+        row("idle", 3, num_updates=5),
+        row("idle", 1, base_seed=5),
+    ):
+        file.append(line)
+    jobs = missing_jobs({IDLE: file}, wanted_episodes([TASK], 4, [0, 5]))
+    assert {job[0] for job in jobs} == {IDLE}
+    assert sorted(job[1] for job in jobs) == [
+        *((TASK.id, 0, 5), (TASK.id, 1, 0), (TASK.id, 2, 0), (TASK.id, 2, 5), (TASK.id, 3, 5))
+    ]
+
+
+def test_older_rows_with_more_kills_than_the_bound_count_as_the_bound(file, tmp_path):
+    file.append(row("idle", 0, score=38.0, normalized_score=190.0, kills=38.0))
+    file.append(row("idle", 1, score=20.0, normalized_score=100.0))
+    old, new = read_rows(tmp_path / "evaluation.jsonl")
+    assert (old["score"], old["normalized_score"], old["kills"]) == (20.0, 100.0, 38.0)
+    assert (new["score"], new["normalized_score"]) == (20.0, 100.0)
+
+
+def test_a_half_written_line_is_cut_off(tmp_path):
+    path = tmp_path / "evaluation.jsonl"
+    file = RecordFile(path)
+    file.append(row("idle", 0))
+    file.append(row("idle", 1))
+    file.close()
+    path.write_bytes(path.read_bytes()[:-7])  # as a kill would leave it
+    file = RecordFile(path)
+    assert [r["episode"] for r in file.rows] == [0]
+    file.append(row("idle", 1))
+    file.close()
+    assert [r["episode"] for r in read_rows(path)] == [0, 1]
+
+
+def test_a_file_with_half_a_first_line_is_empty(tmp_path):
+    path = tmp_path / "evaluation.jsonl"
+    path.write_text('{"schema": 1')
+    assert read_rows(path) == []
+    assert path.read_bytes() == b""
+
+
+@pytest.mark.parametrize("text", ["precious, on one line", "two\nlines", '{"schema": 1, "task": "x"}\nhalf'])
+def test_a_last_line_that_is_no_row_of_ours_is_not_cut_off(tmp_path, text):
+    path = tmp_path / "notes.txt"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r"last line: got b'.*', no row of an evaluation; move the file aside"):
+        RecordFile(path)
+    assert path.read_text() == text
+
+
+@pytest.mark.parametrize("fields", [{}, {"task": [], "episode": 1}, {"task": "x", "episode": "1"}])
+def test_a_row_without_task_or_episode_is_refused(tmp_path, fields):
+    path = tmp_path / "evaluation.jsonl"
+    path.write_text(json.dumps({"schema": 1, **IDLE.identity, **fields}) + "\n")
+    with pytest.raises(ConfigError, match=r"row 1: got task, episode and base seed \(.*\): no row of an evaluation"):
+        RecordFile(path)
+
+
+@pytest.mark.parametrize("line", ["nonsense", json.dumps({"schema": 99})])
+def test_a_file_of_something_else_is_refused_and_left_alone(tmp_path, line):
+    path = tmp_path / "evaluation.jsonl"
+    path.write_text(f"{line}\n")
+    with pytest.raises(ConfigError, match=r"line 1: .*move the file aside or give another with --out"):
+        RecordFile(path)
+    assert path.read_text() == f"{line}\n"
+
+
+def test_two_processes_cannot_write_one_file(tmp_path):
+    file = RecordFile(tmp_path / "evaluation.jsonl")
+    with pytest.raises(ConfigError, match=r"evaluation\.jsonl is being written by another process"):
+        RecordFile(tmp_path / "evaluation.jsonl")
+    file.close()
+    RecordFile(tmp_path / "evaluation.jsonl").close()
+
+
+def test_a_place_that_cannot_be_written_is_an_error(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="cannot be written: "):
+        RecordFile(tmp_path / "file" / "evaluation.jsonl")
+
+
+@pytest.mark.engine
+def test_an_evaluation_goes_on_where_it_was_left(tmp_path):
+    path = tmp_path / "evaluation.jsonl"
+    wanted = wanted_episodes([TASK], 2)
+    file = RecordFile(path)
+    rows = play_and_record({IDLE: file}, missing_jobs({IDLE: file}, wanted), num_workers=1)
+    first = next(rows)
+    assert read_rows(path) == [first], "a row is on disk before it is told of"
+    rows.close()
+    file.close()
+    file = RecordFile(path)
+    jobs = missing_jobs({IDLE: file}, wanted)
+    assert jobs == [(IDLE, Episode(TASK.id, 1 - first["episode"]))]
+    list(play_and_record({IDLE: file}, jobs, num_workers=0))
+    assert missing_jobs({IDLE: file}, wanted) == []
+    assert {r["episode"] for r in read_rows(path)} == {0, 1}
+    file.close()
+
+
+@pytest.mark.engine
+def test_anybody_s_player_is_evaluated_by_the_same_protocol(tmp_path):
+    path, env = tmp_path / "rows.jsonl", player_env("random", EnvConfig())
+    mine = evaluate_player(RandomPlayer, [TASK.id], path, name="mine", episodes=2, env=env)
+    assert [(r["player"], r["task"], r["episode"]) for r in mine] == [("mine", TASK.id, 0), ("mine", TASK.id, 1)]
+    file = RecordFile(path)
+    random = simple_player("random", EnvConfig())
+    jobs = missing_jobs({random: file}, wanted_episodes([TASK], 2))
+    theirs = sorted(play_and_record({random: file}, jobs, num_workers=0), key=lambda r: r["episode"])
+    file.close()
+    assert [{**r, "player": "mine"} for r in theirs] == mine
+    # nothing is left to play: IdlePlayer would fail, since this action set has no idle action
+    assert evaluate_player(IdlePlayer, [TASK], path, name="mine", episodes=2, env=env) == mine
+    assert len(read_rows(path)) == 4
+
+
+def test_a_player_is_not_evaluated_on_an_unknown_task(tmp_path):
+    with pytest.raises(TaskError, match="unknown scenario 'nowhere'"):
+        evaluate_player(RandomPlayer, ["nowhere/default"], tmp_path / "rows.jsonl", name="mine")

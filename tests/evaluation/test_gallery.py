@@ -1,0 +1,139 @@
+"""Pictures: one pose and moment a map, captions that fit, and sheets in the docs that are those the code draws."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gvz.evaluation.gallery import (
+    COLUMNS,
+    FRAME_HEIGHT,
+    FRAME_WIDTH,
+    MOMENTS,
+    MOVING,
+    scripted_frames,
+    task_frame,
+    task_sight,
+    tiled,
+    write_contact_sheet,
+)
+from gvz.scenarios.base import Task
+from gvz.scenarios.compiler import task_content
+from gvz.tasks import named_tasks, parse_task, scenarios
+
+IMAGES = Path(__file__).parents[2] / "docs" / "images"
+
+KITS, COLUMNS_AND_TORCHES = "Medikit CustomMedikit", "HeartColumn TallGreenColumn TallRedColumn BlueTorch GreenTorch"
+STRONG = "Arachnotron Fatso PainElemental Archvile Revenant"
+SHOWN = {
+    "gore": (("HeadCandles HeadsOnAStick LiveStick", 100),),
+    "flying_enemies": (("LostSoul", 60),),
+    "obstacles": ((COLUMNS_AND_TORCHES, 100),),
+    "stimpacks": (("Stimpack", 80), (KITS, 80)),
+    "poison": (("Poison", 40),),
+    "mixed_enemies": (("Zombieman MarineChainsawVzd DoomImp Cacodemon LostSoul", 300),),
+    "invulnerable": ((STRONG, 300),),
+    "flaming_skulls": (("FloatingSkull", 1000),),
+    "mancubus": (("Fatso", 100), ("FatShot", 40)),
+    "barons": (("BaronOfHell", 100), ("BaronBall", 10)),
+    "cacodemons": (("Cacodemon", 200), ("CacodemonBall", 20)),
+    "revenants": (("Revenant", 100), ("RevenantTracer", 40)),
+    "arachnotron": (("Arachnotron", 50), ("ArachnotronPlasma", 40)),
+    "revenants_and_arachnotron": (("Revenant", 80), ("Arachnotron", 50), ("RevenantTracer", 40)),
+}
+"""attribute -> (classes of things, pixels that they take at least of a tile)"""
+ENEMIES = {
+    "defend_the_center": ("Demon MarineChainsawVzd", 150),
+    "health_gathering": (KITS, 150),
+    "seek_and_kill": ("Demon", 300),
+    "dodge_projectiles": ("DoomImp", 200),
+}
+"""what a task shows whose attributes change no kind of thing"""
+
+
+def shown(task: Task) -> list[tuple[str, int]]:
+    """What a task's tile has to show."""
+    if task.id == "health_gathering/complete":  # shaded: a small kit would not be seen
+        return [(KITS, 2000), *SHOWN["poison"], *SHOWN["obstacles"]]
+    kinds = {a.name for a in task.scenario.attributes if "entity_type" in a.groups}
+    things = [] if kinds & set(task.attributes) else [ENEMIES[task.scenario.id]]
+    return things + [thing for name in task.attributes for thing in SHOWN.get(name, ())]
+
+
+def tiles() -> list:
+    """Every named task; those of one engine start each that hid something before are not left to the slow lane."""
+    found = []
+    for task in named_tasks():
+        hid = {"stimpacks", "arachnotron"} & set(task.attributes) or task.id == "health_gathering/complete"
+        found.append(pytest.param(task, id=task.id, marks=() if hid else pytest.mark.slow))
+    return found
+
+
+def test_every_map_has_its_moment():
+    maps = {(task.scenario.id, task_content(task, "thesis").base_wad) for task in named_tasks()}
+    assert maps == MOMENTS.keys()
+
+
+def test_the_moving_picture_shows_every_level_of_every_scenario():
+    assert MOVING.keys() == scenarios().keys()
+    for scenario, (_, names) in MOVING.items():
+        assert [parse_task(f"{scenario}/{name}").level for name in names] == [0, 1, 2, 3, 4]
+
+
+def test_a_sheet_holds_every_frame_unchanged_and_its_caption_beside():
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(256, size=(FRAME_HEIGHT, FRAME_WIDTH, 3), dtype=np.uint8) for _ in range(5)]
+    sheet = np.asarray(tiled([(frame, "caption " * 20, 4) for frame in frames], COLUMNS))
+    height, width = sheet.shape[0] // 2, sheet.shape[1] // COLUMNS
+    for n, frame in enumerate(frames):
+        y, x = n // COLUMNS * height, n % COLUMNS * width
+        np.testing.assert_array_equal(sheet[y : y + FRAME_HEIGHT, x : x + FRAME_WIDTH], frame)
+        caption = sheet[y + FRAME_HEIGHT : y + height, x : x + width].reshape(-1, 3)
+        assert len(np.unique(caption, axis=0)) > 2
+        assert (sheet[y : y + height, x + FRAME_WIDTH : x + width] == sheet[0, -1]).all()  # a long one is not cut off
+
+
+@pytest.mark.engine
+def test_a_frame_is_the_same_each_time_and_differs_from_task_to_task():
+    default, again, gore = (task_frame(parse_task(f"defend_the_center/{n}")) for n in ("default", "default", "gore"))
+    np.testing.assert_array_equal(default, again)
+    changed = (default != gore).any(axis=-1).mean()
+    assert 0.001 < changed < 0.1  # decorations only: walls, floor, HUD are where they were, so the pose is the same
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("task", tiles())
+def test_a_tile_shows_what_the_attributes_change(task):
+    _, pixels = task_sight(task)
+    for classes, least in shown(task):
+        assert sum(pixels.get(name, 0) for name in classes.split()) >= least, (classes, pixels)
+
+
+@pytest.mark.engine
+def test_frames_of_the_scripted_agent_are_those_of_its_evaluation_episode():
+    task = parse_task("defend_the_center/default")
+    whole, part = scripted_frames(task, 0, 0, 12), scripted_frames(task, 0, 8, 4)
+    assert len(whole) == 12
+    np.testing.assert_array_equal(whole[8:], part)
+
+
+@pytest.mark.parametrize("scenario", list(scenarios()))
+def test_the_sheets_in_the_docs_show_all_named_tasks(scenario):
+    file = IMAGES / f"gallery_{scenario}.png"
+    assert file.stat().st_size < 700_000
+    with Image.open(file) as sheet:
+        rows = -(-len(named_tasks(scenario)) // COLUMNS)
+        assert sheet.height % rows == 0
+        assert sheet.height // rows > FRAME_HEIGHT
+
+
+@pytest.mark.slow
+@pytest.mark.engine
+@pytest.mark.parametrize("scenario", scenarios().values(), ids=lambda s: s.id)
+def test_the_sheets_in_the_docs_are_those_the_code_draws(scenario, tmp_path):
+    with (
+        Image.open(write_contact_sheet(scenario, tmp_path)) as drawn,
+        Image.open(IMAGES / f"gallery_{scenario.id}.png") as shown,
+    ):
+        np.testing.assert_array_equal(np.asarray(drawn.convert("RGB")), np.asarray(shown.convert("RGB")))

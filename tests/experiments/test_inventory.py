@@ -1,0 +1,99 @@
+"""What stands on the disk: checkpoints, episodes, logs."""
+
+import fcntl
+import gzip
+import json
+from pathlib import Path
+
+import pytest
+
+from gvz.experiments import inventory as progress
+from gvz.experiments.base import TrainingRun
+from gvz.experiments.plan import Evaluation
+
+RUN = TrainingRun(
+    config="rainbow_4task",
+    scenario="defend_the_center",
+    training="train1",
+    tasks=("defend_the_center/default",),
+    seed=1111,
+    total_updates=300,
+    num_checkpoints=3,
+)
+
+
+def row(task: str, episode: int, **more) -> str:
+    return json.dumps({"schema": 1, "task": task, "episode": episode, **more}) + "\n"
+
+
+def save_policies(results: Path, *steps: int) -> Path:
+    directory = progress.run_directory(results, RUN)
+    for step in steps:
+        (directory / "policies" / str(step)).mkdir(parents=True)
+    return directory
+
+
+@pytest.mark.parametrize(
+    ("saved", "standing"),
+    [
+        ((), ()),
+        ((100, 200, 300), (100, 200, 300)),
+        ((150, 200, 250, 300), (150, 200, 300)),  # 150: saved late; 250: saved when the run was stopped
+        ((40, 100, 104), (100,)),
+        ((104, 208, 300, 400), (104, 208, 300)),
+        ((304,), ()),  # a longer run's: not the end of this one
+    ],
+)
+def test_the_first_policy_at_or_after_a_checkpoint_stands_for_it(saved, standing):
+    assert progress.standing_checkpoints(RUN, saved) == standing
+
+
+def test_a_run_is_done_when_trained_and_every_episode_of_every_checkpoint_is_there(tmp_path):
+    evaluation = Evaluation(tasks=("a", "b"), episodes=2)
+    assert progress.run_progress(tmp_path, RUN, evaluation) == progress.RunProgress(
+        num_updates=0, checkpoints=(), trained=False, missing={}
+    )
+    directory = save_policies(tmp_path, 100, 200, 300)
+    episodes = [(c, t, n) for c in (100, 200, 300) for t in "ab" for n in (0, 1)]
+    lines = [row(t, n, num_updates=c) for c, t, n in episodes]
+    (directory / "evaluation.jsonl").write_text("".join(lines[:5] + lines[4:5]) + lines[5][:20])
+    (directory / "metrics.jsonl").write_text('{"num_updates": 290}\n{"num_updates": 300}\n{"num_upd')
+    found = progress.run_progress(tmp_path, RUN, evaluation)
+    assert (found.num_updates, found.trained, found.done) == (300, True, False)
+    assert found.missing == {200: 3, 300: 4}  # a row twice counts once, a half-written one not
+    (directory / "evaluation.jsonl").write_text("".join(lines))
+    assert progress.run_progress(tmp_path, RUN, evaluation).done
+
+
+def test_episodes_of_another_base_seed_do_not_count(tmp_path):
+    directory = save_policies(tmp_path, 100, 200, 300)
+    (directory / "evaluation.jsonl").write_text(row("a", 0, num_updates=100, base_seed=7))
+    found = progress.run_progress(tmp_path, RUN, Evaluation(tasks=("a",), episodes=1))
+    assert found.missing == {100: 1, 200: 1, 300: 1}
+
+
+def test_compressed_records_count(tmp_path):
+    file = progress.player_file(tmp_path, "random")
+    evaluation = Evaluation(tasks=("a",), episodes=3)
+    assert progress.missing_player_episodes(file, evaluation) == 3
+    file.parent.mkdir()
+    file.with_name("random.jsonl.gz").write_bytes(gzip.compress((row("a", 0) + row("a", 1) + "[]\n{\n").encode()))
+    assert progress.missing_player_episodes(file, evaluation) == 1
+
+
+def test_a_job_s_state_is_read_from_its_lock_its_results_and_its_log(tmp_path):
+    log = progress.log_file(tmp_path, "a/b")
+    assert progress.job_state(tmp_path, "a/b", done=False, begun=False) == "waiting"
+    log.parent.mkdir(parents=True)
+    log.write_text("# python\nlaunching\nerror: the disk is full\n# ended with exit code 2 after 3 s\n")
+    assert progress.job_state(tmp_path, "a/b", done=False, begun=True) == "failed"
+    assert progress.last_words(log) == ["launching", "error: the disk is full"]
+    assert progress.job_state(tmp_path, "a/b", done=True, begun=True) == "done"
+    log.write_text("# ended with exit code 130 after 3 s\n")
+    assert progress.job_state(tmp_path, "a/b", done=False, begun=True) == "stopped"
+    log.write_text("killed in the midd")
+    assert progress.job_state(tmp_path, "a/b", done=False, begun=True) == "stopped"
+    with log.open("a") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert progress.job_state(tmp_path, "a/b", done=False, begun=True) == "running"
+    assert progress.job_state(tmp_path, "a/b", done=False, begun=True) == "stopped"

@@ -1,0 +1,263 @@
+"""Configurations: found, overridden, saved and compared; everything wrong is said before any process starts."""
+
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+
+import pytest
+
+from gvz.core.env_config import EnvConfig
+from gvz.core.errors import ConfigError
+from gvz.launch import main, parse
+from gvz.run.config import (
+    RunConfig,
+    config_from_dict,
+    config_to_dict,
+    configs_directory,
+    differences,
+    find_config_file,
+    load_config,
+)
+
+ALL_CONFIGS = sorted(p.stem for p in configs_directory().glob("*.py") if p.stem != "__init__")
+
+
+@pytest.mark.parametrize("name", ALL_CONFIGS)
+def test_every_config_loads_and_survives_json(name):
+    config = load_config(name)
+    assert config.name == name
+    saved = json.loads(json.dumps(config_to_dict(config)))
+    assert differences(config_from_dict(saved), config) == []
+
+
+def test_the_main_config_plays_the_four_tasks():
+    assert [t.id for t in load_config("rainbow_4task.py").resolved_tasks()] == [
+        "defend_the_center/default",
+        "defend_the_center/gore",
+        "defend_the_center/stone_wall",
+        "defend_the_center/fast_enemies",
+    ]
+
+
+def test_a_path_is_taken_as_a_path(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text("from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='mine', seed=5)\n")
+    assert load_config(str(file)).seed == 5
+    with pytest.raises(ConfigError, match=r"no file '.*/other\.py'"):
+        find_config_file(str(tmp_path / "other.py"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x = 1", "got NoneType for CONFIG, want `CONFIG = RunConfig"),
+        ("1 / 0", "ZeroDivisionError: division by zero"),
+        ("def (", "SyntaxError"),
+        ("from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='a b')", "name: got 'a b'"),
+        (
+            "from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='a', mode='asynch')",
+            "CONFIG.mode: got 'asynch'",
+        ),
+        (
+            "from gvz.run.config import LearnerConfig, RunConfig\n"
+            "CONFIG = RunConfig(name='a', learner=LearnerConfig(batch_size=32.5))",
+            "CONFIG.learner.batch_size: got 32.5, want int",
+        ),
+    ],
+)
+def test_a_broken_config_file_is_named(tmp_path, text, message):
+    file = tmp_path / "broken.py"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=re.escape(str(file)) + ".*" + re.escape(message)):
+        load_config(str(file))
+
+
+def test_a_near_miss_is_suggested():
+    with pytest.raises(ConfigError, match="did you mean 'rainbow_4task'"):
+        load_config("rainbow_4tasks")
+
+
+def test_flags_override_every_field():
+    launch = parse(
+        "--config rainbow_4task.py --run-dir out --seed 2222 --learner.total-updates 7 --learner.warmup-steps 64 "
+        "--learner.batch-size 16 --replay.capacity 1000 --actors.num-actors 2 --actors.games-per-actor 2 --mode sync "
+        "--checkpoint.period-updates 5 --scenario seek_and_kill --agent.noisy off --learner.max-grad-norm 10".split()
+    )
+    run = launch.run
+    assert (str(run.run_dir), run.seed, run.mode, run.scenario) == ("out", 2222, "sync", "seek_and_kill")
+    assert (run.learner.total_updates, run.learner.batch_size, run.replay.capacity) == (7, 16, 1000)
+    assert (run.agent.noisy, run.learner.max_grad_norm, run.checkpoint.period_updates) == ("off", 10.0, 5)
+    assert [t.id for t in run.resolved_tasks()] == [
+        f"seek_and_kill/{a}" for a in ("default", "red", "obstacles", "mixed_enemies")
+    ]
+
+
+def test_reward_weights_are_one_field_in_every_form():
+    run = parse("--env.reward-weights kill 2 death -1.5".split()).run
+    weights = (("death", -1.5), ("kill", 2.0))
+    assert run.env.reward_weights == weights
+    assert run.env == EnvConfig(reward_weights={"kill": 2, "death": -1.5})  # pyright: ignore[reportArgumentType]
+    assert hash(run.env) == hash(EnvConfig(reward_weights=weights))
+    saved = config_to_dict(run)
+    assert saved["config"]["env"]["reward_weights"] == [["death", -1.5], ["kill", 2.0]]
+    assert config_from_dict(json.loads(json.dumps(saved))).env == run.env
+
+
+def test_the_fewest_warmup_decisions_are_n_steps_a_game():
+    flags = "--actors.num-actors 16 --actors.games-per-actor 4 --learner.warmup-steps"
+    assert parse([*flags.split(), "192"]).run.num_lanes == 64
+    assert parse([*flags.split(), "64", "--agent.n-steps", "1"]).run.num_lanes == 64
+
+
+def test_tasks_may_be_named():
+    run = parse(["--tasks", "defend_the_center/gore", "defend_the_center/gore+mossy_bricks"]).run
+    assert [t.id for t in run.resolved_tasks()] == ["defend_the_center/gore", "defend_the_center/gore+mossy_bricks"]
+
+
+BAD = {
+    "--seed -1": "seed: got -1",
+    "--learner.batch-size 0": "learner.batch_size: got 0",
+    "--learner.warmup-steps 200000": "learner.warmup_steps: got 200000, more than replay.capacity",
+    "--learner.warmup-steps 20": "learner.batch_size: got 32, more than the 20 decisions",
+    "--replay.capacity 70 --learner.warmup-steps 64": "replay.capacity: got 70, want at least",
+    "--learner.learning-rate nan": "learner.learning_rate: got nan",
+    "--replay.num-newest 32": "replay.num_newest: got 32, want less than learner.batch_size 32",
+    "--actors.num-actors 16 --actors.games-per-actor 4 --learner.warmup-steps 191": (
+        "learner.warmup_steps: got 191, want at least 192, which is agent.n_steps (3) for each of 64 games"
+    ),
+    "--tasks defend_the_center/gor": "gore",
+    "--tasks defend_the_center/gore health_gathering/lava": "want one scenario",
+    "--tasks defend_the_center/gore defend_the_center/gore": "one task twice",
+    "--scenario doom": "defend_the_center",
+    "--agent.conv-channels 32 --agent.conv-kernels 8 4": "want one equal length",
+    "--actors.num-actors 1 --actors.games-per-actor 2": "every task needs a game: want at least 4",
+    "--checkpoint.keep 0": "checkpoint.keep: got 0",
+    "--log.period-updates 0": "log.period_updates: got 0",
+    "--env.buffers depth": "env.buffers: got ('depth',), want none",
+    "--env.frame-skip 99": "env.frame_skip: got 99",
+    "--env.reward-weights kil 2": "env.reward_weights: unknown component 'kil' (did you mean 'kill'?)",
+    "--env.reward-weights living 1": "env.reward_weights: unknown component 'living'; want some of kill, player_kill",
+    "--env.reward-weights kill nan": "env.reward_weights, ('kill', nan): got nan, want a finite float",
+    "--env.reward-weights kill 1 kill 2": "env.reward_weights: got kill kill, want each component once",
+    "--env.reward-weights kill": "Error parsing --env.reward-weights",
+    "--env.reward-weights kill 0 death 0 ammo_spent 0 health_lost 0": "env.reward_weights: got 0 for each of kill,",
+    "--name a/b": "name: got 'a/b'",
+}
+
+
+@pytest.mark.parametrize("flags", BAD)
+def test_a_bad_value_is_refused_by_name_with_exit_code_2(flags, capsys):
+    try:
+        code = main(flags.split())
+    except SystemExit as end:  # tyro's own way out
+        code = end.code
+    assert code == 2
+    assert BAD[flags] in " ".join(re.sub("[│╭╰─╮╯]", " ", capsys.readouterr().err).split())
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--learner.batch-sizes 3", "batch-size"),
+        ("--learner.batch-size many", "batch-size"),
+        ("--mode fast", "async"),
+        ("--config nope", "there are"),
+        ("--tasks defend_the_center/gor", "gore"),
+    ],
+)
+def test_the_command_exits_with_2_and_one_message(flags, message):
+    done = subprocess.run(
+        [sys.executable, "-m", "gvz.launch", *flags.split()], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_help_lists_flags_units_and_defaults():
+    done = subprocess.run(
+        [sys.executable, "-m", "gvz.launch", "--help"], capture_output=True, text=True, timeout=60, check=True
+    )
+    for part in ("--config", "--fresh", "--run-dir", "--learner.total-updates", "200000", "gradient steps", "--tasks"):
+        assert part in done.stdout
+
+
+def test_a_saved_configuration_with_an_unknown_key_is_refused():
+    saved = config_to_dict(load_config("rainbow_4task"))
+    saved["config"]["learner"]["batchsize"] = 3
+    with pytest.raises(ConfigError, match=r"config.learner.batchsize: unknown key, did you mean batch_size\?"):
+        config_from_dict(saved)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("seed", "x", "config.seed: got 'x', want int"),
+        ("seed", True, "config.seed: got True, want int"),
+        ("mode", "x", "config.mode: got 'x', want one of"),
+        ("agent", 3, "config.agent: got int, want a map"),
+        ("tasks", 3, "config.tasks: got 3, want a list"),
+        ("training_set", 4.0, "config.training_set: got 4.0, want one of 1, 4, 8"),
+        ("training_set", True, "config.training_set: got True, want one of"),
+    ],
+)
+def test_a_saved_configuration_of_wrong_type_is_refused(key, value, message):
+    saved = config_to_dict(load_config("rainbow_4task"))
+    saved["config"][key] = value
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        config_from_dict(saved)
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "message"),
+    [
+        (("config", "name"), ..., "config.name: missing"),
+        (("resolved", "num_actors"), ..., "resolved.num_actors: missing"),
+        (("resolved", "num_actors"), "2", "resolved.num_actors: got '2', want int"),
+        (("resolved", "games_per_actor"), 10**30, f"actors.games_per_actor: got {10**30}, want 1..65536"),
+        (("resolved", "tasks"), ["seek_and_kill/red"], "resolved.tasks: got ['seek_and_kill/red'], but the configur"),
+        (("config", "learner", "learning_rate"), 10**400, "config.learner.learning_rate: got 1000"),
+    ],
+)
+def test_a_saved_configuration_that_is_damaged_is_refused(where, value, message):
+    saved = part = config_to_dict(load_config("rainbow_4task"))
+    for key in where[:-1]:
+        part = part[key]
+    if value is ...:
+        del part[where[-1]]
+    else:
+        part[where[-1]] = value
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        config_from_dict(saved)
+
+
+def test_more_games_than_a_record_can_number_are_refused():
+    flags = "--actors.num-actors 300 --actors.games-per-actor 300 --replay.capacity 100000000"
+    with pytest.raises(ConfigError, match="got 300 times 300 games, want at most 65536"):
+        parse(flags.split())
+
+
+def test_a_name_that_no_file_can_have_is_refused():
+    with pytest.raises(ConfigError, match=r"--config: 'a+' cannot be read: File name too long"):
+        find_config_file("a" * 300)
+
+
+def test_another_schema_is_refused():
+    with pytest.raises(ConfigError, match="schema 1"):
+        config_from_dict({"schema": 2})
+
+
+def test_sync_mode_plays_the_same_games_in_one_place():
+    flags = "--actors.num-actors 2 --actors.games-per-actor 3".split()
+    both = [parse([*flags, "--mode", mode]).run for mode in ("async", "sync")]
+    assert [(run.num_actors, run.games_per_actor, run.num_lanes) for run in both] == [(2, 3, 6), (1, 6, 6)]
+
+
+def test_derived_numbers_are_saved_explicitly():
+    config = RunConfig(name="x")
+    saved = config_from_dict(config_to_dict(config))
+    assert saved.actors.num_actors == config.num_actors
+    assert (saved.agent.v_min, saved.agent.v_max) == config.value_range()
+    assert dataclasses.replace(saved, actors=config.actors, agent=config.agent) == config

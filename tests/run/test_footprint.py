@@ -1,0 +1,54 @@
+"""The footprint: what a run takes, and a refusal with advice when the machine has not got it."""
+
+import dataclasses
+
+import pytest
+
+from gvz.core.errors import ResourceError
+from gvz.run.footprint import ENGINE_SHM_BYTES, Footprint, check, format_bytes
+
+FOOTPRINT = Footprint(
+    replay_bytes=2_000_000_000,
+    replay_on_host=True,
+    params_bytes=20_000_000,
+    num_actors=2,
+    num_games=8,
+    transport_bytes=100_000_000,
+)
+
+
+def test_engines_alone_take_dev_shm_and_the_transport_is_memory_all_the_same():
+    assert FOOTPRINT.shm_bytes == 8 * ENGINE_SHM_BYTES
+    assert FOOTPRINT.memory_bytes - dataclasses.replace(FOOTPRINT, transport_bytes=0).memory_bytes == 100_000_000
+
+
+def test_a_replay_on_a_gpu_is_not_charged_to_the_host_but_its_checkpoint_copy_is():
+    on_device = dataclasses.replace(FOOTPRINT, replay_on_host=False)
+    assert FOOTPRINT.memory_bytes - on_device.memory_bytes == FOOTPRINT.replay_bytes
+    assert on_device.snapshot_bytes == FOOTPRINT.snapshot_bytes > FOOTPRINT.replay_bytes
+
+
+def test_the_lines_say_bytes_and_processes():
+    text = "\n".join(FOOTPRINT.lines())
+    assert "replay 2.00 GB (host)" in text
+    assert "processes: 1 learner, 2 actors, 8 engines" in text
+
+
+def test_what_fits_passes():
+    check(FOOTPRINT, shm_free=FOOTPRINT.shm_bytes, memory_free=FOOTPRINT.memory_bytes)
+
+
+def test_a_small_dev_shm_is_refused_with_advice():
+    with pytest.raises(
+        ResourceError, match=r"/dev/shm has 64 MB free, want 88 MB\. In Docker start with --shm-size=84m"
+    ):
+        check(FOOTPRINT, shm_free=64_000_000, memory_free=10**12)
+
+
+def test_too_little_memory_is_refused_with_the_bill():
+    with pytest.raises(ResourceError, match=r"memory: 1\.00 GB available, this run needs .*Lower --replay\.capacity"):
+        check(FOOTPRINT, shm_free=10**12, memory_free=10**9)
+
+
+def test_bytes_are_readable():
+    assert [format_bytes(n) for n in (0, 999, 1500, 2_000_000, 3.25e9)] == ["0 B", "999 B", "2 kB", "2 MB", "3.25 GB"]

@@ -1,0 +1,82 @@
+"""What a record says of its machine is true of this one, and says nothing it does not know."""
+
+import json
+import os
+import subprocess
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from gvz.run import machine
+
+
+def git(directory: Path, *arguments: str) -> str:
+    identity = ("-c", "user.name=a", "-c", "user.email=a@b.c")
+    command = ["git", "-C", str(directory), *identity, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout.strip()
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch) -> Path:
+    """A repository with a commit, in place of this one."""
+    (tmp_path / "gvz").mkdir()
+    (tmp_path / "gvz" / "env.py").write_text("1\n")
+    git(tmp_path, "init", "--quiet")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "--quiet", "-m", "first")
+    monkeypatch.setattr(machine, "ROOT", tmp_path)
+    return tmp_path
+
+
+def test_all_of_it_is_json_and_of_this_machine():
+    found = json.loads(json.dumps(machine.describe()))
+    assert set(found) == {"cpu", "cores", "memory_bytes", "system", "devices", "versions", "commit"}
+    assert found["cpu"] in Path("/proc/cpuinfo").read_text()
+    assert found["cores"] == len(os.sched_getaffinity(0))
+    assert found["versions"]["jax"] == version("jax")
+    assert found["devices"]
+
+
+@pytest.mark.parametrize(
+    ("cpuinfo", "xla_flags", "wanted"),
+    [
+        ("processor : 0\nflags\t\t: fpu sse4_2 avx avx2 fma\n", "", "AVX2"),
+        ("flags : sse4_2 avx avx2 avx512f avx512_vnni avx512_bf16", "--xla_dump_to=x", "AVX512_BF16"),
+        (
+            "flags : sse4_2 avx avx2 avx512f",
+            "--xla_cpu_max_isa=AVX2 --xla_cpu_max_isa=SSE4_2",
+            "AVX512, at most SSE4_2 by XLA_FLAGS",
+        ),
+        ("Features : fp asimd", "", os.uname().machine),
+    ],
+)
+def test_the_instruction_set_is_the_largest_that_xla_knows_and_its_cap_is_told(cpuinfo, xla_flags, wanted):
+    assert machine.instruction_set(cpuinfo, xla_flags) == wanted
+
+
+def test_packages_that_are_not_installed_have_no_version():
+    assert set(machine.versions(["numpy", "no-such-package"])) == {"python", "numpy"}
+
+
+def test_a_commit_says_when_measured_files_differ_from_it(checkout):
+    head = git(checkout, "rev-parse", "--short=12", "HEAD")
+    (checkout / "notes.txt").write_text("not measured")
+    assert machine.commit() == head
+    (checkout / "gvz" / "new.py").write_text("")  # not even known to git
+    assert machine.commit() == f"{head}+changes"
+
+
+def test_an_installation_inside_of_another_repository_has_no_commit(checkout, monkeypatch):
+    monkeypatch.setattr(machine, "ROOT", checkout / "gvz")
+    assert machine.commit() is None
+
+
+def test_a_checkout_without_git_or_without_commits_has_no_commit(checkout, monkeypatch, tmp_path_factory):
+    empty = tmp_path_factory.mktemp("empty")
+    git(empty, "init", "--quiet")
+    monkeypatch.setattr(machine, "ROOT", empty)
+    assert machine.commit() is None
+    monkeypatch.setattr(machine, "ROOT", checkout)
+    monkeypatch.setenv("PATH", str(empty))
+    assert machine.commit() is None

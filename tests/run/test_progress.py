@@ -1,0 +1,65 @@
+"""What a person sees: every number on the panel and in the plain line, on a terminal and off it."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from gvz.run.progress import Progress, Status, TaskStatus, format_duration, plain_line
+
+STATUS = Status(
+    phase="training",
+    num_updates=5_000,
+    total_updates=20_000,
+    env_steps=30_000,
+    updates_per_s=50.0,
+    steps_per_s=800.0,
+    frames_per_s=3_200.0,
+    replay_fill=0.5,
+    learner_wait=0.25,
+    actor_wait=0.1,
+    staleness_updates=12.0,
+    loss=1.5,
+    restarts=2,
+    tasks=(
+        TaskStatus(task="defend_the_center/gore", episodes=7, score=550.0, upper_bound=1100.0),
+        TaskStatus(task="defend_the_center/default", episodes=0, score=float("nan"), upper_bound=1100.0),
+    ),
+)
+PARTS = ("training", "5,000", "20,000", "05:00", "50.0 updates/s", "800 decisions/s", "3,200", "50%", "25%", "550/1100")
+
+
+def test_the_plain_line_has_every_number():
+    line = plain_line(STATUS)
+    assert all(part in line for part in PARTS)
+    assert "default -" in line
+    assert "nan" not in line
+
+
+def test_off_a_terminal_lines_are_printed_rarely():
+    out = io.StringIO()
+    with Progress(Console(file=out, width=300)) as progress:
+        progress.show(STATUS)
+        progress.show(STATUS)
+        progress.say("checkpoint written")
+        progress.show(STATUS, force=True)
+    lines = out.getvalue().splitlines()
+    assert len(lines) == 3
+    assert lines[1] == "checkpoint written"
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_on_a_terminal_the_panel_has_every_number(width):
+    out = io.StringIO()
+    with Progress(Console(file=out, width=width, force_terminal=True, color_system=None)) as progress:
+        progress.show(STATUS)
+    text = out.getvalue()
+    assert all(part in text for part in PARTS)
+    assert "2 actor restarts" in text
+    assert "parameters 12 updates old" in text
+    assert "defend_the_center" in text
+    assert "50.0" in text
+
+
+def test_durations():
+    assert [format_duration(s) for s in (None, 0, 61, 3723)] == ["--:--", "00:00", "01:01", "1:02:03"]

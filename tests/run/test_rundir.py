@@ -1,0 +1,204 @@
+"""The run directory: locked, private, never overwritten; its records survive a cut."""
+
+import dataclasses
+import gzip
+import json
+import stat
+
+import pytest
+
+from gvz.core.errors import ConfigError, GvzError, ResumeError
+from gvz.run import rundir
+from gvz.run.config import load_config
+from gvz.run.rundir import RunDir, move_aside, read_records
+from tests.full_disk import full_disk
+
+CONFIG = load_config("rainbow_4task")
+
+
+def test_it_is_private_and_held_by_one(tmp_path):
+    with RunDir(tmp_path / "run") as run:
+        assert stat.S_IMODE(run.path.stat().st_mode) == 0o700
+        with pytest.raises(ResumeError, match="another running process uses it"):
+            RunDir(tmp_path / "run")
+    RunDir(tmp_path / "run").close()
+
+
+def test_a_path_that_cannot_be_made_says_so(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ResumeError, match=r"file/run: Not a directory; choose another with --run-dir"):
+        RunDir(tmp_path / "file" / "run")
+
+
+def test_the_saved_configuration_comes_back(tmp_path):
+    with RunDir(tmp_path) as run:
+        assert run.saved_config() is None
+        run.write_config(CONFIG)
+        saved = run.saved_config()
+        assert saved is not None
+        assert saved.agent == CONFIG.with_value_range(*CONFIG.value_range()).agent
+        assert saved.num_lanes == CONFIG.num_lanes
+        run.check_resumable(CONFIG)
+
+
+def test_a_change_of_meaning_is_refused_field_by_field(tmp_path):
+    with RunDir(tmp_path) as run:
+        run.write_config(CONFIG)
+        other = dataclasses.replace(
+            CONFIG,
+            seed=3,
+            env=dataclasses.replace(CONFIG.env, reward_weights=(("kill", 2.0),)),
+            learner=dataclasses.replace(CONFIG.learner, batch_size=64, total_updates=300_000),
+            log=dataclasses.replace(CONFIG.log, period_updates=7),
+        )
+        with pytest.raises(ResumeError) as refusal:
+            run.check_resumable(other)
+    text = str(refusal.value)
+    assert "seed: 1111 -> 3" in text
+    assert "env.reward_weights: () -> (('kill', 2.0),)" in text
+    assert "learner.batch_size: 32 -> 64" in text
+    assert "total_updates" not in text
+    assert "log." not in text
+
+
+@pytest.mark.parametrize("value_range", [(-6.9, 14.1), None])
+def test_a_run_that_began_with_other_atoms_goes_on_with_those_alone(tmp_path, value_range):
+    """Of another version of this package, or of one that did not note them."""
+    with RunDir(tmp_path) as run:
+        run.write_config(CONFIG)
+        file = tmp_path / "config.json"
+        saved = json.loads(file.read_text())
+        saved["resolved"]["value_range"] = value_range
+        file.write_text(json.dumps(saved))
+        low, _ = CONFIG.value_range()
+        with pytest.raises(ResumeError, match=f"agent.v_min: {value_range and value_range[0]} -> {low}"):
+            run.check_resumable(CONFIG)
+        if value_range is not None:
+            run.check_resumable(CONFIG.with_value_range(*value_range))
+
+
+def test_total_updates_may_not_shrink(tmp_path):
+    with RunDir(tmp_path) as run:
+        run.write_config(CONFIG)
+        learner = dataclasses.replace(CONFIG.learner, total_updates=5)
+        with pytest.raises(ResumeError, match=r"total_updates: 200000 -> 5 \(it may only grow\)"):
+            run.check_resumable(dataclasses.replace(CONFIG, learner=learner))
+
+
+def test_a_damaged_config_is_named(tmp_path):
+    with RunDir(tmp_path) as run:
+        for text in ('{"schema": 1, "config": {"nam', "[" * 100_000, '{"schema": 1, "config": {}}'):
+            (tmp_path / "config.json").write_text(text)
+            with pytest.raises(ResumeError, match=r"config.json cannot be read"):
+                run.saved_config()
+
+
+def test_records_are_cut_to_what_a_checkpoint_vouches_for(tmp_path):
+    with RunDir(tmp_path) as run:
+        run.append("episodes.jsonl", {"episode": 0})
+        lengths = run.record_lengths()
+        run.append("episodes.jsonl", {"episode": 1})
+        assert run.truncate_records(lengths) > 0
+        assert run.truncate_records(lengths) == 0
+    rows, problems = read_records(tmp_path / "episodes.jsonl")
+    assert ([row["episode"] for row in rows], problems) == ([0], [])
+    assert json.loads((tmp_path / "discarded" / "episodes.jsonl").read_text())["episode"] == 1
+
+
+def test_everything_readable_of_a_damaged_record_is_read(tmp_path):
+    file = tmp_path / "episodes.jsonl"
+    file.write_text('{"schema": 1, "a": 1}\nnonsense\n{"schema": 9}\n[1]\n{"schema": 1, "a": 2}\n{"schema": 1, "a')
+    rows, problems = read_records(file)
+    assert [row["a"] for row in rows] == [1, 2]
+    assert [p.split(": ", 1)[1] for p in problems] == [
+        "not JSON (half-written?)",
+        "schema 9, want 1",
+        "schema 'list', want 1",
+        "not JSON (half-written?)",
+    ]
+
+
+def test_a_small_file_that_unpacks_to_a_huge_line_is_not_read_on(tmp_path):
+    file = tmp_path / "episodes.jsonl.gz"
+    file.write_bytes(gzip.compress(b'{"schema": 1}\n' + b" " * 50_000_000))
+    assert file.stat().st_size < 100_000
+    rows, (problem,) = read_records(file)
+    assert rows == [{"schema": 1}]
+    assert "line 2: not read on; want lines shorter than 1048576 characters, and at most 4194304 of them" in problem
+
+
+def test_more_lines_than_any_run_writes_are_not_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(rundir, "MAX_LINES", 2)
+    (tmp_path / "episodes.jsonl").write_text('{"schema": 1}\n' * 5)
+    rows, problems = read_records(tmp_path / "episodes.jsonl")
+    assert (len(rows), len(problems)) == (2, 1)
+
+
+def test_a_missing_record_file_is_an_error(tmp_path):
+    with pytest.raises(GvzError, match="no such record file"):
+        read_records(tmp_path / "episodes.jsonl")
+
+
+def test_fresh_moves_an_old_run_aside(tmp_path):
+    path = tmp_path / "run"
+    assert move_aside(path) is None
+    for _ in range(2):  # twice within a second: the names must not collide
+        with RunDir(path) as run:
+            run.write_config(CONFIG)
+        moved = move_aside(path)
+        assert moved is not None
+        assert (moved / "config.json").exists()
+        assert not path.exists()
+
+
+def test_fresh_refuses_what_is_no_run_or_in_use(tmp_path):
+    (tmp_path / "thesis.tex").write_text("precious")
+    with pytest.raises(ConfigError, match="is not a run directory"):
+        move_aside(tmp_path)
+    with RunDir(tmp_path / "run"), pytest.raises(ResumeError, match="another running process"):
+        move_aside(tmp_path / "run")
+
+
+def test_rows_wait_for_room_on_a_full_disk_and_none_is_lost_or_torn(tmp_path):
+    wanted = [{"number": number, "text": "x" * 100} for number in range(100)]
+    with RunDir(tmp_path) as run:
+        for row in wanted[:10]:
+            run.append("metrics.jsonl", row)
+        whole = run.record_lengths()["metrics.jsonl"]
+        with full_disk(whole + 300):
+            for row in wanted[10:90]:
+                run.append("metrics.jsonl", row)
+            assert (tmp_path / "metrics.jsonl").stat().st_size == whole + 300, "the middle of a row"
+            assert run.record_lengths()["metrics.jsonl"] > 8 * whole, "what waits is counted"
+        for row in wanted[90:]:
+            run.append("metrics.jsonl", row)
+        assert run.record_lengths()["metrics.jsonl"] == (tmp_path / "metrics.jsonl").stat().st_size
+    rows, problems = read_records(tmp_path / "metrics.jsonl")
+    assert problems == []
+    assert rows == [{"schema": rundir.RECORDS_SCHEMA, **row} for row in wanted]
+
+
+def test_rows_that_wait_are_written_at_the_end_or_said_to_be_lost(tmp_path):
+    with RunDir(tmp_path / "late") as run:
+        with full_disk(0):
+            run.append("metrics.jsonl", {})
+        assert (tmp_path / "late" / "metrics.jsonl").stat().st_size == 0
+    assert len(read_records(tmp_path / "late" / "metrics.jsonl")[0]) == 1
+    run = RunDir(tmp_path / "lost")
+    with full_disk(0):
+        run.append("metrics.jsonl", {})
+        with pytest.raises(
+            GvzError, match=r"metrics.jsonl: 14 bytes of records cannot be written: File too large; mak"
+        ):
+            run.close()
+    run.close()
+    RunDir(tmp_path / "lost").close()
+
+
+def test_rows_do_not_wait_without_bound(tmp_path, monkeypatch):
+    monkeypatch.setattr(rundir, "MAX_WAITING_BYTES", 1000)
+    with RunDir(tmp_path) as run, full_disk(0):
+        for _ in range(71):
+            run.append("metrics.jsonl", {})
+        with pytest.raises(GvzError, match="1008 bytes of records cannot be written"):
+            run.append("metrics.jsonl", {})
