@@ -1,10 +1,8 @@
 """gvz doctor, as it is called."""
 
 import json
-import os
 import subprocess
 import sys
-from pathlib import Path
 
 from gvz import cli
 from gvz.run import doctor
@@ -33,14 +31,15 @@ def test_clean_removes_what_a_dead_run_left(capsys, monkeypatch, tmp_path):
     tmp_path.chmod(0o700)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setattr(doctor, "CHECKS", (doctor.check_leftovers,))
-    segment = Path("/dev/shm") / f"gvz-test-doctor-{os.getpid()}"
-    code = f"from gvz.core import janitor; janitor.record('segment', {segment.name!r}); open({str(segment)!r}, 'w')"
+    left = tmp_path / "gvz-test-0123456789abcdef"
+    left.mkdir()
+    code = f"from gvz.core import janitor; janitor.record('directory', {str(left)!r})"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
     assert cli.main(["doctor"]) == 0
-    assert f"1: {segment.name}" in capsys.readouterr().out
-    assert segment.exists()
+    assert f"1: {left}" in capsys.readouterr().out
+    assert left.exists()
     assert cli.main(["doctor", "--clean", "--json"]) == 0
     out, err = capsys.readouterr()
-    assert f"removed shared memory {segment.name}" in err
+    assert f"removed directory {left}" in err
     assert json.loads(out)["found"] == "none"
-    assert not segment.exists()
+    assert not left.exists()
