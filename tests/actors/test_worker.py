@@ -110,12 +110,12 @@ def test_told_to_stop_it_ends_well(spec: ActorSpec, ring: RingReader, monkeypatc
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_max_isa=AVX2")
     process = ActorProcess(spec, ring, None)
     try:
-        environment = Path(f"/proc/{process.pid}/environ").read_text().split("\0")
-        flags = "XLA_FLAGS=--xla_cpu_max_isa=AVX2 --xla_cpu_multi_thread_eigen=false"
-        assert flags in environment, "the user's flags hold for actors too"
         while not any(isinstance(message, Ready) for message in process.receive()):
             assert process.exit_text() is None
             ring.read(100)
+        environment = Path(f"/proc/{process.pid}/environ").read_text().split("\0")
+        flags = "XLA_FLAGS=--xla_cpu_max_isa=AVX2 --xla_cpu_multi_thread_eigen=false"
+        assert flags in environment, "the user's flags hold for actors too"
         process.ask_to_stop()
         assert process.wait(30)
         assert process.exit_text() == "exited with code 0"
