@@ -122,8 +122,8 @@ class Watched:
         }
 
     def shared_memory(self) -> set[str]:
-        """The run's segments, and whatever of engines has come into /dev/shm since its start."""
-        return _shared(f"gvz-{self.process.pid}-") | (_shared("ViZDoom") - self._before)
+        """Whatever of engines has come into /dev/shm since the run's start."""
+        return _shared("ViZDoom") - self._before
 
     def left_behind(self) -> list[str]:
         """Files of the ended run in /dev/shm that no process has mapped.

@@ -104,9 +104,8 @@ def alive(processes: list[psutil.Process]) -> list[psutil.Process]:
 
 
 def left_behind() -> list[str]:
-    """What there still is of runs that have ended: segments, and what their janitor knows of."""
-    segments = [path.name for run in STARTED for path in janitor.SHM_DIR.glob(f"gvz-{run.pid}-*")]
-    return segments + janitor.dead_instances()
+    """What there still is of runs that have ended, as far as their janitor knows of it."""
+    return janitor.dead_instances()
 
 
 def arrays_of(checkpoint: Path) -> dict[str, np.ndarray]:

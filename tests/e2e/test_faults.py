@@ -1,5 +1,6 @@
 """Faults in a run of the real command with real engines: noticed, mended within a budget, and nothing lost."""
 
+import contextlib
 import json
 import signal
 import subprocess
@@ -44,10 +45,19 @@ def mischief(rules: dict[str, dict]) -> dict[str, str]:
     return {"PYTHONPATH": str(HERE / "mischief"), "MISCHIEF": json.dumps(rules)}
 
 
+def rings(run: subprocess.Popen[str], number: int) -> list[Path]:
+    """The learner's descriptors of an actor's ring; none before it is made."""
+    found = []
+    for link in Path(f"/proc/{run.pid}/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # closed since
+            if link.readlink().name.startswith(f"memfd:gvz-ring-{number} "):
+                found.append(link)
+    return found
+
+
 def writer(run: subprocess.Popen[str], number: int) -> tuple[int, WriterState]:
     """Process id and state of an actor, from its ring."""
-    (file,) = janitor.SHM_DIR.glob(f"gvz-{run.pid}-*-ring-{number}")
-    words = np.frombuffer(file.read_bytes()[HEADER_BYTES:], "<u8", 8)
+    words = np.frombuffer(rings(run, number)[0].read_bytes()[HEADER_BYTES:], "<u8", 8)
     return int(words[ring._PID]), WriterState(words[ring._STATE])
 
 
@@ -60,7 +70,7 @@ def actor(run: subprocess.Popen[str], number: int) -> psutil.Process:
             return False
         return len(engines(psutil.Process(pid))) == 2  # else it has attached to the ring but not begun to say its own
 
-    wait_until(lambda: list(janitor.SHM_DIR.glob(f"gvz-{run.pid}-*-ring-{number}")) != [], "the rings")
+    wait_until(lambda: rings(run, number) != [], "the rings")
     wait_until(plays, f"actor {number} to play")
     return psutil.Process(writer(run, number)[0])
 
