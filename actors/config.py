@@ -22,14 +22,14 @@ class ActorsConfig:
     start_timeout_s: float = 120.0
     """an actor that has not started all its games by then is restarted"""
     heartbeat_timeout_s: float = 30.0
-    """an actor that shows no sign of life for so long is killed and restarted"""
+    """an actor without a heartbeat for this many seconds is killed and replaced"""
     max_restarts: int = 20
     """restarts of one actor within restart_window_s before the run stops with an error"""
     restart_window_s: float = 600.0
     """length of the window in which restarts are counted"""
     recycle_episodes: int = 1000
-    """a game's engine is restarted after so many episodes at most (ViZDoom has leaked memory over hours); 0: only where
-    the task needs it. A task with fuzzy enemies needs it after every episode, so that each can be replayed alone"""
+    """a game's engine is restarted after at most this many episodes (ViZDoom has leaked memory over hours); 0: only
+    where the task needs it, as with fuzzy enemies: a fresh engine for every episode lets each be replayed alone"""
 
     def __post_init__(self) -> None:
         for name, low, high in (

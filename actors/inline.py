@@ -65,7 +65,7 @@ class InlinePool:
             self._loop.set_params(*self._published)
 
     def drain(self, max_records: int, wait_s: float = 0.0) -> list[StepBlock]:
-        """Plays until there are `max_records` records and returns exactly so many; there is nothing to wait for.
+        """Plays until there are `max_records` records and returns exactly these; there is nothing to wait for.
 
         Raises:
             ValueError: no parameters were published.

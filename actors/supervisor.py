@@ -16,7 +16,7 @@ from gvz.transport.ring import RingReader, WriterState
 _DUMP_S = 0.5
 """time given to a stuck actor to write its stacks before it is killed"""
 _STABLE_S = 10.0
-"""an actor that has played for so long is soon restarted; others wait longer each time"""
+"""an actor that has played for this time is restarted soon; others wait longer each time"""
 _FIRST_BACKOFF_S, _LONGEST_BACKOFF_S = 0.25, 15.0
 
 
@@ -80,7 +80,7 @@ class SupervisedActor:
             received = self.process.receive()
             self._check(received)
             messages += received
-        except TransportError as error:  # its process is beside itself, the others are not
+        except TransportError as error:  # this actor's stream is corrupt; the others are fine
             exit_text = f"sent what is no message of its own ({error})"
         if any(isinstance(message, Ready) for message in messages):
             self._ready_at, self._silent_s = now, 0.0

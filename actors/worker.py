@@ -23,7 +23,7 @@ from gvz.transport.messages import ActorSpec, Fault, Ready, Stop
 from gvz.transport.ring import RingWriter, WriterState
 
 SPACE_TIMEOUT_S = 3600.0
-"""a learner that reads nothing for so long is given up (it compiles, saves and is paused for far shorter times)"""
+"""an actor ends when its learner reads nothing for this time (compiling, saving and pauses take far less)"""
 PARAMS_TIMEOUT_S = 600.0
 """likewise for the first version of the parameters"""
 MAX_PARAMS_SHARE = 0.05

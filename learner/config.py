@@ -119,7 +119,7 @@ class ReplayConfig:
     min_priority: float = 0.01
     """added to a TD error before the exponent"""
     num_newest: int = 0
-    """so many newest transitions stand at the tail of every batch (combined experience replay)"""
+    """newest transitions at the end of every batch (combined experience replay)"""
 
     def __post_init__(self) -> None:
         _check(

@@ -1,7 +1,7 @@
 """From the actors' blocks to the replay's: one fixed size, checked and counted.
 
 What is handed on stands in fresh memory that nothing writes to again. JAX on a CPU may use an aligned numpy array as
-it is, without a copy, and runs behind its caller; a staging buffer filled anew for the next records would change the
+it is, without a copy, and runs behind its caller; a staging buffer filled again with the next records would change the
 frames of the last. Fresh memory costs the one copy that joins the blocks anyway, and no waiting.
 """
 

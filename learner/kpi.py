@@ -8,7 +8,7 @@ from learner.config import LearnerConfig
 class TaskKpis:
     """Running mean of each task's score, and the weight of its samples.
 
-    KPI_j is the mean of task j's last `kpi_window_episodes` scores (fewer until there are so many), and
+    KPI_j is the mean of task j's last `kpi_window_episodes` scores (fewer at the start), and
     w_j = max_i KPI_i / KPI_j. Source: thesis eq. 4.19, 4.20. Differs: a weight is at most `kpi_max_weight` (the
     thesis divides by zero for KPI 0), and all weights are 1 until every task has finished an episode.
     """

@@ -1,7 +1,7 @@
 """How the learner's process handles memory that was freed.
 
 A train step on a CPU takes some 85 MB of scratch memory and frees them again. glibc gives blocks of that size back to
-the kernel at once, so that every step has them mapped, cleared and faulted in anew, 4 KB at a time: 21,000 page faults
+the kernel at once, so that every step has them mapped, cleared and faulted in again, 4 KB at a time: 21,000 page faults
 a step, and 29% of the processor time of an hour of `rainbow_4task` on two cores. With the memory kept, a step takes 94
 to 106 ms instead of 134 (alternating, two rounds; 2026-11-21, 2-core AMD EPYC).
 """

@@ -55,7 +55,7 @@ class ReplaySpec:
     prioritized: bool
     """False samples uniformly"""
     num_newest: int
-    """so many newest transitions stand at the tail of every batch"""
+    """newest transitions at the end of every batch"""
 
     def __post_init__(self) -> None:
         if self.lane_capacity < self.stack_size + self.n_steps:
@@ -324,7 +324,7 @@ def check_can_sample(spec: ReplaySpec, state: ReplayState) -> None:
 
 
 def _moved(spec: ReplaySpec, slot: Array, steps: Array | int) -> Array:
-    """The slot so many records later (earlier if negative) in the same lane's circle."""
+    """The slot that many records later (earlier if negative) in the same lane's circle."""
     lane_start = slot // spec.lane_capacity * spec.lane_capacity
     return lane_start + (slot + steps) % spec.lane_capacity
 

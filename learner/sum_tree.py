@@ -5,7 +5,7 @@ one aligned row of the level below. Its sum is never stored for the root: the to
 
 Float32 is safe here for three reasons. A parent is recomputed from its children, never adjusted by a difference, so
 nothing drifts. A draw can only enter a child with a positive sum, so rounding at a boundary never ends in a leaf of
-zero, or beyond the filled part. And the bits of a draw that rounding to the total takes away are drawn anew halfway
+zero, or beyond the filled part. And the bits of a draw that rounding to the total takes away are drawn again halfway
 down, so that a leaf far smaller than the total's rounding step still gets its share.
 """
 
@@ -116,7 +116,7 @@ def sample(tree: SumTree, key: Key[Array, ""], batch_size: int) -> tuple[Int[Arr
         child, child_start, value = _choose_child(rows[first_rows[level] + node], target)
         return node * FANOUT + child, target - child_start, value / all_sum
 
-    # A loop, not unrolled levels: XLA would fuse these into one another and choose the child of one level anew for
+    # A loop, not unrolled levels: XLA would fuse these into one another and choose the child of one level again for
     # every child of the next (measured: 3x slower at batch 512). What is returned comes out of the loop, so that a
     # `set` of drawn leaves has no reading of the nodes beside it and is done in place.
     top = (jnp.zeros(batch_size, jnp.int32), target, jnp.ones(batch_size))

@@ -44,7 +44,7 @@ LAUNCHER_FILE = "launch"
 _LAUNCH_S = 0.05
 """from fork to the first line of a launcher, and ample"""
 _PARTIAL_S = 3600.0
-"""a record half written for so long will stay so"""
+"""a record that is half written after this time will never be whole"""
 KILL_TIMEOUT_S = 30.0
 """the kernel takes milliseconds over a SIGKILL, unless the process hangs in a driver or in a dead file system"""
 _ENGINE_SHM_PREFIXES = ("ViZDoomSM", "ViZDoomMQCtr", "ViZDoomMQDoom")

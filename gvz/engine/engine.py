@@ -133,7 +133,7 @@ class Engine:
         return self.state()
 
     def advance(self, buttons: Sequence[float], tics: int) -> bool:
-        """Holds the buttons for so many tics, or until the player dies.
+        """Holds the buttons for `tics` tics, or until the player dies.
 
         Args:
             buttons: one number a button, in the order of the configuration.

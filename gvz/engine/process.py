@@ -23,7 +23,7 @@ from gvz.core import janitor
 from gvz.core.errors import EngineError, ResourceError
 
 _START_LOCKS = tuple(f"start-{place}" for place in range(min(8, max(2, os.cpu_count() or 1))))
-"""so many engines of one user start at the same time, over all processes; many at once fail (ViZDoom #355)"""
+"""at most this many engines of one user start at the same time, over all processes; many at once fail (ViZDoom #355)"""
 _SHM_BYTES = 16 * 2**20
 """free shared memory a start needs: the three files of one engine take 10.8 MB"""
 _LAUNCHER_MODE = 0o700
@@ -51,7 +51,7 @@ def make_directory() -> Path:
 def write_launcher(directory: Path, engine: Path, log: Path) -> Path:
     """Writes the script that the client library launches in place of the engine (see wrapper.py).
 
-    The client has made its message queues by then, so the script notes their id first of all. It is made anew for
+    The client has made its message queues by then, so the script notes their id first of all. It is made again for
     every engine, because an installed file might not be executable, and its first line might be too long or hold blanks
     for a `#!` line.
 

@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 
 EPISODE_TIMEOUT_S = 900.0
-"""an episode takes seconds; a machine on which none ends for so long has a worker that hangs"""
+"""an episode takes seconds; if none ends within this time, a worker hangs"""
 MAX_ATTEMPTS = 3
-"""times an episode is begun anew when its engine died"""
+"""times an episode is played again when its engine died"""
 
 
 class Episode(NamedTuple):

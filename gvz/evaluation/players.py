@@ -44,7 +44,7 @@ class RandomPlayer:
         return int(self._rng.integers(self._num_actions))
 
     def observe(self, observation: "Observation", info: dict[str, Any]) -> None:
-        """Chance looks at nothing."""
+        """Ignores observations."""
 
 
 class IdlePlayer:

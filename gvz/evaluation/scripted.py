@@ -47,7 +47,7 @@ class Sight:
         return label.y + label.height - self._horizon
 
     def ahead(self, label: "Label", half_width: float) -> bool:
-        """Whether the middle of a label's box is within so many pixels of the screen's middle."""
+        """Whether the middle of a label's box is at most `half_width` pixels from the screen's middle."""
         return abs(self._offset(label)) <= half_width
 
     def turn_to(self, label: "Label") -> str:
@@ -182,7 +182,7 @@ class SweepPlayer:
         return self._actions[next(self._script)]
 
     def observe(self, observation: "Observation", info: dict[str, Any]) -> None:
-        """It looks at nothing."""
+        """Ignores observations."""
 
 
 class ScriptedPlayer:

@@ -3,7 +3,7 @@
 The unit of comparison between agents is the *run*: one training seed. Scores of several runs on several tasks are a
 matrix [S, T] (seeds, tasks) of means over evaluation episodes; the statistics are of such matrices, with any axes
 before, and of plain vectors, which are matrices of one run. An interval is a percentile bootstrap interval, and it
-says what was drawn anew: episodes (how well are these very agents known?) or runs (what would other seeds give?).
+says what was resampled: episodes (how well are these very agents known?) or runs (what would other seeds give?).
 
 Source: thesis 3.1 (performance indicators, eq. 3.1 and 3.2) and 3.1.4 (solved); Agarwal et al. 2021, "Deep RL at the
 edge of the statistical precipice" (interquartile mean, probability of improvement, stratified bootstrap).
@@ -22,7 +22,7 @@ Cells = Sequence[Sequence[np.ndarray]]
 """scores of single episodes: cells[s][t] is float64[E] of run s on task t; E may differ from cell to cell"""
 
 Redraw = Literal["episodes", "runs", "runs_by_task"]
-"""what a bootstrap draws anew, with replacement
+"""what a bootstrap resamples, with replacement
 
 episodes: episodes within each task and run. runs: whole runs, each with its scores on all tasks: right where one agent
 was evaluated on all of them. runs_by_task: runs within each task, independently of the other tasks: right where every
@@ -151,7 +151,7 @@ def bootstrap(
     """A statistic of all scores together, with a percentile interval from a stratified bootstrap.
 
     Args:
-        strata: scores of each stratum (task, or task and seed), float[E]; each is drawn anew within itself.
+        strata: scores of each stratum (task, or task and seed), float[E]; each is resampled within itself.
         statistic: of the scores of all strata as one vector.
         confidence: of the interval, 0..1.
         num_resamples: bootstrap samples.
@@ -184,9 +184,9 @@ def bootstrap_runs(
     """A statistic of the runs' mean scores, with a percentile interval.
 
     Args:
-        groups: what the statistic takes, each drawn anew by itself: one scenario's runs each, or ours and theirs.
+        groups: what the statistic takes, each resampled by itself: one scenario's runs each, or ours and theirs.
         statistic: f(scores [..., S, T] of each group) -> [...].
-        redraw: what is drawn anew in each group. Of a single run only episodes can be.
+        redraw: what is resampled in each group. Of a single run only episodes can be.
         confidence: of the interval, 0..1.
         num_resamples: bootstrap samples.
         seed: of the resampling.
@@ -212,7 +212,7 @@ def _means(cells: Cells) -> np.ndarray:
 
 
 def _redrawn(cells: Cells, redraw: Redraw, num_resamples: int, rng: np.random.Generator) -> np.ndarray:
-    """Means of what was drawn anew, float64[R, S, T]."""
+    """Means of what was resampled, float64[R, S, T]."""
     num_runs, num_tasks = len(cells), len(cells[0])
     match redraw:
         case "episodes":

@@ -94,9 +94,9 @@ class Experiment:
     evaluate_on: EvaluateOn
     """own: the task trained on; test: the scenario's test set; all: its named tasks"""
     tasks_per_level: int | None = None
-    """so many tasks of a level are trained alone and evaluated on, in the thesis's order; None: all (see `scale`)"""
+    """this many tasks of a level are trained alone and evaluated on, in the thesis's order; None: all (see `scale`)"""
     table_checkpoints: int = 5
-    """the table is over the last so many checkpoints"""
+    """the table is over the last checkpoints, this many"""
     columns: Columns
     """of the table"""
     players: tuple[SimplePlayer, ...] = ("random",)

@@ -70,7 +70,7 @@ def agent_scores(episodes: pl.DataFrame, agent: str, *, column: str = "normalize
 
 
 def redraw(scores: Scores, tasks: Sequence[str]) -> Redraw:
-    """What a bootstrap can draw anew: runs, if there are several, else episodes."""
+    """What a bootstrap can resample: runs, if there are several, else episodes."""
     if len(scores.complete_seeds(tasks)) < 2:
         return "episodes"
     return "runs_by_task" if scores.agents_of_tasks else "runs"

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from gvz.run.progress import TaskStatus
 
 ZERO_EPISODES = 30
-"""a task whose last so many episodes scored nothing (as many as its KPI looks back on) is one that is not learned"""
+"""a task whose last episodes, this many, scored nothing is not learned (its KPI looks back as far)"""
 ENDLESS_EPISODES = 2
-"""a game that has played for so many time-outs and ended no episode does not end them"""
+"""a game that has played for this many time-outs without an end of an episode does not end them"""
 EDGE_SHARE = 0.02
 """part of the values' range, at either end, that counts as its edge"""
 STALE = 10
-"""acting parameters that are older than records can wait by so many times are not taken by the actors"""
+"""warn when staleness exceeds the expected maximum by this factor"""
 _EVENLY_FILLED = 0.5
 """share of the replay from which on its records are weighed: before, a quick game is simply ahead"""
 

@@ -38,9 +38,9 @@ DRAIN_RECORDS = 256
 DRAIN_WAIT_S = 0.02
 """longest wait for a record before the loop looks after its actors again"""
 NO_RECORDS_TIMEOUT_S = 900.0
-"""a run whose actors deliver nothing for so long is stopped; a stuck actor is replaced long before"""
+"""a run whose actors deliver nothing for this time is stopped; a stuck actor is replaced long before"""
 LONGEST_ROUND_S = 1800.0
-"""a learner that is at one round for so long (it compiles in one, too) is stuck in the device, and ended"""
+"""a learner whose round takes longer is stuck in the device and is ended (a round may compile)"""
 
 
 class Trainer:

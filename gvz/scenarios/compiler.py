@@ -1,6 +1,6 @@
 """Task -> WAD file: content of a task, its map, script and classes, and the cache.
 
-A WAD is always built anew (some 20 ms) and kept in the user's cache directory under the hash of its
+A WAD is always built (some 20 ms) and kept in the user's cache directory under the hash of its
 bytes, so a cached file is either what this version of the code builds, or not found. Nothing here starts an engine.
 """
 
