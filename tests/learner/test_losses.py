@@ -102,6 +102,7 @@ def test_projection_of_hand_worked_examples():
     np.testing.assert_allclose(losses.project(moved, p, atoms), wanted, atol=1e-7)
 
 
+@pytest.mark.isa
 @settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
@@ -121,6 +122,7 @@ def test_projection_keeps_mass_and_equals_the_oracle(seed: int, r: float, discou
         assert abs(projected @ atoms - p @ moved) < 1e-3 * span
 
 
+@pytest.mark.isa
 @pytest.mark.parametrize("double", [False, True])
 def test_categorical_loss_equals_the_float64_oracle(double: bool):
     for seed in range(20):
@@ -192,6 +194,7 @@ def rlax() -> ModuleType:
     return rlax
 
 
+@pytest.mark.isa
 # Importing rlax touches names that jax has deprecated, and rlax points from its own cross-entropy to distrax's.
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore:Rlax:PendingDeprecationWarning")
 def test_losses_agree_with_rlax(rlax: ModuleType):
