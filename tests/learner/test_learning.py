@@ -40,6 +40,13 @@ from tests.learner.games import (
 
 pytestmark = pytest.mark.isa
 
+
+@pytest.fixture
+def record_property(record_property: Callable[[str, object], None]) -> Callable[[str, float], None]:
+    """As pytest's, for numbers of numpy, too: pytest-xdist sends no others than Python's between its processes."""
+    return lambda name, value: record_property(name, float(value))
+
+
 LANES = 4
 OFF = AgentConfig(
     double=False,
