@@ -9,7 +9,7 @@ from gvz.run import doctor
 
 
 def test_json_has_a_line_for_every_check(capsys, monkeypatch):
-    slow = (doctor.check_engine, doctor.check_learner)  # tests/test_doctor.py runs all of them
+    slow = (doctor.check_engine, doctor.check_learner)  # tests/run/test_doctor.py runs all of them
     monkeypatch.setattr(doctor, "CHECKS", tuple(check for check in doctor.CHECKS if check not in slow))
     assert cli.main(["doctor", "--json"]) == 0
     rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
