@@ -50,7 +50,7 @@ class Moment:
 
 
 # Found by a search over seeds, poses and tics for frames that show what every attribute of the map's tasks changes;
-# tests/test_gallery.py says what has to be in sight.
+# tests/evaluation/test_gallery.py says what has to be in sight.
 MOMENTS: Mapping[tuple[str, str], Moment] = {
     ("defend_the_center", "defend_the_center.wad"): Moment(seed=4, tics=100, pose=Pose(0, 0, 40)),
     ("dodge_projectiles", "defend_the_line.wad"): Moment(seed=8, tics=80, pose=Pose(-480, 160, 0)),
