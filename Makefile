@@ -41,8 +41,8 @@ test-isa: install ## tests of learning and of the learner's numbers, as older pr
 	done
 
 learning-seeds: install ## ten seeds of every test of learning under three instruction sets: the figures beside the tests
-	for flags in "" --xla_cpu_max_isa=AVX2 --xla_cpu_max_isa=SSE4_2; do \
-	  XLA_FLAGS=$$flags $(BIN)/python -m pytest tests/learner/test_learning.py --learning-seeds 10 \
+	for isa in AMX_FP16 AVX2 SSE4_2; do \
+	  XLA_FLAGS=--xla_cpu_max_isa=$$isa $(BIN)/python -m pytest tests/learner/test_learning.py --learning-seeds 10 \
 	    --timeout 1800 -q $(ARGS) || exit 1; \
 	done
 
