@@ -74,7 +74,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             config: sizes, action set, profile.
             render_mode: rgb_array: `render()` gives the screen, uint8 [render_height, render_width, 3];
                 human: a window shows the game at its true speed.
-            recycle_episodes: restart the engine after at most so many episodes; default: where the task needs it. A
+            recycle_episodes: restart the engine after at most this many episodes; default: where the task needs it. A
                 task with fuzzy enemies gets a fresh engine for every episode, whatever the number: the engine's fuzz
                 goes on from episode to episode, so only a fresh engine draws it the same again. Nothing else that can
                 be seen depends on it. 0 never restarts, not even there: for players that do not look.

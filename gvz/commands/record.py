@@ -36,7 +36,7 @@ class Record:
 
     out: Path
     """file to write: .mp4, .webp or .gif"""
-    cast: Annotated[EpisodeChoice, tyro.conf.arg(name="")] = ANY_EPISODE
+    choice: Annotated[EpisodeChoice, tyro.conf.arg(name="")] = ANY_EPISODE
     seconds: float | None = None
     """of game time, from the episode's start; default all of it (.gif, .webp: at most 20)"""
     tensorboard: bool = False
@@ -51,10 +51,10 @@ class Record:
 
         if self.seconds is not None and self.seconds <= 0:
             raise ConfigError(f"--seconds: got {self.seconds:g}, want more than 0")
-        if self.tensorboard and (self.out.suffix != ".gif" or self.cast.run_dir is None):
+        if self.tensorboard and (self.out.suffix != ".gif" or self.choice.run_dir is None):
             raise ConfigError("--tensorboard: want a run directory and an --out that ends with .gif, which it can show")
         check_video_file(self.out)
-        player_spec, task = self.cast.resolve()
+        player_spec, task = self.choice.resolve()
         panel, every_tic = make_panel(player_spec, task), self.out.suffix == ".mp4"
         seconds = self.seconds if every_tic or self.seconds is not None else ANIMATION_S
         timeout = task.scenario.timeout_frames(player_spec.env.profile)
@@ -62,7 +62,7 @@ class Record:
         shown: list[Moment] = []
 
         def pictures() -> "Generator[Image, None, None]":
-            episode = Episode(task.id, self.cast.episode, self.cast.seed)
+            episode = Episode(task.id, self.choice.episode, self.choice.seed)
             with contextlib.closing(perform(player_spec, episode)) as moments, _progress(num_tics) as advance:
                 for moment in moments:
                     shown[:] = [moment]
@@ -80,8 +80,8 @@ class Record:
         except KeyboardInterrupt:
             print("interrupted; nothing was written", file=sys.stderr)
             return EXIT_INTERRUPTED
-        if self.tensorboard and self.cast.run_dir is not None:
-            events = self.cast.run_dir / "tensorboard" / "episodes"
+        if self.tensorboard and self.choice.run_dir is not None:
+            events = self.choice.run_dir / "tensorboard" / "episodes"
             add_to_tensorboard(self.out, events, f"episode/{task.id}", player_spec.identity["num_updates"])
         [last] = shown
         how = "died" if last.terminated else "reached the time-out" if last.truncated else "was cut off"

@@ -31,7 +31,7 @@ class Watch:
               gvz watch --player random --task seek_and_kill/blue --episodes 3
     """
 
-    cast: Annotated[EpisodeChoice, tyro.conf.arg(name="")] = ANY_EPISODE
+    choice: Annotated[EpisodeChoice, tyro.conf.arg(name="")] = ANY_EPISODE
     episodes: int | None = None
     """how many, one after the other; default until the window is closed"""
     speed: float = 1.0
@@ -43,7 +43,7 @@ class Watch:
             raise ConfigError(f"--episodes: got {self.episodes}, want at least 1")
         if self.speed <= 0:
             raise ConfigError(f"--speed: got {self.speed:g}, want more than 0")
-        player_spec, task = self.cast.resolve()
+        player_spec, task = self.choice.resolve()
         from gvz.evaluation.panel import HEIGHT, WIDTH
         from gvz.viewer import Window
 
@@ -54,10 +54,10 @@ class Watch:
                 "watch: no window can be opened, there seems to be no display ($DISPLAY); "
                 "`gvz record` writes the same pictures to a file"
             ) from error
-        episode = self.cast.episode
+        episode = self.choice.episode
         with contextlib.closing(window):
             try:
-                while not window.closed and (self.episodes is None or episode < self.cast.episode + self.episodes):
+                while not window.closed and (self.episodes is None or episode < self.choice.episode + self.episodes):
                     self._show(window, player_spec, task, episode)
                     episode += 1
             except KeyboardInterrupt:
@@ -74,7 +74,7 @@ class Watch:
         from gvz.evaluation.playback import perform
 
         panel, begun_s = make_panel(player_spec, task), time.monotonic()
-        with contextlib.closing(perform(player_spec, Episode(task.id, episode, self.cast.seed))) as moments:
+        with contextlib.closing(perform(player_spec, Episode(task.id, episode, self.choice.seed))) as moments:
             for moment in moments:
                 if moment.frames == 0:
                     begun_s = time.monotonic()  # the engines have started

@@ -1,4 +1,4 @@
-"""Where things are kept that can always be made again: compiled maps and compiled XLA programs. Tier 0."""
+"""Where things are kept that can always be made again: compiled maps and compiled XLA programs."""
 
 import os
 from pathlib import Path
