@@ -104,7 +104,7 @@ bench-micro: install ## timed bodies of tests/perf
 docs: install    ## the documentation as a site, in site/
 	$(BIN)/python -m mkdocs build --strict
 
-lock: install    ## resolve requirements.lock anew from pyproject.toml
+lock: install    ## resolve requirements.lock from pyproject.toml
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev pyproject.toml \
 	  --no-emit-index-url --no-header --no-annotate --no-emit-package opencv-python --output-file requirements.lock
 

@@ -1,4 +1,4 @@
-"""The pool of sync mode: the same acting loop in the learner's own process.
+"""The `Pool` of sync mode: the same acting loop in the learner's own process.
 
 A game is played only inside `drain`, so a run is a function of its seed, and `state` holds all that is needed to go
 on bit for bit.
@@ -10,21 +10,17 @@ from typing import Any
 import numpy as np
 
 from actors.loop import ActorLoop
-from actors.pool import PoolConfig, PoolStatistics, num_decisions
+from actors.pool import Pool, PoolConfig, PoolStatistics, lanes_to_begin_with, num_decisions
 from gvz.core.errors import ResumeError
-from gvz.transport.messages import STEP_DTYPE, EpisodeStats, Message, ParamsHeader, StepBlock, decode, encode
+from gvz.transport.messages import Message, ParamsHeader, StepBlock, decode, encode
 from gvz.transport.ring import RingReader
 
 
-class InlinePool:
-    """One loop that plays every lane. Use as a context manager, or `close` it."""
+class InlinePool(Pool):
+    """One loop that plays every lane."""
 
     def __init__(self, config: PoolConfig, state: dict[str, Any] | None = None):
-        """Starts every game.
-
-        Args:
-            config: what to play; sync mode has `num_actors` 1.
-            state: what `state()` returned in the run that is resumed.
+        """Starts every game; `state` is what `state()` returned in the run that is resumed.
 
         Raises:
             ValueError: more than one actor.
@@ -32,16 +28,16 @@ class InlinePool:
         """
         if config.num_actors != 1:
             raise ValueError(f"num_actors: got {config.num_actors}, want 1: inline, all games are one actor's")
-        (spec,) = config.actor_specs([0] * config.num_lanes)
+        (spec,) = config.actor_specs(lanes_to_begin_with(config, None))
         self._messages: list[Message] = []
-        self._ring = RingReader.create("gvz-ring-inline", spec.ring_capacity, config.frame_shape)
+        self._ring = RingReader.create("gvz-ring-inline", spec.ring_capacity, config.frame_shape, config.record_dtype)
         self._writer = self._ring.writer()
         self._published: tuple[np.ndarray, ParamsHeader] | None = None
-        self._rest = StepBlock(np.empty(0, STEP_DTYPE), np.empty((0, *config.frame_shape), np.uint8))
+        self._rest = StepBlock(np.empty(0, config.record_dtype), np.empty((0, *config.frame_shape), np.uint8))
         """played, but not yet asked for"""
         self._num_games = len(spec.lanes)
         self._needs_params = bool(spec.policy)
-        self._env_steps = self._episodes = 0
+        self._env_steps = 0
         self._loop = ActorLoop(spec, self._writer, self._messages.append)
         try:
             if state is None:
@@ -52,20 +48,16 @@ class InlinePool:
             self.close()
             raise
 
-    def __enter__(self) -> "InlinePool":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def publish(self, params: np.ndarray, header: ParamsHeader) -> None:
-        """Acts by `params` float32[P] (copied) from now on."""
         if self._needs_params:
             self._published = (params.copy(), header)
             self._loop.set_params(*self._published)
 
+    def assign(self, lane: int, task: int) -> None:
+        self._loop.assign(lane, task)
+
     def drain(self, max_records: int, wait_s: float = 0.0) -> list[StepBlock]:
-        """Plays until there are `max_records` records and returns exactly these; there is nothing to wait for.
+        """Plays until there are `max_records` records and returns exactly these; it never waits.
 
         Raises:
             ValueError: no parameters were published.
@@ -87,10 +79,8 @@ class InlinePool:
         return blocks
 
     def poll(self) -> list[Message]:
-        """Episodes and faults since the last call."""
         messages = list(self._messages)
         self._messages.clear()
-        self._episodes += sum(isinstance(message, EpisodeStats) for message in messages)
         return messages
 
     def state(self) -> dict[str, Any]:
@@ -108,10 +98,8 @@ class InlinePool:
         }
 
     def statistics(self) -> PoolStatistics:
-        """Counters for the log; nobody ever waits."""
         return PoolStatistics(
             env_steps=self._env_steps,
-            episodes=self._episodes,
             restarts=0,
             actors_ready=1,
             waited_for_space_s=0.0,
@@ -131,7 +119,7 @@ class InlinePool:
         if state["published"] is not None:
             header = ParamsHeader(**state["published"]["header"])
             self.publish(np.frombuffer(state["published"]["params"], np.float32), header)
-        steps = np.frombuffer(state["rest_steps"], STEP_DTYPE)
+        steps = np.frombuffer(state["rest_steps"], self._ring.dtype)
         frames = np.frombuffer(state["rest_frames"], np.uint8).reshape(len(steps), *self._ring.frame_shape)
         self._rest = StepBlock(steps, frames)
         self._messages += [decode(data) for data in state["messages"]]

@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 
 from actors.policy import make_policy
-from actors.preprocess import push_frame, start_stack
+from actors.preprocess import ObservationBatch
 from gvz.core.errors import ConfigError, ResumeError
 from gvz.transport.messages import ActorSpec, EpisodeStats, Fault, Message, ParamsHeader
 from gvz.transport.ring import RingWriter, WriterState
@@ -24,10 +24,12 @@ class Game:
     """One lane: an environment and what has happened since its episode began."""
 
     env: gymnasium.Env[np.ndarray, int]
+    index: int
+    """row of the batch that the policy sees"""
     lane: int
     task: int
-    stack: np.ndarray
-    """uint8[H, W, stack_size * C], a view of the batch that the policy sees"""
+    next_task: int
+    """of the episodes after this one"""
     episode: int
     """number within the lane"""
     seed: int = 0
@@ -56,13 +58,17 @@ class ActorLoop:
     """
 
     def __init__(self, spec: ActorSpec, ring: RingWriter, emit: Callable[[Message], None]):
-        height, width, channels = spec.frame_shape
-        obs_shape = (len(spec.lanes), height, width, channels * spec.stack_size)
         self._spec = spec
         self._ring = ring
         self._emit = emit
-        self._obs = np.zeros(obs_shape, np.uint8)
-        self._tasks = np.array(spec.lane_tasks, np.int32)
+        self._obs = ObservationBatch(
+            len(spec.lanes),
+            spec.frame_shape,
+            spec.stack_size,
+            past_actions=spec.past_actions,
+            variables=spec.variables,
+            action_masks=spec.action_masks,
+        )
         self._params_version = 0
         self.games: list[Game] = []
         ring.beat(WriterState.STARTING)
@@ -70,7 +76,7 @@ class ActorLoop:
             spec.policy,
             num_actions=spec.num_actions,
             num_params=spec.num_params,
-            obs_shape=obs_shape,
+            obs=self._obs.arrays,
             seed=derive_seed(spec.seed, spec.actor, *spec.first_episodes),
         )
 
@@ -82,11 +88,10 @@ class ActorLoop:
             ResumeError: a game does not come to where it was.
         """
         spec = self._spec
-        for index, (lane, task, episode) in enumerate(
-            zip(spec.lanes, spec.lane_tasks, spec.first_episodes, strict=True)
-        ):
+        tasks = spec.lane_tasks if state is None else [game["task"] for game in state["games"]]
+        for index, (lane, task, episode) in enumerate(zip(spec.lanes, tasks, spec.first_episodes, strict=True)):
             self._ring.beat(WriterState.STARTING)
-            game = Game(env=self._make_env(task), lane=lane, task=task, stack=self._obs[index], episode=episode)
+            game = Game(env=self._make_env(task), index=index, lane=lane, task=task, next_task=task, episode=episode)
             self.games.append(game)
             if state is None:
                 self._reset(game)
@@ -100,11 +105,15 @@ class ActorLoop:
         self._policy.set_params(params, header)
         self._params_version = header.version
 
+    def assign(self, lane: int, task: int) -> None:
+        """The next episodes of a lane are of the task with this index; the present one ends first."""
+        next(game for game in self.games if game.lane == lane).next_task = task
+
     def step(self) -> None:
         """One decision for every game: writes one record each, then plays on. The ring must have the room."""
         self._ring.beat(WriterState.ACTING)
-        actions = self._policy.act(self._obs, self._tasks)
-        self._write(actions)
+        actions, extras = self._policy.act(self._obs.arrays)
+        self._write(actions, extras)
         for game, action in zip(self.games, actions.tolist(), strict=True):
             if game.terminated or game.truncated:
                 self._finish(game)
@@ -117,6 +126,8 @@ class ActorLoop:
         """All that `begin` needs to come back here, as msgpack types. The parameters are not in it."""
         games = [
             {
+                "task": game.task,
+                "next_task": game.next_task,
                 "episode": game.episode,
                 "actions": list(game.actions),
                 "params_version": game.params_version,
@@ -135,19 +146,23 @@ class ActorLoop:
         module, _, name = self._spec.env_entry_point.partition(":")
         return getattr(importlib.import_module(module), name)(self._spec.tasks[task], self._spec.env_config)
 
-    def _write(self, actions: np.ndarray) -> None:
-        """Publishes o_t, r_t, the end flags and a_t of every game."""
+    def _write(self, actions: np.ndarray, extras: np.ndarray) -> None:
+        """Publishes o_t, r_t, the end flags, a_t and what goes with them of every game."""
         games = self.games
         steps, frames = self._ring.reserve(len(games))
         steps["episode"] = [game.episode for game in games]
         steps["params_version"] = self._params_version
         steps["reward"] = [game.reward for game in games]
         steps["lane"] = self._spec.lanes
-        steps["task"] = self._tasks
+        steps["task"] = self._obs.arrays["task"]
         steps["first"] = [not game.actions for game in games]
         steps["terminated"] = [game.terminated for game in games]
         steps["truncated"] = [game.truncated for game in games]
         steps["action"] = np.where(steps["terminated"] | steps["truncated"], 0, actions)
+        if self._spec.variables:
+            steps["vector"] = self._obs.arrays["vector"]
+        if self._spec.num_extras:
+            steps["extras"] = extras
         for frame, game in zip(frames, games, strict=True):
             frame[...] = game.frame
         self._ring.commit()
@@ -159,7 +174,7 @@ class ActorLoop:
         game.reward_sum += game.reward
         for name, value in game.info["reward_components"].items():
             game.reward_components[name] = game.reward_components.get(name, 0.0) + float(value)
-        push_frame(game.stack, frame)
+        self._obs.push(game.index, action, frame, game.info.get("variables", {}))
 
     def _finish(self, game: Game) -> None:
         """Reports the episode, whose last record is written, and starts the next."""
@@ -184,6 +199,9 @@ class ActorLoop:
             )
         )
         game.episode += 1
+        if game.next_task != game.task:
+            game.env.close()
+            game.task, game.env = game.next_task, self._make_env(game.next_task)
         self._reset(game)
 
     def _report_crash(self, game: Game, when: str) -> None:
@@ -200,18 +218,19 @@ class ActorLoop:
         game.frame, game.info = game.env.reset(options={"episode_seed": game.seed})
         if game.info.get("engine_crash", False):
             self._report_crash(game, "before the first decision")
-        if list(game.frame.shape) != self._spec.frame_shape or game.frame.dtype != np.uint8:
+        if game.frame.shape != self._spec.frame_shape or game.frame.dtype != np.uint8:
             raise ConfigError(
                 f"{self._spec.env_entry_point}({self._spec.tasks[game.task]!r}): got a frame "
-                f"{game.frame.dtype}{list(game.frame.shape)}, want uint8{self._spec.frame_shape}"
+                f"{game.frame.dtype}{list(game.frame.shape)}, want uint8{list(self._spec.frame_shape)}"
             )
         game.reward, game.terminated, game.truncated = 0.0, False, False
         game.actions, game.reward_sum, game.reward_components = [], 0.0, {}
-        start_stack(game.stack, game.frame)
+        self._obs.begin(game.index, game.task, game.frame, game.info.get("variables", {}))
 
     def _replay(self, game: Game, state: dict[str, Any]) -> None:
         """Brings a game to where `state` left it: same episode, same seed, same actions."""
         game.episode, game.params_version = state["episode"], state["params_version"]
+        game.next_task = state["next_task"]
         self._reset(game)
         for action in state["actions"]:
             self._ring.beat(WriterState.RESETTING)

@@ -15,10 +15,8 @@ from gvz.core import janitor
 from gvz.core.cache import xla_cache_directory
 from gvz.transport.broadcast import BroadcastWriter
 from gvz.transport.channel import Channel
-from gvz.transport.messages import ActorSpec, Message, Stop
+from gvz.transport.messages import ActorSpec
 from gvz.transport.ring import RingReader
-
-LOG_TAIL_BYTES = 4000
 
 
 def one_core() -> dict[str, str]:
@@ -43,7 +41,11 @@ def _environment() -> dict[str, str]:
 
 
 class ActorProcess:
-    """A running worker. `spec` goes to it as the first message; its output is appended to a log file."""
+    """A running worker. Its output is appended to a log file.
+
+    Attributes:
+        channel: what it says and hears; the first message to it is its `spec`.
+    """
 
     def __init__(self, spec: ActorSpec, ring: RingReader, params: BroadcastWriter | None):
         """Starts the process, which inherits the descriptors of its socket, its ring and the parameter queue."""
@@ -64,16 +66,12 @@ class ActorProcess:
                 start_new_session=True,
             )
         self.pid = self._process.pid
-        self._channel = Channel(ours, peer=f"{self._who} (pid {self.pid})")
+        self.channel = Channel(ours, peer=f"{self._who} (pid {self.pid})")
         try:
-            self._channel.send(spec)
+            self.channel.send(spec)
         except BaseException:
             self.end(grace_s=0.0)
             raise
-
-    def receive(self) -> list[Message]:
-        """Messages that have arrived."""
-        return self._channel.receive()
 
     def exit_text(self) -> str | None:
         """How the process ended, in words; None while it runs."""
@@ -81,10 +79,6 @@ class ActorProcess:
         if code is None:
             return None
         return f"was ended by {signal.Signals(-code).name}" if code < 0 else f"exited with code {code}"
-
-    def ask_to_stop(self) -> None:
-        """Tells it to finish its step, close its games and exit."""
-        self._channel.send(Stop())
 
     def dump_stacks(self) -> None:
         """Has it write the stacks of its threads into the log (faulthandler; works while Python code hangs)."""
@@ -104,7 +98,7 @@ class ActorProcess:
         Raises:
             WaitTimeoutError: it is still there.
         """
-        self._channel.close()
+        self.channel.close()
         self._process.terminate()
         if not self.wait(grace_s):
             self._process.kill()
@@ -114,9 +108,3 @@ class ActorProcess:
 def log_path(spec: ActorSpec) -> Path:
     """Where the output of this actor's processes is kept."""
     return Path(spec.work_dir) / f"actor_{spec.actor}.log"
-
-
-def read_log_tail(path: Path) -> str:
-    """The end of a log; of one that is gone, nothing."""
-    data = path.read_bytes()[-LOG_TAIL_BYTES:] if path.exists() else b""
-    return data.decode(errors="replace").strip()

@@ -1,22 +1,23 @@
 """One actor over the lives of its processes: watched, ended when stuck, replaced within a budget."""
 
-import dataclasses
 from collections import deque
 
+import msgspec
 import numpy as np
 
 from actors.config import ActorsConfig
-from actors.process import ActorProcess, log_path, read_log_tail
-from gvz.core import janitor
+from actors.process import ActorProcess, log_path
+from gvz.core import janitor, records
 from gvz.core.errors import TransportError, WorkerError
 from gvz.transport.broadcast import BroadcastWriter
-from gvz.transport.messages import ActorSpec, EpisodeStats, Fault, Message, Ready
+from gvz.transport.messages import ActorSpec, Assign, EpisodeStats, Fault, Message, Ready
 from gvz.transport.ring import RingReader, WriterState
 
 _DUMP_S = 0.5
 """time given to a stuck actor to write its stacks before it is killed"""
 _STABLE_S = 10.0
 """an actor that has played for this time is restarted soon; others wait longer each time"""
+_LOG_TAIL_BYTES = 4000
 _FIRST_BACKOFF_S, _LONGEST_BACKOFF_S = 0.25, 15.0
 
 
@@ -34,8 +35,8 @@ class SupervisedActor:
 
     def __init__(self, spec: ActorSpec, limits: ActorsConfig, params: BroadcastWriter | None):
         """`params` is the queue that the actor takes its parameters from; None for random play."""
-        height, width, channels = spec.frame_shape
-        self.ring = RingReader.create(f"gvz-ring-{spec.actor}", spec.ring_capacity, (height, width, channels))
+        name = f"gvz-ring-{spec.actor}"
+        self.ring = RingReader.create(name, spec.ring_capacity, spec.frame_shape, spec.record_dtype)
         self.process: ActorProcess | None = None
         self.next_episodes = list(spec.first_episodes)
         self.restarts = 0
@@ -61,6 +62,13 @@ class SupervisedActor:
         self._ready_at, self._kill_at, self._silent_s = None, None, 0.0
         self._heartbeat_ns = self.ring.writer_status().heartbeat_ns
 
+    def assign(self, lane: int, task: int) -> None:
+        """The next episodes of a lane are of the task with this index; processes that follow begin with it."""
+        tasks = [task if own == lane else old for own, old in zip(self._spec.lanes, self._spec.lane_tasks, strict=True)]
+        self._spec = msgspec.structs.replace(self._spec, lane_tasks=tasks)
+        if self.process is not None:
+            self.process.channel.send(Assign(lane=lane, task=task))
+
     def watch(self, now: float, watched_s: float) -> list[Message]:
         """Looks after the process once.
 
@@ -77,7 +85,7 @@ class SupervisedActor:
         exit_text = self.process.exit_text()  # first: what it said before its end is then all there
         messages: list[Message] = []
         try:
-            received = self.process.receive()
+            received = self.process.channel.receive()
             self._check(received)
             messages += received
         except TransportError as error:  # this actor's stream is corrupt; the others are fine
@@ -102,16 +110,17 @@ class SupervisedActor:
                 self.next_episodes[game] = max(self.next_episodes[game], int(episodes[-1]) + 1)
 
     def track_unread(self) -> None:
-        """As `note`, from what is still in the ring."""
+        """As `track_episodes`, from what is still in the ring."""
         self.track_episodes(self.ring.peek(self.ring.capacity).steps)
 
     def _check(self, received: list[Message]) -> None:
-        """Raises TransportError: an episode of a game that is not this actor's."""
-        games = dict(zip(self._spec.lanes, self._spec.lane_tasks, strict=True))
+        """Raises TransportError: an episode of a game that is not this actor's, or of no task of the run."""
+        lanes, num_tasks = self._spec.lanes, len(self._spec.tasks)
         for message in received:
-            if isinstance(message, EpisodeStats) and games.get(message.lane) != message.task:
+            if isinstance(message, EpisodeStats) and not (message.lane in lanes and message.task < num_tasks):
                 raise TransportError(
-                    f"got an episode of lane {message.lane}, task {message.task}, want lane: task of {games}"
+                    f"got an episode of lane {message.lane}, task {message.task}, want one of lanes {lanes} and a task "
+                    f"below {num_tasks}"
                 )
 
     def _start_again(self, now: float) -> list[Message]:
@@ -144,7 +153,7 @@ class SupervisedActor:
         process, self.process = self.process, None
         if process is not None:
             process.end(grace_s=0.0)
-        log_tail = read_log_tail(log_path(self._spec))
+        log_tail = "\n".join(records.last_lines(log_path(self._spec), _LOG_TAIL_BYTES))
         janitor.clean_dead_instances()
         actor, limits = self._spec.actor, self._limits
         self._ended_at.append(now)
@@ -171,4 +180,4 @@ class SupervisedActor:
         self.track_unread()
         begun = [first + 1 for first in self._spec.first_episodes]
         self.next_episodes = [max(pair) for pair in zip(self.next_episodes, begun, strict=True)]
-        self._spec = dataclasses.replace(self._spec, first_episodes=list(self.next_episodes))
+        self._spec = msgspec.structs.replace(self._spec, first_episodes=list(self.next_episodes))

@@ -19,7 +19,7 @@ from gvz.core import janitor
 from gvz.core.errors import EngineError, WaitTimeoutError
 from gvz.transport.broadcast import BroadcastReader
 from gvz.transport.channel import Channel
-from gvz.transport.messages import ActorSpec, Fault, Ready, Stop
+from gvz.transport.messages import ActorSpec, Assign, Fault, Ready, Stop
 from gvz.transport.ring import RingWriter, WriterState
 
 SPACE_TIMEOUT_S = 3600.0
@@ -35,10 +35,9 @@ class Worker:
 
     def __init__(self, spec: ActorSpec, channel: Channel, ring: int, params: int | None):
         """`ring` and `params` are file descriptors; they stay the caller's."""
-        height, width, channels = spec.frame_shape
         self._spec = spec
         self._channel = channel
-        self._ring = RingWriter.attach(ring, spec.ring_capacity, (height, width, channels))
+        self._ring = RingWriter.attach(ring, spec.ring_capacity, spec.frame_shape, spec.record_dtype)
         self._params = None if params is None else BroadcastReader.attach(params, spec.num_params, spec.layout_hash)
         self._take_params_at = 0.0
         self._loop = ActorLoop(spec, self._ring, channel.send)
@@ -59,7 +58,13 @@ class Worker:
         self._ring.beat(WriterState.STOPPED)
 
     def _must_stop(self) -> bool:
-        return any(isinstance(m, Stop) for m in self._channel.receive()) or self._channel.closed
+        """Hears what the learner says: new tasks of lanes, or the end."""
+        stop = self._channel.closed
+        for message in self._channel.receive():
+            if isinstance(message, Assign):
+                self._loop.assign(message.lane, message.task)
+            stop |= isinstance(message, Stop)
+        return stop or self._channel.closed
 
     def _take_params(self) -> bool:
         """Acts by the newest parameters from now on; False if there are none newer, or if it is too soon."""

@@ -1,1 +1,3 @@
-"""Whole-system benchmarks beside their peers: `python -m benchmarks --list`. See docs/PERFORMANCE.md."""
+"""What is measured for the pages: throughput beside peers (`python -m benchmarks --list`), reference scores, contrast,
+reliability; and a probe of encoders and augmentations.
+"""

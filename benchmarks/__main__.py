@@ -15,7 +15,7 @@ from gvz.core.errors import GvzError
 
 @dataclass(frozen=True, kw_only=True)
 class Benchmarks:
-    """Measure throughput beside peers; a record each, from which `python -m benchmarks.report` writes the page.
+    """Measure throughput beside peers. Each benchmark writes a record; `python -m benchmarks.report` makes the page.
 
     Example: python -m benchmarks all --out results/performance
     """
@@ -25,9 +25,9 @@ class Benchmarks:
     list: bool = False
     """print the names and what each compares"""
     quick: bool = False
-    """smallest sizes: proves that all bodies run; its figures mean nothing"""
+    """smallest sizes: checks that every body runs; the figures have no meaning"""
     out: Path = Path("runs/benchmarks")
-    """directory of the records; what stands there under the same name is replaced"""
+    """directory of the records; a record with the same name is replaced"""
     peers: Path = rounds.FULL.peers
     """interpreter of the peers' virtual environment (`make bench-peers`)"""
 
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name, module in runner.benchmarks().items():
             print(f"{name:16} {(module.__doc__ or '').splitlines()[0]}")
         return 0
-    for number in (signal.SIGINT, signal.SIGTERM):  # also where a shell has started us with Ctrl-C ignored
+    for number in (signal.SIGINT, signal.SIGTERM):  # also if a shell started us with Ctrl-C ignored
         signal.signal(number, signal.default_int_handler)
     budget = replace(rounds.QUICK if options.quick else rounds.FULL, peers=options.peers.absolute())
     failures = []

@@ -1,9 +1,9 @@
-"""Decisions per second with the full network acting, against the limit that engine and arithmetic set.
+"""Decisions per second with the full network acting, against the limit of engine and arithmetic.
 
-The limit of a core is 1 / (engine time + inference FLOPs / matmul rate): the engine time is that of bare processes,
-the rate that of float32 products in a process with an actor's settings, on all cores at once; both are measured in
-the same rounds. A batch reads all weights once, so pools of 4 and of 8 games an actor are measured, and the better of
-each round counts, as for the peers of `actors`. Goal: 0.6 of the limit.
+The limit of a core is 1 / (engine time + inference FLOPs / matmul rate). The engine time is measured with bare
+processes, the rate with float32 products in a process with an actor's settings, on all cores at once, both in the same
+rounds. A batch reads all weights once, so pools of 4 and of 8 games per actor are measured; the better one of each
+round counts, as for the peers of `actors`. Goal: 0.6 of the limit.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ from benchmarks.rounds import Budget, Row, alternate, goal, measured, rates
 
 
 def measure(budget: Budget) -> list[Row]:
-    """Rates of pools with and without the network, of engines and of products, and the goal's ratio."""
+    """Rates of pools with the network, of engines and of products, and the goal's ratio."""
     import jax
     import jax.numpy as jnp
 
@@ -60,10 +60,7 @@ def measure(budget: Budget) -> list[Row]:
             },
         )
         profile = workload.processor_times(budget.rounds, plays)
-    obs = jax.ShapeDtypeStruct((1, *agent.spec.obs_shape), jnp.uint8)
-    flops = workload.flops(
-        workload.direct(agent).act, params, jax.random.key(0), obs, jax.ShapeDtypeStruct((1,), jnp.int32), 0.0
-    )
+    flops = workload.flops(workload.direct(agent).act, params, jax.random.key(0), agent.spec.zeros(), jnp.float32(0))
     limits = [1 / (1 / e + flops / f) for e, f in zip(values["engines"], values["flops"], strict=True)]
     bests = [max(each) for each in zip(*(values[name] for name in plays), strict=True)]
     return [

@@ -1,10 +1,10 @@
 """Decisions per second: the engine's limit, our actor pool with random play, EnvPool, LevDoom.
 
-The limit is N bare processes that do nothing but `make_action` and `get_state` at the same render size, N that which
-gives most. The pool does everything a run does but the network: resize, stack, ring, drain in the learner's process.
-EnvPool runs asynchronously with a thread a core, LevDoom bare (without its wrappers) under gymnasium's AsyncVectorEnv;
-of both the better of two sizes counts. Goals: the pool reaches 0.85 of the limit, 4 times EnvPool, 8 times LevDoom at
-its default of 320x240 and 6 times at our 256x144.
+The limit is the rate of N bare processes that only call `make_action` and `get_state` at the same render size, with
+the best N. The pool does everything that a run does except the network: resize, stack, ring, drain in the learner's
+process. EnvPool runs asynchronously with one thread per core, LevDoom bare (without its wrappers) under gymnasium's
+AsyncVectorEnv; for both the better of two sizes counts. Goals: the pool reaches 0.85 of the limit, 4 times EnvPool, 8
+times LevDoom at its default of 320x240 and 6 times at our 256x144.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ from benchmarks.rounds import Budget, Row, absent, alternate, goal, rates, ratio
 
 
 def measure(budget: Budget) -> list[Row]:
-    """Rates of all candidates in alternating rounds, and the goals' ratios."""
+    """Rates of all candidates in alternating rounds, and the ratios of the goals."""
     from gvz.run.assemble import assemble
 
     cores = len(os.sched_getaffinity(0))

@@ -1,8 +1,8 @@
-"""What grows with what: actors 1 to 2x cores, replay 10K to 1M, batch 32 to 1024, parameters x8, tasks 1 to 76.
+"""How time grows with size: actors 1 to 2x cores, replay 10K to 1M, batch 32 to 1024, parameters x8, tasks 1 to 76.
 
-Each is a curve whose points are measured in alternating rounds. Goals: a gradient step's time grows no faster than its
-batch and its parameters, a publication's no faster than the vector; insertion and drawing are flat in the replay's
-size up to the logarithm that a tree costs; a pool's rate does not fall with actors or tasks by more than their number.
+Each curve's points are measured in alternating rounds. Goals: a gradient step's time grows no faster than its batch and
+its parameters, a publication's time no faster than the vector. Insertion and drawing do not grow with the replay's
+size, except for the logarithm of a tree. A decision's time grows no faster than the number of actors or tasks.
 """
 
 import dataclasses
@@ -14,15 +14,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from benchmarks import workload
 from benchmarks.rounds import Budget, Row, alternate, goal, measured, seconds_per_call
 
 _FRAME_SHAPE = (24, 24, 3)
-"""of the replay curves: a million frames of 84x84x3 are 21 GB"""
+"""frames of the replay curves: a million frames of 84x84x3 would be 21 GB"""
 _SLACK = 0.1
-"""what an exponent of growth may be above its ideal: measured on a machine, not on paper"""
+"""tolerance of an exponent of growth above its ideal, because it is a measurement"""
 
 
 def measure(budget: Budget) -> list[Row]:
@@ -56,7 +57,8 @@ def _replay(budget: Budget) -> list[Row]:
 
     from learner import replay
     from learner.ingest import BLOCK_SIZE
-    from learner.replay import ReplaySpec, StepArrays
+    from learner.replay import ReplaySpec
+    from learner.store import StepArrays
 
     rng, inserts, draws = np.random.default_rng(0), {}, {}
     for capacity in (1_000, 4_000) if budget.quick else (10_000, 100_000, 1_000_000):
@@ -109,8 +111,9 @@ def _replay(budget: Budget) -> list[Row]:
 
 
 def _updates(budget: Budget, sizes: Sequence[int], change: Callable[[Any, int], Any]) -> dict[float, list[float]]:
-    """Seconds of a gradient step over a size, with a replay of two thousand records of full frames."""
+    """Seconds of a gradient step by size, with a replay of two thousand records of full frames."""
     from gvz.run.assemble import assemble
+    from learner.config import ReplayConfig
 
     bodies = {}
     with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
@@ -118,7 +121,7 @@ def _updates(budget: Budget, sizes: Sequence[int], change: Callable[[Any, int], 
             config = workload.run_config(budget)
             config = dataclasses.replace(
                 config,
-                replay=dataclasses.replace(config.replay, capacity=4_000),
+                replay=ReplayConfig(capacity=4_000),
                 learner=dataclasses.replace(config.learner, warmup_steps=2_000),
             )
             config = change(config, size)
@@ -139,7 +142,7 @@ def _batch(budget: Budget) -> list[Row]:
 
 
 def _parameters(budget: Budget) -> list[Row]:
-    """A gradient step over the parameters, by way of the hidden units; a publication of as many numbers."""
+    """A gradient step by the number of parameters (set by the hidden units); a publication of as many numbers."""
 
     import jax
 
@@ -180,7 +183,7 @@ def _play(budget: Budget, config: Any) -> list[float]:
 
 
 def _actors(budget: Budget) -> list[Row]:
-    """A pool's rate over its actors, each with four games; the pools run one after the other, each alone."""
+    """A pool's rate by its number of actors, each with four games; the pools run one after the other."""
     from gvz.run.assemble import assemble
 
     cores = len(os.sched_getaffinity(0))
@@ -188,7 +191,8 @@ def _actors(budget: Budget) -> list[Row]:
     with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
         config = workload.run_config(budget)
         base = workload.random_players(assemble(config, Path(directory)).pool_config)
-        values: dict[float, list[float]] = {n: _play(budget, dataclasses.replace(base, num_actors=n)) for n in counts}
+        pools = {n: msgspec.structs.replace(base, num_actors=n) for n in counts}
+        values: dict[float, list[float]] = {n: _play(budget, pool) for n, pool in pools.items()}
     return [
         *_curve("actor pool over actors", "decisions/s", "actors", values),
         goal(7, "exponent of a decision's time in the actors", exponent(_times(values)), at_most=1 + _SLACK),
@@ -200,9 +204,9 @@ def _times(per_s: Mapping[float, Sequence[float]]) -> dict[float, list[float]]:
 
 
 def _tasks(budget: Budget) -> list[Row]:
-    """A pool's rate over its tasks, of all scenarios, a game a task at least; an actor a core."""
+    """A pool's rate by its number of tasks, of all scenarios; at least one game per task, one actor per core."""
     from actors.pool import PoolConfig
-    from gvz.actions import num_actions
+    from gvz.actions import action_buttons
     from gvz.core.env_config import EnvConfig
     from gvz.engine.probe import ensure_loads
     from gvz.scenarios.compiler import compile_task
@@ -214,7 +218,7 @@ def _tasks(budget: Budget) -> list[Row]:
     values: dict[float, list[float]] = {}
     with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
         for count in counts:
-            # evenly through the list, so that every curve point has its share of every scenario and level
+            # evenly spaced in the list, so that every point of the curve has its share of every scenario and level
             chosen = [tasks[i * len(tasks) // count] for i in range(count)]
             for task in chosen:
                 compiled = compile_task(task, env.profile)
@@ -228,7 +232,7 @@ def _tasks(budget: Budget) -> list[Row]:
                 env_config=dataclasses.asdict(env),
                 frame_shape=env.frame_shape,
                 stack_size=4,
-                num_actions=num_actions(chosen[0].scenario, env.action_set),
+                num_actions=len(action_buttons(chosen[0].scenario, env.action_set)),
                 policy=b"",
                 num_params=0,
                 layout_hash=0,

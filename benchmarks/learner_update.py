@@ -1,10 +1,10 @@
 """Gradient steps per second (draw, loss, update, priorities) at batch 32, 84x84x12, beside Tianshou and Dopamine.
 
-Our learner with a full replay of 100K records in one jitted, donated call; Tianshou's PyTorch Rainbow with its own
-prioritized buffer of 100K, sampling included; Dopamine's JAX full Rainbow with its prioritized buffer. Then where our
-time goes, and how far that is from the time that the arithmetic alone would take at the measured rate of matrix
-products. Goals on a CPU: no slower than Tianshou, twice Dopamine. On a GPU: 5,000 steps/s, and 80% of that while
-actors play and their records go into the same replay.
+Candidates: our learner with a full replay of 100K records in one jitted, donated call; Tianshou's PyTorch Rainbow with
+its own prioritized buffer of 100K, sampling included; Dopamine's JAX full Rainbow with its prioritized buffer. A
+profile of our step follows, and the time that the arithmetic alone would take at the measured rate of matrix products.
+Goals on a CPU: no slower than Tianshou, twice Dopamine. On a GPU: 5,000 steps/s, and 80% of that while actors play and
+their records go into the same replay.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ from benchmarks.remote import start_peer
 from benchmarks.rounds import Budget, Row, absent, alternate, goal, measured, rates, ratios, seconds_per_call
 
 PEERS = {"Tianshou": ("tianshou_rainbow", 1.0), "Dopamine": ("dopamine_rainbow", 2.0)}
-"""name -> (script, how many times as fast the goal asks us to be)"""
+"""name -> (script, goal: our speed divided by the peer's)"""
 
 
 def measure(budget: Budget) -> list[Row]:
@@ -34,7 +34,9 @@ def measure(budget: Budget) -> list[Row]:
         directory = stack.enter_context(tempfile.TemporaryDirectory(prefix="gvz-benchmark-"))
         parts = assemble(config, workload.work_directory(directory))
         learner = workload.Learner(config, parts)
-        scans = (default_num_updates(config.learner),) if on_cpu else (default_num_updates(config.learner), 64)
+        scans = (
+            (default_num_updates(learner.sizes.config),) if on_cpu else (default_num_updates(learner.sizes.config), 64)
+        )
         bodies: dict[str, Callable[[], float]] = {
             f"learner, {scan} to a call": partial(learner.updates_per_s, scan, budget.body_s) for scan in scans
         }
@@ -42,7 +44,7 @@ def measure(budget: Budget) -> list[Row]:
         if on_cpu:
             without_gpu = {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": ""}
             for name, (script, _) in PEERS.items():
-                size = (str(config.replay.capacity), str(config.learner.batch_size))
+                size = (str(learner.sizes.replay_config.capacity), str(learner.sizes.batch_size))
                 peer = start_peer(script, budget.peers, *size, environment=without_gpu)
                 if isinstance(peer, str):
                     rows.append(absent(name, peer))
@@ -56,7 +58,7 @@ def measure(budget: Budget) -> list[Row]:
         values = alternate(budget.rounds, bodies)
         products = values.pop("products")
         profile = _profile(learner, budget)
-    batch_size = config.learner.batch_size
+    batch_size = learner.sizes.batch_size
     rows = [*(rates(n, updates_per_s=found, batch_size=batch_size) for n, found in values.items()), *rows]
     for name, (_, factor) in PEERS.items():
         if name in values:
@@ -78,7 +80,7 @@ def measure(budget: Budget) -> list[Row]:
 
 
 def _products_per_s(size: int, seconds: float) -> float:
-    """FLOP/s of square float32 matrix products on all that the learner may use."""
+    """FLOP/s of square float32 matrix products on all cores or devices that the learner may use."""
     import jax
     import jax.numpy as jnp
 
@@ -89,16 +91,16 @@ def _products_per_s(size: int, seconds: float) -> float:
 
 
 def _profile(learner: "workload.Learner", budget: Budget) -> list[Row]:
-    """Milliseconds of each part of a gradient step, compiled alone; fused into one they may take less."""
+    """Milliseconds of each part of a gradient step, compiled alone; fused into one call they can take less."""
     import jax
     import jax.numpy as jnp
     import optax
 
     from learner import replay
 
-    agent, spec, config = learner.parts.learner.agent, learner.parts.learner.replay_spec, learner.config
+    agent, spec, config = learner.sizes.agent, learner.sizes.replay_spec, learner.config
     params, key = learner.state.params, jax.random.key(0)
-    batch_size = config.learner.batch_size
+    batch_size = learner.sizes.batch_size
     optimizer = optax.adam(config.learner.learning_rate, eps=config.learner.adam_eps)
 
     def loss(params: Any, batch: replay.Transitions) -> jax.Array:

@@ -3,20 +3,22 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
 
 from benchmarks.record import Record
-from benchmarks.report import PICTURES, curves
-from benchmarks.rounds import Row, Spread
+from benchmarks.rounds import Row, Spread, curves
 
+PICTURES = {
+    "actors": "performance_actors.png",
+    "learner_update": "performance_learner.png",
+    "growth": "performance_growth.png",
+}
+"""benchmark -> the plot of its CPU record, in docs/images"""
 RATE_OF = {"actors": ("decisions_per_s", "decisions/s"), "learner_update": ("updates_per_s", "gradient steps/s")}
 
 
 def draw(records: Sequence[Record], directory: Path) -> list[Path]:
-    """Draws what there are CPU records of; returns the files."""
+    """Draws the plots of all CPU records; returns the files."""
     files = []
     for made in records:
         if made.device != "cpu" or made.benchmark not in PICTURES:
@@ -32,8 +34,9 @@ def draw(records: Sequence[Record], directory: Path) -> list[Path]:
 
 
 def _bars(bars: Sequence[tuple[str, Spread]], unit: str, out: Path) -> None:
-    """A bar each, with its range over the rounds."""
-    figure, axes = plt.subplots(figsize=(8.0, 0.9 + 0.32 * len(bars)), layout="constrained")
+    """One bar each, with its range over the rounds."""
+    figure = Figure(figsize=(8.0, 0.9 + 0.32 * len(bars)), layout="constrained")
+    axes = figure.subplots()
     for place, (name, spread) in enumerate(bars):
         low, high = spread["median"] - spread["min"], spread["max"] - spread["median"]
         ours = any(word in name for word in ("actor pool", "learner"))
@@ -42,17 +45,16 @@ def _bars(bars: Sequence[tuple[str, Spread]], unit: str, out: Path) -> None:
     axes.invert_yaxis()
     axes.set(xlabel=f"{unit}: median, with min and max of the rounds")
     figure.savefig(out, dpi=120, metadata={"Software": None})
-    plt.close(figure)
 
 
 def _growth(rows: Sequence[Row], out: Path) -> None:
-    """A panel for each thing that grows; both axes logarithmic, so that linear is a slope of one."""
+    """One panel for each growing size; both axes are logarithmic, so linear growth has a slope of one."""
     panels: dict[str, list[str]] = {}
     found = curves(rows)
     for name, points in found.items():
         panels.setdefault(points[0]["x_unit"], []).append(name)
-    figure, all_axes = plt.subplots(1, len(panels), figsize=(3.6 * len(panels), 3.2), layout="constrained")
-    for axes, (x_unit, names) in zip([all_axes] if len(panels) == 1 else all_axes, panels.items(), strict=True):
+    figure = Figure(figsize=(3.6 * len(panels), 3.2), layout="constrained")
+    for axes, (x_unit, names) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
         for name in names:
             points = found[name]
             medians = [point["median"] for point in points]
@@ -65,4 +67,3 @@ def _growth(rows: Sequence[Row], out: Path) -> None:
         axes.grid(visible=True, which="both", alpha=0.3)
         axes.legend(fontsize=7)
     figure.savefig(out, dpi=120, metadata={"Software": None})
-    plt.close(figure)

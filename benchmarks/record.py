@@ -1,4 +1,4 @@
-"""A benchmark's record: one JSON file with what was measured, where, when, with what and by which command."""
+"""A benchmark's record: one JSON file with the measurements, machine, date, versions and command."""
 
 import json
 import os
@@ -13,14 +13,14 @@ from gvz.core.errors import ConfigError
 from gvz.run import machine
 
 SCHEMA = 1
-"""Stands in every record; raised by one when a record's meaning changes."""
+"""Part of every record; increased by one when a record's meaning changes."""
 ROOT = Path(__file__).parent.parent
 DIRECTORY = ROOT / "results" / "performance"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Record:
-    """One benchmark, once."""
+    """One run of one benchmark."""
 
     schema: int
     benchmark: str
@@ -32,7 +32,7 @@ class Record:
     """of the start, UTC"""
     command: str
     quick: bool
-    """smallest sizes, whose figures mean nothing"""
+    """smallest sizes; the figures have no meaning"""
     seconds: float
     machine: dict[str, Any]
     versions: dict[str, str]
@@ -40,12 +40,12 @@ class Record:
 
 
 def environment() -> dict[str, str]:
-    """Of what is measured: this one, but bytecode is cached, as it is wherever PYTHONDONTWRITEBYTECODE is not set."""
+    """The environment of measured commands: ours without PYTHONDONTWRITEBYTECODE, so that bytecode is cached."""
     return {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
 
 
 def describe_machine() -> dict[str, Any]:
-    """What the figures were measured on; load and free memory are those at the start."""
+    """The measuring machine, with its load and free memory at the start."""
     return {
         **machine.hardware(),
         "free_memory_bytes": psutil.virtual_memory().available,
@@ -54,12 +54,12 @@ def describe_machine() -> dict[str, Any]:
 
 
 def describe_commit() -> str:
-    """Of the checkout, with `+changes` if measured files differ from it; "unknown" outside of one."""
+    """The checkout's commit, with `+changes` if measured files differ from it; "unknown" without a checkout."""
     return machine.commit((*machine.MEASURED, "benchmarks")) or "unknown"
 
 
 def write(record: Record, directory: Path) -> Path:
-    """Writes `<benchmark>.json` (`<benchmark>_<device>.json` if that is no CPU), a row a line."""
+    """Writes `<benchmark>.json` (`<benchmark>_<device>.json` if it is not a CPU), one row per line."""
     directory.mkdir(parents=True, exist_ok=True)
     suffix = "" if record.device == "cpu" else f"_{record.device}"
     file = directory / f"{record.benchmark}{suffix}.json"
@@ -74,16 +74,16 @@ def read_all(directory: Path = DIRECTORY) -> list[Record]:
     """Every record of a directory, in the order of the file names.
 
     Raises:
-        ConfigError: a file is no record, of another schema, or made by `--quick`.
+        ConfigError: a file is not a record, has another schema, or was made by `--quick`.
     """
     records = []
     for file in sorted(directory.glob("*.json")):
         try:
             record = Record(**json.loads(file.read_text()))
         except (ValueError, TypeError) as error:
-            raise ConfigError(f"{file}: not a record of benchmarks ({error}); measure anew or remove it") from error
+            raise ConfigError(f"{file}: not a record of benchmarks ({error}); measure again or remove it") from error
         if record.schema != SCHEMA:
-            raise ConfigError(f"{file}: schema {record.schema}, want {SCHEMA}; measure anew")
+            raise ConfigError(f"{file}: schema {record.schema}, want {SCHEMA}; measure again")
         if record.quick:
             raise ConfigError(f"{file}: made by --quick, its figures mean nothing; measure without")
         records.append(record)

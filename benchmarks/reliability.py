@@ -30,7 +30,7 @@ def read(file: Path) -> dict[str, Any]:
     """A record.
 
     Raises:
-        ConfigError: it is not there, or of another schema.
+        ConfigError: the file is missing or has another schema.
     """
     try:
         made = json.loads(file.read_text())
@@ -42,11 +42,11 @@ def read(file: Path) -> dict[str, Any]:
 
 
 def fuzz_table(made: dict[str, Any]) -> str:
-    """Inputs tried and edges covered, by what was fed with them."""
+    """Inputs tried and edges covered, by target."""
     lines = [
         f"*`{made['command']}`; {made['cpu']}, {made['cores']} cores.*",
         "",
-        "| target | inputs | seconds | edges covered | broken promises | UTC, commit |",
+        "| target | inputs | seconds | edges covered | failures | UTC, commit |",
         "|---|---|---|---|---|---|",
         *(
             f"| {name} | {found['inputs']:,} | {found['seconds']:.0f} | {found['edges']:,} | "
@@ -59,7 +59,7 @@ def fuzz_table(made: dict[str, Any]) -> str:
 
 
 def soak_table(made: dict[str, Any]) -> str:
-    """What was done, what it cost, what grew, what was lost."""
+    """Kills, their cost, growth and losses."""
     ratios, priced, machine = summary(made), kill_ratios(made), made["machine"]
     minutes = sum(s["end_s"] - s["begin_s"] for s in made["stretches"] if s["kind"] == "kills") / 60
     rates = {
@@ -75,7 +75,7 @@ def soak_table(made: dict[str, Any]) -> str:
         f"| actors killed (SIGKILL) | {len(made['kills'])} in {minutes:.0f} minutes |",
         f"| restarts counted by the run | {made['restarts']} |",
         f"| gradient steps | {made['updates']:,} |",
-        "| records lost, repeated or torn | none: the first would have ended the run, and the soak with it |",
+        "| records lost, repeated or torn | none: a single one would have ended the soak |",
         f"| damaged rows in the records | {made['damaged_rows']} |",
         f"| gradient steps/s, undisturbed stretches | {rates['undisturbed']} |",
         f"| gradient steps/s, stretches with kills | {rates['kills']} |",
@@ -91,7 +91,7 @@ def soak_table(made: dict[str, Any]) -> str:
 
 
 def draw(made: dict[str, Any], out: Path) -> None:
-    """A panel for each thing that must stay flat, the kills as ticks, and the rates of the stretches."""
+    """One panel for each quantity that must not grow, the kills as ticks, and the rates of the stretches."""
     import matplotlib
 
     matplotlib.use("Agg")

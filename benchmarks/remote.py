@@ -1,6 +1,6 @@
-"""A body that runs in a process of its own, often under another interpreter: ours, or the peers'.
+"""A measured body in its own process, under our interpreter or the peers'.
 
-The process prints one JSON object about itself, and then one for every line of JSON arguments it is sent (see
+The process prints one JSON object about itself, and then one for every line of JSON arguments that it receives (see
 `benchmarks/peers/serve.py`).
 """
 
@@ -19,20 +19,20 @@ from typing import Any
 
 PEERS = Path(__file__).parent / "peers"
 START_TIMEOUT_S = 600.0
-"""a process that has not said who it is by then is given up: imports of torch and TensorFlow take a minute when cold"""
+"""limit for a process's first line: cold imports of torch and TensorFlow take a minute"""
 ANSWER_TIMEOUT_S = 300.0
 _END_TIMEOUT_S = 10.0
 
 
 class RemoteError(Exception):
-    """The process could not start, died or did not answer: says so, with the end of what it printed."""
+    """The process could not start, died or did not answer; the message has the end of its output."""
 
 
 class Remote:
     """A running body. Call it with arguments; `close` it, or use it as a context manager.
 
     Attributes:
-        about: what the process said about itself: versions and settings.
+        about: the versions and settings that the process reported.
     """
 
     def __init__(
@@ -57,14 +57,14 @@ class Remote:
                 needs is not installed).
         """
         self._name = script
-        self._directory = tempfile.TemporaryDirectory(prefix="gvz-peer-")  # a peer's ViZDoom writes where it stands
+        self._directory = tempfile.TemporaryDirectory(prefix="gvz-peer-")  # ViZDoom writes into its directory
         self._errors = Path(self._directory.name) / "stderr"
         self._process: subprocess.Popen[bytes] | None = None
         if not Path(python).exists():
             self.close()
             raise RemoteError(f"{script}: there is no interpreter {python}; make one with `make bench-peers`")
         root = str(PEERS.parent.parent)
-        path = [root] if str(python) == sys.executable else []  # peers see nothing of ours
+        path = [root] if str(python) == sys.executable else []  # peers do not see our modules
         with self._errors.open("wb") as errors:
             self._process = subprocess.Popen(
                 [str(Path(python).absolute()), str(PEERS / f"{script}.py"), *arguments],
@@ -99,7 +99,7 @@ class Remote:
             raise RemoteError(f"{self._name}: it has died; {self._tail()}") from error
 
     def answer(self) -> dict[str, Any]:
-        """What the body measured.
+        """The measurements of the body.
 
         Raises:
             RemoteError: it died, or did not answer in time.
@@ -107,7 +107,7 @@ class Remote:
         return self._answer(ANSWER_TIMEOUT_S)
 
     def has_answered(self) -> bool:
-        """Whether `answer` would not wait."""
+        """Whether `answer` returns without waiting."""
         assert self._process is not None
         assert self._process.stdout is not None
         return bool(self._buffer or select.select([self._process.stdout], [], [], 0.0)[0])
@@ -118,7 +118,7 @@ class Remote:
         return self.answer()
 
     def close(self) -> None:
-        """Closes its input, which ends it in good order; kills it if that takes too long. Can be repeated."""
+        """Closes its input, which ends it normally; kills it if that takes too long. Can be repeated."""
         process, self._process = self._process, None
         if process is not None:
             assert process.stdin is not None
@@ -134,7 +134,7 @@ class Remote:
         self._directory.cleanup()
 
     def _answer(self, timeout_s: float) -> dict[str, Any]:
-        """The next line that is a JSON object; libraries print what they like before it."""
+        """The next line that is a JSON object; libraries can print other lines before it."""
         assert self._process is not None
         assert self._process.stdout is not None
         descriptor, deadline = self._process.stdout.fileno(), time.monotonic() + timeout_s
@@ -156,16 +156,16 @@ class Remote:
     def _tail(self) -> str:
         """The last line it wrote to its standard error: in Python, the exception."""
         lines = self._errors.read_text(errors="replace").strip().splitlines()
-        return lines[-1][:300] if lines else "it ended without a word"
+        return lines[-1][:300] if lines else "it ended without a message"
 
 
 def start_peer(
     script: str, python: Path, *arguments: str, environment: Mapping[str, str] = MappingProxyType({})
 ) -> "Remote | str":
-    """A peer's process, or why there is none.
+    """A peer's process, or the reason why there is none.
 
-    A peer that cannot live with the others (TensorFlow and torch in one process do not) has an environment of its
-    own beside theirs, `<theirs>-<peer>`.
+    A peer that does not work in the common environment (TensorFlow and torch in one process do not) has its own beside
+    it, `<environment>-<peer>`.
     """
     venv = python.parent.parent
     own = venv.with_name(f"{venv.name}-{script.partition('_')[0]}") / "bin" / "python"
@@ -177,7 +177,7 @@ def start_peer(
 
 
 def count_per_s(remotes: list[Remote], arguments: Mapping[str, Any]) -> float:
-    """Asks all at once and adds up their `count` / `seconds`."""
+    """Asks all processes at once and adds up their `count` / `seconds`."""
     for remote in remotes:
         remote.ask(**arguments)
     answers = [remote.answer() for remote in remotes]

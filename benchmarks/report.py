@@ -2,7 +2,7 @@
 
     python -m benchmarks.report
 
-What stands outside of the markers is written by hand.
+Text outside the markers is written by hand.
 """
 
 import sys
@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from benchmarks import record, rounds
+from benchmarks.plots import PICTURES, draw
 from benchmarks.record import Record
 from benchmarks.rounds import Row, Spread
 from gvz.core.errors import ConfigError
@@ -25,14 +26,9 @@ GOALS = {
     6: ("whole", "Learner and actors together"),
     7: ("growth", "Growth"),
     8: ("startup", "Start-up"),
+    9: ("encoders", "Encoders"),
 }
-"""number -> (benchmark, title)"""
-PICTURES = {
-    "actors": "performance_actors.png",
-    "learner_update": "performance_learner.png",
-    "growth": "performance_growth.png",
-}
-"""benchmark -> the plot of its CPU record, in docs/images"""
+"""number -> (benchmark, title); a benchmark may have figures and no goal"""
 RATES = ("decisions", "frames", "updates", "samples")
 
 
@@ -45,7 +41,7 @@ def number(value: float) -> str:
 
 
 def cell(spread: Spread | None) -> str:
-    """Median [min, max]; a dash where there is no such rate, the value alone where it was measured once."""
+    """Median [min, max]; a dash if there is no such rate, the value alone if it was measured once."""
     if spread is None:
         return "-"
     if len(spread["values"]) == 1:
@@ -54,13 +50,13 @@ def cell(spread: Spread | None) -> str:
 
 
 def goals_table(records: Sequence[Record]) -> str:
-    """All goals: what was wanted, what was measured, and whether that is enough."""
+    """All goals: the bound, the measurement, and the verdict."""
     lines = ["| goal | | wanted | measured | |", "|---|---|---|---|---|"]
     for goal, (benchmark, title) in GOALS.items():
         mine = [r for r in records if r.benchmark == benchmark]
         rows = [(r, row) for r in mine for row in r.rows if row["kind"] == "goal"]
         head = f"[{goal}. {title}](#{goal}-{title.lower().replace(' ', '-')})"
-        if not rows:
+        if not rows and not mine:
             lines.append(f"| {head} | | | not measured | |")
         for i, (made, row) in enumerate(rows):
             where = "" if made.device == "cpu" else f" ({made.device})"
@@ -103,7 +99,7 @@ def _parts(made: Record) -> Iterator[str]:
         yield "| | measured | |\n|---|---|---|\n" + "\n".join(
             f"| {row['name']} | {cell(row)} | {row['unit']} |" for row in single
         )
-    for name, points in curves(made.rows).items():
+    for name, points in rounds.curves(made.rows).items():
         xs = " | ".join(f"{row['x']:,.0f}" for row in points)
         values = " | ".join(cell(row) for row in points)
         yield (
@@ -115,15 +111,8 @@ def _parts(made: Record) -> Iterator[str]:
         yield "Not measured:\n\n" + "\n".join(missing)
 
 
-def curves(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Name -> points of every curve, in the order of x."""
-    points = [row for row in rows if row["kind"] == "measured" and row["x"] is not None]
-    names = dict.fromkeys(row["name"] for row in points)
-    return {name: sorted((r for r in points if r["name"] == name), key=lambda r: r["x"]) for name in names}
-
-
 def write_page(page: str, records: Sequence[Record]) -> str:
-    """The page with what the records give between its markers.
+    """The page with the records' tables between its markers.
 
     Raises:
         ConfigError: a marker is missing.
@@ -155,8 +144,6 @@ def _bound(row: Row) -> str:
 
 def main() -> int:
     """Writes the page and its plots; returns the exit code."""
-    from benchmarks.plots import draw
-
     try:
         records = record.read_all()
         PAGE.write_text(write_page(PAGE.read_text(), records))

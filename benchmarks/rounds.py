@@ -1,7 +1,7 @@
-"""Alternating rounds, and the rows that a benchmark gives back.
+"""Alternating rounds, and the rows that a benchmark returns.
 
-A row is plain data: `kind` says which of the four it is, and every measured quantity in it is a `Spread`. Ratios are
-made within a round, of bodies that ran one after the other, and only then summed up.
+A row is plain data: `kind` says which of the four kinds it is, and every measured quantity in it is a `Spread`. Ratios
+are computed within a round, for bodies that ran one after the other; the median is taken afterwards.
 """
 
 import time
@@ -14,21 +14,21 @@ import numpy as np
 
 Row = dict[str, Any]
 Spread = dict[str, Any]
-"""median, min and max of a quantity over the rounds, and its `values`, one a round"""
+"""median, min and max of a quantity over the rounds, and its `values`, one per round"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Budget:
-    """How long a benchmark may measure."""
+    """Length of a measurement."""
 
     rounds: int
     """rounds after the warm-up"""
     body_s: float
     """seconds of one body in one round"""
     quick: bool
-    """smallest sizes: proves that every body runs; its figures mean nothing"""
+    """smallest sizes: checks that every body runs; the figures have no meaning"""
     peers: Path
-    """interpreter of the peers' virtual environment; what is not installed there is reported as absent"""
+    """interpreter of the peers' virtual environment; peers that are not installed there are reported as absent"""
 
 
 FULL = Budget(rounds=5, body_s=2.5, quick=False, peers=Path(".venv-peers/bin/python"))
@@ -38,7 +38,7 @@ QUICK = Budget(rounds=1, body_s=0.3, quick=True, peers=Path(".venv-peers/bin/pyt
 def alternate(
     rounds: int, bodies: Mapping[str, Callable[[], float]], *, warm_up: bool = True
 ) -> dict[str, list[float]]:
-    """Runs A, B, C, A, B, C, ... and returns what each body measured, a value a round; a warm-up is thrown away."""
+    """Runs A, B, C, A, B, C, ... and returns one value of each body per round; the warm-up round is discarded."""
     values: dict[str, list[float]] = {name: [] for name in bodies}
     for number in range(-int(warm_up), rounds):
         for name, body in bodies.items():
@@ -49,7 +49,7 @@ def alternate(
 
 
 def seconds_per_call(call: Callable[[], object], body_s: float) -> float:
-    """Mean seconds of one call, called again and again for `body_s` seconds, at least once."""
+    """Mean seconds of one call, repeated for `body_s` seconds, at least once."""
     start, count = time.perf_counter(), 0
     while count == 0 or time.perf_counter() - start < body_s:
         call()
@@ -76,7 +76,7 @@ def rates(
     frame_skip: int = 4,
     batch_size: int = 32,
 ) -> Row:
-    """The four rates of a candidate; those it has none of are None."""
+    """The four rates of a candidate; None for a rate that it does not have."""
     row: Row = {"kind": "rates", "name": name}
     for rate, unit in ((decisions_per_s, ("decisions", 1)), (decisions_per_s, ("frames", frame_skip))):
         row[f"{unit[0]}_per_s"] = None if rate is None else spread([value * unit[1] for value in rate])
@@ -99,19 +99,26 @@ def goal(
     at_most: float | None = None,
     unit: str = "",
 ) -> Row:
-    """What was aimed at, and what came out; `number` is the goal's in docs/PERFORMANCE.md. One bound is given."""
+    """A goal and its measurement; `number` is the section of docs/PERFORMANCE.md. Give one bound."""
     assert (at_least is None) != (at_most is None), "a goal has one bound"
     bounds = {"at_least": at_least, "at_most": at_most}
     return {"kind": "goal", "number": number, "name": name, "unit": unit, **bounds, **spread(values)}
 
 
 def absent(name: str, why: str) -> Row:
-    """A peer or a device that could not be measured, never a number."""
+    """A peer or device that could not be measured, and why."""
     return {"kind": "absent", "name": name, "why": why}
 
 
 def met(row: Row) -> bool:
-    """Whether the median of a goal's row keeps to its bound."""
+    """Whether the median of a goal's row keeps its bound."""
     if row["at_least"] is not None:
         return row["median"] >= row["at_least"]
     return row["median"] <= row["at_most"]
+
+
+def curves(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Name -> points of every curve, in the order of x."""
+    points = [row for row in rows if row["kind"] == "measured" and row["x"] is not None]
+    names = dict.fromkeys(row["name"] for row in points)
+    return {name: sorted((r for r in points if r["name"] == name), key=lambda r: r["x"]) for name in names}

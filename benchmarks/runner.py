@@ -1,4 +1,4 @@
-"""Finds the benchmarks, and runs each in a process of its own, so that none can sink, slow or outlive the rest.
+"""Finds the benchmarks and runs each in its own process, so that none can stop, slow down or outlive the others.
 
 A benchmark is a file of this package with a docstring and a function `measure(budget) -> list of rows`; its file name
 is its name.

@@ -1,12 +1,12 @@
-"""The soak: the main job for an hour at full speed while its actors are killed one after the other.
+"""The soak: the main job at full speed while its actors are killed one after the other for an hour.
 
     python -m benchmarks.soak                      # 60 minutes of kills, a kill every 20 s; record, page and plot
     python -m benchmarks.soak --minutes 6 --stretches 1 --out soak.json
 
-The run is the real command. Stretches with kills take turns with short ones without: the price of the kills is the
-ratio of a stretch to those beside it, within one run on one machine whose own speed drifts. Memory, descriptors, shared
-memory and processes are sampled all the time; at the end the run is stopped by SIGTERM, and what it left behind
-counted.
+The run is the real command. Stretches with kills alternate with short undisturbed ones. The cost of the kills is the
+ratio of a stretch's speed to that of the stretches beside it, because the machine's own speed drifts. Memory,
+descriptors, shared memory and processes are sampled throughout. At the end SIGTERM stops the run, and the files that it
+left behind are counted.
 """
 
 import contextlib
@@ -29,11 +29,11 @@ from rich.console import Console
 
 from benchmarks import record
 from benchmarks.whole import end_run, tree_bytes
+from gvz.core import records
 from gvz.run import machine
-from gvz.run.rundir import read_records
 
 SCHEMA = 1
-"""of the records in DIRECTORY, those of the fuzzing too"""
+"""of all records in DIRECTORY, also those of the fuzzing"""
 DIRECTORY = record.ROOT / "results" / "reliability"
 SHARED_MEMORY = Path("/dev/shm")
 _START_TIMEOUT_S, _STOP_TIMEOUT_S, _CLEARED_S = 900.0, 120.0, 60.0
@@ -41,26 +41,26 @@ _START_TIMEOUT_S, _STOP_TIMEOUT_S, _CLEARED_S = 900.0, 120.0, 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class Soak:
-    """Run the main job while its actors are killed; record what grows, what is lost, what it costs."""
+    """Run the main job while its actors are killed; record growth, losses and cost."""
 
     minutes: float = 60.0
-    """of kills in all"""
+    """total length of the stretches with kills"""
     kill_every_s: float = 20.0
     """seconds between two kills; the actors take turns"""
     stretches: int = 20
-    """the minutes are cut into so many, with an undisturbed one before, between and after them"""
+    """number of stretches with kills; undisturbed ones are before, between and after them"""
     undisturbed_minutes: float = 1.0
     """length of an undisturbed stretch"""
     sample_s: float = 5.0
     """seconds between two samples"""
     out: Path = DIRECTORY / "soak.json"
-    """where the record goes"""
+    """file of the record"""
     flags: tyro.conf.Positional[tuple[str, ...]] = ()
     """further words for `python -m gvz.launch --config rainbow_4task.py`, after a `--`"""
 
 
 class Watched:
-    """A run of the real command, its actors and what it takes of the machine."""
+    """A run of the real command, its actors and its use of the machine."""
 
     def __init__(self, directory: Path, flags: Sequence[str]):
         self.directory = directory
@@ -74,7 +74,7 @@ class Watched:
         self._root = psutil.Process(self.process.pid)
 
     def output(self) -> str:
-        """The end of what the command has printed."""
+        """The end of the command's output."""
         self._output.seek(0)
         return self._output.read().decode(errors="replace")[-4000:]
 
@@ -94,8 +94,7 @@ class Watched:
 
     def metrics(self) -> list[dict[str, Any]]:
         """Rows of metrics.jsonl so far."""
-        file = self.directory / "metrics.jsonl"
-        return read_records(file)[0] if file.exists() else []
+        return records.read_stored(self.directory / "metrics.jsonl")[0]
 
     def actors(self) -> list[psutil.Process]:
         """Living actor processes, oldest first."""
@@ -107,7 +106,7 @@ class Watched:
         return sorted(found, key=lambda process: process.create_time())
 
     def sample(self) -> dict[str, float]:
-        """What the run takes now: bytes of memory, counts of descriptors, processes and files in /dev/shm."""
+        """The run's present use: bytes of memory, counts of descriptors, processes and files in /dev/shm."""
         sizes = []
         for name in self.shared_memory():
             with contextlib.suppress(FileNotFoundError):
@@ -122,13 +121,13 @@ class Watched:
         }
 
     def shared_memory(self) -> set[str]:
-        """Whatever of engines has come into /dev/shm since the run's start."""
+        """Files of engines in /dev/shm that are newer than the run."""
         return _shared("ViZDoom") - self._before
 
     def left_behind(self) -> list[str]:
         """Files of the ended run in /dev/shm that no process has mapped.
 
-        Another run beside it may be about to clear away what it has killed, so what is found is looked at for a minute.
+        Another run may be about to remove files of its own dead engines, so this waits up to a minute for that.
         """
         deadline = time.monotonic() + _CLEARED_S
         while (left := _unmapped(self.shared_memory())) and time.monotonic() < deadline:
@@ -137,7 +136,7 @@ class Watched:
 
 
 def soak(options: Soak, console: Console) -> dict[str, Any]:
-    """Runs it all; returns the record."""
+    """Runs the whole soak; returns the record."""
     started = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
     hardware, commit = machine.hardware(), record.describe_commit()
     with tempfile.TemporaryDirectory(prefix="gvz-soak-") as directory:
@@ -156,7 +155,7 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
                     samples.append({"time_s": round(time.time() - begin, 1), **run.sample()})
                     due = kind == "kills" and now >= options.kill_every_s * _killed_since(kills, stretch)
                     if due and (actors := run.actors()):
-                        actors[0].kill()  # the one that has lived longest, so that they take turns
+                        actors[0].kill()  # the oldest, so that they take turns
                         kills.append(round(time.time() - begin, 1))
                 stretches.append({**stretch, "end_s": time.time() - begin})
                 console.print(f"{(time.time() - begin) / 60:5.1f} min  {kind:11} {len(kills)} kills so far")
@@ -164,8 +163,8 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
             code = run.process.wait(_STOP_TIMEOUT_S)
         finally:
             end_run(run.process)
-        rows, problems = read_records(run.directory / "metrics.jsonl")
-        faults, _ = read_records(run.directory / "faults.jsonl")
+        rows, problems = records.read(run.directory / "metrics.jsonl")
+        faults, _ = records.read(run.directory / "faults.jsonl")
         for stretch in stretches:
             stretch["updates_per_s"] = _rate(rows, begin, stretch)
         return {
@@ -189,7 +188,7 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
 
 
 def summary(made: dict[str, Any]) -> dict[str, float]:
-    """What the promises are about: medians of the last fifth over the first, and the median of `kill_ratios`."""
+    """The promised quantities: medians of the last fifth over the first, and the median of `kill_ratios`."""
     samples = made["samples"]
     fifth = max(1, len(samples["time_s"]) // 5)
     grown = {
@@ -215,7 +214,7 @@ def _shared(prefix: str) -> set[str]:
 
 
 def _unmapped(names: set[str]) -> list[str]:
-    """Those that no process has mapped."""
+    """The names of files that no process has mapped."""
     mapped = ""
     for process in psutil.process_iter() if names else ():
         with contextlib.suppress(OSError):
@@ -264,7 +263,7 @@ def _count(kinds: Iterator[str]) -> dict[str, int]:
 
 
 def _words(options: Soak) -> list[str]:
-    """The options that are not at their defaults, as words of the command line."""
+    """The options without default values, as words of the command line."""
     default = Soak()
     words = []
     for name, value in asdict(options).items():
@@ -274,7 +273,7 @@ def _words(options: Soak) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns the exit code: 0 nothing lost or left, 1 something was."""
+    """Runs the command; returns the exit code: 0 if nothing was lost or left behind, else 1."""
     options = tyro.cli(Soak, args=arguments, prog="python -m benchmarks.soak")
     console = Console(stderr=True)
     made = soak(options, console)

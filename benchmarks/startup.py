@@ -1,11 +1,10 @@
-"""Seconds to the help page and from the command to the first episode's row of `rainbow_4task`, on a warm cache, and
-what the start of an actor takes, which is the price of every one that is replaced.
+"""Seconds to the help page and from the command to the first episode's row of `rainbow_4task`, with warm caches, and
+the processor time of an actor's start, which is the cost of each replacement.
 
-The first run fills the caches (bytecode, compiled maps, compiled programs) and is thrown away. Goals: `--help` under
+The first run fills the caches (bytecode, compiled maps, compiled programs) and is discarded. Goals: `--help` under
 0.5 s without importing jax, the first row within 15 s.
 """
 
-import dataclasses
 import subprocess
 import sys
 import tempfile
@@ -13,6 +12,7 @@ import time
 from functools import partial
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from benchmarks import workload
@@ -26,7 +26,7 @@ _POLL_S = 0.05
 
 
 def measure(budget: Budget) -> list[Row]:
-    """Alternates all of them."""
+    """Alternates all measurements."""
     with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
         counter = iter(range(1000))
         values = alternate(
@@ -82,13 +82,13 @@ def _first_episode_s(directory: Path, budget: Budget) -> float:
 
 
 def _actor_start_s(directory: Path, budget: Budget) -> float:
-    """Processor seconds that one actor and its engines have taken when it is ready to play."""
+    """Processor seconds of one actor and its engines until it is ready to play."""
     from gvz.run.assemble import assemble
 
     parts = assemble(workload.run_config(budget), directory)
     before = workload.processor_s()
     with workload.playing(
-        dataclasses.replace(parts.pool_config, num_actors=1), np.zeros(parts.pool_config.num_params, np.float32)
+        msgspec.structs.replace(parts.pool_config, num_actors=1), np.zeros(parts.pool_config.num_params, np.float32)
     ):
         after = workload.processor_s()
     return sum(after[where] - before[where] for where in ("Python", "engines"))

@@ -1,8 +1,8 @@
-"""One draw and one update of the sum tree at a million leaves, beside flashbax's.
+"""One draw and one update of the sum tree at a million leaves, compared with flashbax's.
 
-Both inside one jit, a hundred steps in a scan with the tree donated. flashbax 0.1.3 runs in the peers' process, under
-the same JAX settings, with the setter it chooses on this device. Goals: twice flashbax's speed at batch 32 and 512 on
-a CPU; on a GPU at most 50 microseconds at batch 256.
+Both run in one jit, a hundred steps in a scan with the tree donated. flashbax 0.1.3 runs in the peers' process, with
+the same JAX settings and the setter that it chooses on this device. Goals: twice flashbax's speed at batch 32 and 512
+on a CPU; on a GPU at most 50 microseconds at batch 256.
 """
 
 import contextlib
@@ -51,7 +51,7 @@ def measure(budget: Budget) -> list[Row]:
 
 
 def _steps(num_leaves: int, batch_size: int) -> Callable[[], None]:
-    """A call that does STEPS_PER_CALL steps and waits for them; compiled and warm."""
+    """A compiled and warm function that does STEPS_PER_CALL steps and waits for them."""
     import jax
     import jax.numpy as jnp
 

@@ -1,10 +1,10 @@
 """The transport against memcpy: step records through a ring, parameters through the broadcast queue to 8 readers.
 
 Ring: blocks of 64 records with frames of 84x84x3, in and out in one process (each is one copy), and as a stream from a
-writer in a process of its own. Queue: the full parameter vector, published with a pause in which every reader takes
-its copy, and back to back, with all readers copying at the same time. Goals: a ring's block goes in and comes out at
-half of memcpy's bandwidth or more; a publication takes at most twice as long as one memcpy of the vector. How old the
-parameters are that actors act by is measured by `whole`.
+writer in another process. Queue: the full parameter vector, published with a pause in which every reader takes its
+copy, and without pauses, while all readers copy. Goals: a ring's block goes in and comes out with at least half of
+memcpy's bandwidth; a publication takes at most twice as long as one memcpy of the vector. `whole` measures the age of
+the acting parameters.
 """
 
 import contextlib
@@ -29,11 +29,11 @@ NUM_PARAMS = 6_728_248
 """of the default Rainbow agent with 3 actions"""
 NUM_READERS = 8
 _PAUSE_S = 0.1
-"""after which every reader has its copy of the last version, on two cores too"""
+"""long enough for every reader to copy the last version, even on two cores"""
 
 
 def measure(budget: Budget) -> list[Row]:
-    """Bandwidths and times in alternating rounds, and the goals' ratios."""
+    """Bandwidths and times in alternating rounds, and the ratios of the goals."""
     budget = dataclasses.replace(budget, body_s=budget.body_s / 2.5)  # a copy takes milliseconds
     with contextlib.ExitStack() as stack:
         ring = alternate(budget.rounds, _ring_bodies(stack, budget))
@@ -74,7 +74,7 @@ def _ring_bodies(stack: contextlib.ExitStack, budget: Budget) -> dict[str, Calla
     }
 
     def bandwidth(name: str) -> float:
-        """Of one of the calls, all of them made in turn, so that each finds the caches as the others do."""
+        """The bandwidth of one call. All calls run in turn, so that each finds the caches in the same state."""
         times, start = [], time.perf_counter()
         while not times or time.perf_counter() - start < budget.body_s:
             for called, call in calls.items():

@@ -1,10 +1,10 @@
 """`rainbow_4task` as a whole: learner and actors together against each alone, first gradient step, memory, staleness.
 
-The run is the real command with a shorter end. Beside it, in turns, the learner alone (full replay, no actors) and the
-actors alone (full network acting, drained, no learner). Work is a share of what the machine does of it alone: goal is
-that gradient steps and decisions of the run add up to 0.9 or more; what a gradient step and a decision cost of the
-processors, together and alone, says where the rest goes. The memory of all its processes, whose peak is its last
-checkpoint, is to be within 10% of the bill it prints.
+The run is the real command with fewer gradient steps. It alternates with the learner alone (full replay, no actors) and
+the actors alone (full network acting, drained, no learner). The run's gradient steps and decisions are divided by the
+rates of each alone; goal: the two shares add up to 0.9 or more. The processor times of a gradient step and a decision,
+together and alone, explain the difference. The memory of all processes has its peak at the last checkpoint; goal: it is
+within 10% of the bill that the run prints.
 """
 
 import contextlib
@@ -29,9 +29,9 @@ from benchmarks.rounds import Budget, Row, goal, measured, rates
 
 _RUN_TIMEOUT_S = 800.0
 _MEASURED_UPDATES, _LOG_PERIOD_UPDATES = 260, 20
-"""gradient steps of a run, and how many there are from row to row of its metrics; rates count from the first row on"""
+"""gradient steps of a run, and between two rows of its metrics; rates count from the first row on"""
 _MEMORY_PERIOD_S, _PROCESSOR_PERIOD_S, _QUICK_PERIOD_S = 0.25, 2.0, 0.05
-"""seconds between two looks at what the processes of a run take; a quick run is over in less than a second"""
+"""seconds between two samples of a run's processes; a quick run takes less than a second"""
 
 
 def measure(budget: Budget) -> list[Row]:
@@ -56,13 +56,13 @@ def measure(budget: Budget) -> list[Row]:
                 _run(Path(directory) / f"run_{number}", budget, updates, period, processor_period_s, _processor)
             )
             learner = workload.Learner(config, parts)
-            learn = partial(learner.updates_per_s, parts.learner.num_updates_per_call)
+            learn = partial(learner.updates_per_s, learner.sizes.num_updates_per_call)
             learn(0.0)  # compiles
             updates_per_s, cost = workload.processor_costs(partial(learn, body_s))
             learner_alone.append(updates_per_s)
             costs["gradient step, learner alone"].append(cost["learner's side"])
             params = learner.acting_params()
-            del learner, learn  # its replay: the next run is to have the machine to itself
+            del learner, learn  # frees its replay, so that the next run has the whole machine
             with workload.playing(parts.pool_config, params) as pool:
                 play = partial(workload.decisions_per_s, pool, body_s)
                 decisions_per_s, cost = workload.processor_costs(play)
@@ -82,7 +82,7 @@ def measure(budget: Budget) -> list[Row]:
         ]
         for name, summed in (("mean", statistics.fmean), ("p95", statistics.median), ("max", max))
     }
-    bill, batch_size = parts.footprint.memory_bytes, config.learner.batch_size
+    bill, batch_size = parts.footprint.memory_bytes, parts.learner.batch_size
     peaks = [max(run["seen"]) for run in firsts]
     cores = [_cores(run) for run in runs]
     for found, (u, d) in zip(cores, together, strict=True):
@@ -112,9 +112,9 @@ def measure(budget: Budget) -> list[Row]:
 def _run(
     directory: Path, budget: Budget, updates: int, log_period: int, look_period_s: float, look: Callable[[int], Any]
 ) -> dict[str, Any]:
-    """One run of the real command: its rows of metrics, seconds from the command to the first, and what `look` saw.
+    """One run of the real command: its rows of metrics, seconds from the command to the first, and `look`'s samples.
 
-    `look` is called with the process's id, from the first row on: to look at such a process costs it time.
+    `look` is called with the process's id, only from the first row on, because sampling slows the process down.
     """
     flags = ["--learner.total-updates", str(updates), "--log.period-updates", str(log_period)]
     flags += workload.quick_flags(budget)
@@ -142,19 +142,19 @@ def _run(
 
 
 def _processor(pid: int) -> tuple[float, dict[str, float]]:
-    """Now, as records say it, and the processor seconds of a run so far."""
+    """The present time, as in records, and the processor seconds of a run so far."""
     return time.time(), workload.processor_s(pid)
 
 
 def _cores(run: dict[str, Any]) -> dict[str, float]:
-    """Processor seconds a second between the first and the last row of a run, by where they go."""
+    """Processor seconds per second between the first and the last row of a run, by kind of process."""
     looks = [look for look in run["seen"] if look[0] <= run["rows"][-1]["time_s"]]
     (begin_s, before), (end_s, after) = looks[0], looks[-1]
     return {where: (after[where] - before[where]) / (end_s - begin_s) for where in before}
 
 
 def end_run(process: "subprocess.Popen[bytes]") -> None:
-    """Ends a run that is not done: twice Ctrl-C stops it at once, and its actors and engines with it."""
+    """Ends an unfinished run: Ctrl-C twice stops it at once with its actors and engines."""
     for _ in range(2):
         if process.poll() is None:
             process.send_signal(signal.SIGINT)
@@ -174,7 +174,7 @@ def _rates(rows: list[dict[str, Any]]) -> tuple[float, float]:
 
 
 def tree_bytes(pid: int) -> int:
-    """Sum of the proportional set sizes of a process and all below it, bytes."""
+    """Sum of the proportional set sizes of a process and its descendants, bytes."""
     total = 0
     with contextlib.suppress(psutil.NoSuchProcess):
         process = psutil.Process(pid)

@@ -1,6 +1,6 @@
-"""What several benchmarks put to work: a pool that is drained, a replay that is full, and how much a network computes.
+"""Workloads of several benchmarks: a drained pool, a full replay, and the number of operations of a network.
 
-Everything is sized as `rainbow_4task` is, on one task, so that a peer that plays a single task is comparable.
+All sizes are those of `rainbow_4task`, on one task, so that peers with a single task are comparable.
 """
 
 import contextlib
@@ -11,13 +11,15 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 import psutil
 
 from benchmarks.rounds import Budget, Row, measured
 
 if TYPE_CHECKING:
-    from actors.pool import ActorPool, PoolConfig
+    from actors.pool import PoolConfig
+    from actors.process_pool import ProcessPool
     from gvz.run.assemble import RunParts
     from gvz.run.config import RunConfig
     from learner.agents.base import Agent
@@ -28,9 +30,9 @@ _START_TIMEOUT_S = 600.0
 _DRAIN_RECORDS, _DRAIN_WAIT_S = 256, 0.02
 """as in gvz/run/train.py"""
 _UPDATES_IN_FLIGHT = 16
-"""calls handed to the device before the next wait: the clock is not to run away from it"""
+"""calls dispatched to the device before the next wait, so that the clock includes their work"""
 _SETTLE_S = 0.3
-"""seconds played before the clock starts: what waited in full rings is not counted"""
+"""seconds played before the clock starts, so that records waiting in full rings are not counted"""
 
 
 QUICK: dict[str, dict[str, Any]] = {
@@ -47,12 +49,12 @@ QUICK: dict[str, dict[str, Any]] = {
     "learner": {"warmup_steps": 100, "batch_size": 8},
     "actors": {"num_actors": 1, "games_per_actor": 4},
 }
-"""what a quick run changes of `rainbow_4task`: above all, what takes XLA long to compile"""
+"""changes of `rainbow_4task` in a quick run, mainly of parts that XLA compiles slowly"""
 
 
 def four_task_config(budget: Budget) -> "RunConfig":
-    """`rainbow_4task`; in a quick run with the smallest network and replay."""
-    from gvz.run.config import load_config
+    """`rainbow_4task`; a quick run has the smallest network and replay."""
+    from gvz.run.config_files import load_config
 
     config = load_config("rainbow_4task.py")
     changes = QUICK if budget.quick else {}
@@ -74,22 +76,22 @@ def quick_flags(budget: Budget) -> list[str]:
 
 
 def run_config(budget: Budget) -> "RunConfig":
-    """`four_task_config` on its default task alone."""
+    """`four_task_config` with its default task alone."""
     return dataclasses.replace(four_task_config(budget), training_set=1)
 
 
 def random_players(config: "PoolConfig", **changes: Any) -> "PoolConfig":
     """The same pool without a network: uniformly random actions."""
-    return dataclasses.replace(config, policy=b"", num_params=0, layout_hash=0, **changes)
+    return msgspec.structs.replace(config, policy=b"", num_params=0, layout_hash=0, **changes)
 
 
 @contextlib.contextmanager
-def playing(config: "PoolConfig", params: np.ndarray | None = None) -> "Generator[ActorPool]":
-    """A pool whose actors are all ready, and which acts by `params` float32[P] if it has a policy."""
-    from actors.pool import ActorPool
+def playing(config: "PoolConfig", params: np.ndarray | None = None) -> "Generator[ProcessPool]":
+    """A pool whose actors are all ready. It acts with `params` float32[P] if it has a policy."""
+    from actors.process_pool import ProcessPool
     from gvz.transport.messages import ParamsHeader
 
-    with ActorPool(config) as pool:
+    with ProcessPool(config) as pool:
         if params is not None:
             pool.publish(params, ParamsHeader(version=1, num_updates=0, layout_hash=config.layout_hash))
         deadline = time.monotonic() + _START_TIMEOUT_S
@@ -101,8 +103,8 @@ def playing(config: "PoolConfig", params: np.ndarray | None = None) -> "Generato
         yield pool
 
 
-def decisions_per_s(pool: "ActorPool", seconds: float) -> float:
-    """Plays for a while, the learner's side of the work included: drain and supervision."""
+def decisions_per_s(pool: "ProcessPool", seconds: float) -> float:
+    """Plays for `seconds`, including the learner's side of the work: drain and supervision."""
 
     def play(seconds: float) -> float:
         start, before = time.perf_counter(), pool.statistics().env_steps
@@ -116,11 +118,11 @@ def decisions_per_s(pool: "ActorPool", seconds: float) -> float:
 
 
 def processor_times(rounds: int, plays: Mapping[str, Callable[[], float]]) -> list[Row]:
-    """Processor time that a decision takes, by where it goes: a profile that needs no profiler.
+    """Processor time of a decision, by kind of process: a profile without a profiler.
 
     Args:
-        rounds: in which the candidates take turns.
-        plays: each plays for a while in processes below this one and returns its decisions a second.
+        rounds: the candidates alternate in each round.
+        plays: each plays for a while in child processes and returns its decisions per second.
     """
     found: dict[str, list[float]] = {}
     for _ in range(rounds):
@@ -131,7 +133,7 @@ def processor_times(rounds: int, plays: Mapping[str, Callable[[], float]]) -> li
 
 
 def processor_costs(work: Callable[[], float]) -> tuple[float, dict[str, float]]:
-    """(units of work a second, processor seconds a unit by where they go); `work` returns the former after a while."""
+    """(units of work per second, which `work` measures and returns; processor seconds per unit by kind of process)."""
     before, start = processor_s(), time.perf_counter()
     units_per_s = work()
     units = units_per_s * (time.perf_counter() - start)
@@ -139,9 +141,9 @@ def processor_costs(work: Callable[[], float]) -> tuple[float, dict[str, float]]
 
 
 def processor_s(pid: int | None = None) -> dict[str, float]:
-    """Seconds of processor time so far: of the games, of what plays them, and of the process, which drains them.
+    """Seconds of processor time so far: of the engines, of the actors, and of the process that drains them.
 
-    `pid` is the process that all others are below; this one if it is not given.
+    `pid` is the process that is the parent of all others; default: this one.
     """
     seconds = {"engines": 0.0, "Python": 0.0, "learner's side": 0.0}
     root = psutil.Process(pid)
@@ -159,7 +161,7 @@ def work_directory(directory: str) -> Path:
 
 
 def filled_replay(spec: "ReplaySpec") -> "ReplayState":
-    """A replay full of noise in episodes of about a hundred records, every leaf with a priority of its own."""
+    """A replay full of noise, in episodes of about a hundred records, with a random priority for every leaf."""
     import jax
     import jax.numpy as jnp
 
@@ -172,53 +174,56 @@ def filled_replay(spec: "ReplaySpec") -> "ReplayState":
         last = jax.random.uniform(keys[0], (K,)) < 0.01
         drawable = ~last & (jnp.arange(K) % spec.lane_capacity < spec.lane_capacity - spec.n_steps)
         priorities = jnp.where(drawable, jax.random.uniform(keys[1], (K,)) + 0.01, 0.0)
-        return dataclasses.replace(
-            empty,
+        records = dataclasses.replace(
+            empty.store,
             frames=jnp.arange(K).astype(jnp.uint8)[:, None] * jnp.uint8(177)
-            + jnp.arange(empty.frames.shape[1]).astype(jnp.uint8)[None],
+            + jnp.arange(empty.store.frames.shape[1]).astype(jnp.uint8)[None],
             reward=jax.random.uniform(keys[2], (K,)),
             action=jax.random.randint(keys[3], (K,), 0, 3),
             task=jnp.zeros(K, jnp.int32),
             first=jnp.roll(last, 1),
             last=last,
             terminated=last,
-            tree=sum_tree.set(empty.tree, jnp.arange(K), priorities),
         )
+        tree = sum_tree.set(empty.tree, jnp.arange(K), priorities)
+        return dataclasses.replace(empty, store=records, tree=tree)
 
     return jax.block_until_ready(fill(jax.random.key(0)))
 
 
 class Learner:
-    """The learner of a run without the run: its state, a full replay, and the jitted functions of gvz/run/train.py."""
+    """The learner of a run without the run: its state, a full replay, and its jitted functions."""
 
     def __init__(self, config: "RunConfig", parts: "RunParts"):
         import jax
 
-        from learner import replay, train_step
+        from learner import replay
         from learner.export import flatten_params
         from learner.ingest import Ingest
+        from learner.off_policy import OffPolicyParts
 
-        self.config, self.parts = config, parts
-        self.state = train_step.init(parts.learner.agent, parts.learner.replay_spec, config.learner, jax.random.key(0))
-        self.replay = filled_replay(parts.learner.replay_spec)
-        self._weights = jax.numpy.ones(parts.learner.replay_spec.num_tasks)
+        assert isinstance(parts.learner, OffPolicyParts)
+        self.config, self.parts, self.sizes = config, parts, parts.learner
+        self.state = self.sizes.init(jax.random.key(0))
+        self.replay = filled_replay(self.sizes.replay_spec)
+        self._weights = jax.numpy.ones(self.sizes.replay_spec.num_tasks)
         self._train_steps: dict[int, Any] = {}
-        self._add = jax.jit(partial(replay.add, parts.learner.replay_spec), donate_argnums=0)
+        self._add = jax.jit(partial(replay.add, self.sizes.replay_spec), donate_argnums=0)
         self._flatten = jax.jit(flatten_params)
-        self._ingest = Ingest(parts.learner.replay_spec)
+        self._ingest = Ingest(self.sizes.replay_spec)
         self._version = 1
 
     def acting_params(self) -> np.ndarray:
         """The parameters as actors take them, float32[P]."""
         return np.asarray(self._flatten(self.state.params))
 
-    def updates_per_s(self, per_call: int, seconds: float, pool: "ActorPool | None" = None) -> float:
-        """Gradient steps a second, compilation apart; with a pool as fast as both go, its records into the replay.
+    def updates_per_s(self, per_call: int, seconds: float, pool: "ProcessPool | None" = None) -> float:
+        """Gradient steps per second without compilation; with a pool, its records go into the replay meanwhile.
 
         Args:
             per_call: gradient steps in one jitted call.
-            seconds: at least so long, and at least one call.
-            pool: live actors, drained, watched and given new parameters as in a run.
+            seconds: least length of the measurement; at least one call runs.
+            pool: running actors, which are drained, supervised and get new parameters as in a run.
         """
         import jax
 
@@ -242,18 +247,18 @@ class Learner:
         from learner import train_step
 
         if per_call not in self._train_steps:
-            config, parts = self.config, self.parts
+            sizes = self.sizes
             self._train_steps[per_call] = train_step.make_train_step(
-                parts.learner.agent, parts.learner.replay_spec, config.learner, config.replay, per_call
+                sizes.agent, sizes.replay_spec, sizes.config, sizes.replay_config, per_call
             )
         self.state, self.replay = self._train_steps[per_call](self.state, self.replay, self._weights)
 
-    def _collect(self, pool: "ActorPool") -> None:
+    def _collect(self, pool: "ProcessPool") -> None:
         for arrays in self._ingest.arrays(pool.drain(_DRAIN_RECORDS), self._version):
             self.replay = self._add(self.replay, arrays)
         pool.poll()
 
-    def _publish(self, pool: "ActorPool") -> None:
+    def _publish(self, pool: "ProcessPool") -> None:
         from gvz.transport.messages import ParamsHeader
 
         self._version += 1
@@ -265,15 +270,18 @@ class Learner:
         import jax
 
         from learner import replay
+        from learner.agents.base import OffPolicyAgent
 
         agent, spec, batch_size = (
-            direct(self.parts.learner.agent),
-            self.parts.learner.replay_spec,
-            self.config.learner.batch_size,
+            direct(self.sizes.agent),
+            self.sizes.replay_spec,
+            self.sizes.batch_size,
         )
         batch, _ = jax.eval_shape(
             lambda s, key: replay.sample(spec, s, key, batch_size, 0.5), self.replay, jax.random.key(0)
         )
+
+        assert isinstance(agent, OffPolicyAgent)
 
         def loss(params: Any, batch: replay.Transitions) -> jax.Array:
             return agent.loss(params, params, jax.random.key(0), batch).loss.mean()
@@ -282,7 +290,7 @@ class Learner:
 
 
 def flops(function: Any, *arguments: Any) -> float:
-    """Floating-point operations of one call as XLA counts them before it optimizes; arguments may be shapes."""
+    """Floating-point operations of one call, as XLA counts them before optimization; arguments may be shapes."""
     import jax
 
     analysis = jax.jit(function).lower(*arguments).cost_analysis()
@@ -291,7 +299,7 @@ def flops(function: Any, *arguments: Any) -> float:
 
 
 def direct(agent: "Agent") -> "Agent":
-    """The same agent with plain convolutions: the form whose operations count as the work there is to do."""
+    """The same agent with plain convolutions, whose operations define the necessary work."""
     from learner.agents.base import make_agent
 
     config = agent.config  # pyright: ignore[reportAttributeAccessIssue]  # ours has one, the protocol does not

@@ -3,10 +3,12 @@
 from dataclasses import replace
 
 from configs.rainbow_4task import CONFIG as RAINBOW
+from learner.agents.configs.dqn import DQNConfig
+from learner.config import ReplayConfig
 
 CONFIG = replace(
     RAINBOW,
     name="dqn_4task",
-    agent=replace(RAINBOW.agent, name="dqn", double=False, dueling=False, noisy="off", distributional=False, n_steps=1),
-    replay=replace(RAINBOW.replay, capacity=50_000, prioritized=False),
+    agent=DQNConfig(),
+    replay=ReplayConfig(capacity=50_000, prioritized=False),
 )

@@ -6,19 +6,14 @@ Its exploration falls over a sixteenth of the run's decisions, as `dqn_4task`'s 
 from dataclasses import replace
 
 from configs.rainbow_quick import CONFIG as RAINBOW
+from learner.agents.configs.dqn import DQNConfig
+from learner.config import ReplayConfig
 
 CONFIG = replace(
     RAINBOW,
     name="dqn_quick",
-    agent=replace(
-        RAINBOW.agent,
-        name="dqn",
-        double=False,
-        dueling=False,
-        noisy="off",
-        distributional=False,
-        n_steps=1,
-        epsilon_decay_steps=5_000,
+    agent=DQNConfig(
+        conv_channels=(16, 32), conv_kernels=(8, 4), conv_strides=(4, 2), hidden_units=128, epsilon_decay_steps=5_000
     ),
-    replay=replace(RAINBOW.replay, prioritized=False),
+    replay=ReplayConfig(capacity=50_000, prioritized=False),
 )

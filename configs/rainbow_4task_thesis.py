@@ -13,10 +13,11 @@ in 4.1.5 are in `rainbow_hidden_4096`.
 from dataclasses import replace
 
 from configs.rainbow_4task import CONFIG as RAINBOW
+from learner.config import ReplayConfig
 
 CONFIG = replace(
     RAINBOW,
     name="rainbow_4task_thesis",
-    replay=replace(RAINBOW.replay, num_newest=3),
+    replay=ReplayConfig(num_newest=3),
     learner=replace(RAINBOW.learner, kpi_weighting=True),
 )

@@ -1,4 +1,4 @@
-"""DQN in one file, as CleanRL writes it: PyTorch, one environment, a replay of numpy arrays.
+"""DQN in one file in the style of CleanRL: PyTorch, one environment, a replay of numpy arrays.
 
 pip install -r examples/requirements.txt; python examples/cleanrl_style_dqn.py --steps 200000
 """
@@ -19,7 +19,7 @@ def q_network(num_actions: int) -> nn.Module:
 
 
 def main(task: str = "defend_the_center/default", steps: int = 20_000, capacity: int = 20_000, warmup: int = 1_000):
-    """Learns from every fourth decision; prints the score of every episode."""
+    """Does a gradient step at every fourth decision; prints the score of every episode."""
     torch.manual_seed(1)
     rng = np.random.default_rng(1)
     env = FrameStackObservation(gvz.make(task, grayscale=True), 4)  # u8[4, 84, 84, 1], newest frame last
@@ -38,7 +38,7 @@ def main(task: str = "defend_the_center/default", steps: int = 20_000, capacity:
         obs_t, reward, terminated, truncated, info = env.step(action)
         i = step % capacity
         frames[:, i] = obs[..., 0], obs_t[..., 0]
-        actions[i], rewards[i], discounts[i] = action, reward, 0.0 if terminated else 0.99  # a time-out is no end
+        actions[i], rewards[i], discounts[i] = action, reward, 0.0 if terminated else 0.99  # bootstrap across time-outs
         obs = obs_t
         if terminated or truncated:
             print(f"decision {step}: score {info['score']:.0f} of {info['upper_bound']:.0f}, epsilon {epsilon:.2f}")

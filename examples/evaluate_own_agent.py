@@ -1,4 +1,4 @@
-"""Any function of frames, evaluated by the benchmark's protocol: the same episodes that everybody is compared on.
+"""Evaluates any function of frames by the benchmark's protocol, on the same episodes as every other player.
 
 python examples/evaluate_own_agent.py --episodes 100 --workers 4; gvz report own_agent.jsonl
 """
@@ -20,7 +20,7 @@ ATTACK, TURN_LEFT, TURN_RIGHT = range(3)
 
 
 def choose(stack: np.ndarray) -> int:
-    """Defend the Center by eye: turns to where the picture moves most, fires when that is the middle.
+    """Turns to where the picture of Defend the Center changes most, and fires when that is the middle.
 
     stack: u8[48, 84, 2], the last two frames, the older one first.
     """
@@ -35,7 +35,7 @@ def mean_score(rows: list[Row], task: Task) -> str:
 
 
 def main(episodes: int = 3, level: int = 0, workers: int = 0, out: Path = Path("own_agent.jsonl")):
-    """Plays every named task of a level; the same command goes on where it was stopped."""
+    """Plays every named task of a level; the same command resumes an interrupted evaluation."""
     tasks = named_tasks("defend_the_center", level=level)
     rows = evaluate_player(
         partial(FramePlayer, choose, stack_size=2),

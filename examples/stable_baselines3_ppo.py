@@ -1,4 +1,4 @@
-"""PPO of Stable-Baselines3, trained on some tasks of a scenario and evaluated on others by the benchmark's protocol.
+"""Trains PPO of Stable-Baselines3 on some tasks of a scenario and evaluates it on others by the benchmark's protocol.
 
 pip install -r examples/requirements.txt; python examples/stable_baselines3_ppo.py --steps 200000 --episodes 20
 """

@@ -16,7 +16,7 @@ import gvz
 
 
 class QNetwork(nn.Module):
-    """u8[B, 4, 84, 84, 1] -> f32[B, A]; Tianshou hands it numpy arrays and wants a recurrent state back."""
+    """u8[B, 4, 84, 84, 1] -> f32[B, A]; Tianshou passes numpy arrays and expects a recurrent state in return."""
 
     def __init__(self, num_actions: int):
         super().__init__()

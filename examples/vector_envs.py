@@ -11,7 +11,7 @@ import gymnasium
 import tyro
 from gymnasium.wrappers import FrameStackObservation, RecordEpisodeStatistics, RecordVideo
 
-import gvz  # makes the tasks known to Gymnasium
+import gvz  # registers the tasks in Gymnasium
 
 
 def main(
@@ -26,7 +26,7 @@ def main(
         task,
         num_envs=num_envs,
         vectorization_mode=mode,
-        # processes of their own: a fork of this one would share its threads and locks
+        # new processes: a fork of this one would share its threads and locks
         vector_kwargs={"context": "spawn"} if mode == "async" else {},
         wrappers=[partial(FrameStackObservation, stack_size=4), RecordEpisodeStatistics],
     )
@@ -35,7 +35,7 @@ def main(
     print(f"gvizdoom {gvz.__version__}, {mode}: observations {observations.shape} {observations.dtype}")
     for _ in range(steps):
         observations, _, terminated, truncated, infos = envs.step(envs.action_space.sample())
-        for i in (terminated | truncated).nonzero()[0]:  # game i begins anew with the next step
+        for i in (terminated | truncated).nonzero()[0]:  # game i resets at the next step
             score, length = infos["score"][i], infos["episode"]["l"][i]
             print(f"game {i}: score {score:.0f} after {length} decisions")
     envs.close()

@@ -1,8 +1,8 @@
-"""GViZDoom: graded visual generalization in Doom, and a trainer for it.
+"""GViZDoom: a benchmark of visual generalization in Doom, and a trainer for it.
 
-Tier 1. The modules beside this file are the benchmark's, but for the commands `launch` and `cli`, which are tier 3.
+Tier 1. The modules beside this file belong to the benchmark, except the commands `launch` and `cli`, which are tier 3.
 
-`import gvz` makes every named task known to Gymnasium: gymnasium.make("GViZDoom/DefendTheCenter-Gore-v0").
+`import gvz` registers every named task in Gymnasium: gymnasium.make("GViZDoom/DefendTheCenter-Gore-v0").
 """
 
 from typing import TYPE_CHECKING, Any
@@ -25,7 +25,7 @@ def make(task: "str | Task", **options: Any) -> "DoomEnv":
         task: `<scenario>/<attribute>+<attribute>...`, for example "defend_the_center/gore+mossy_bricks".
         **options: arguments of gvz.env.DoomEnv and fields of gvz.core.env_config.EnvConfig.
     """
-    from gvz.env import DoomEnv  # here, so that `import gvz` loads nothing
+    from gvz.env import DoomEnv  # here, so that `import gvz` is quick
 
     return DoomEnv(task, **options)
 

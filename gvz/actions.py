@@ -1,4 +1,4 @@
-"""Discrete actions: which buttons each of a scenario's actions holds."""
+"""Discrete actions: the buttons that each action of a scenario holds."""
 
 from itertools import chain, combinations
 from typing import assert_never
@@ -16,8 +16,8 @@ def action_buttons(scenario: Scenario, action_set: ActionSet) -> tuple[tuple[str
     buttons: one button each, in the scenario's order (thesis 3.3).
     combinations: every set of buttons without a contradiction, the empty one first, then by size (LevDoom's sets:
         6, 6, 12 and 6 actions).
-    unified: one button each, of all scenarios together, in alphabetical order. Where the scenario does not have
-        the button, the action holds none: the agent cannot move so there (thesis 6.1.1).
+    unified: one button each, of all scenarios together, in alphabetical order. If the scenario does not have
+        the button, the action holds none (thesis 6.1.1).
     """
     match action_set:
         case "buttons":
@@ -31,8 +31,3 @@ def action_buttons(scenario: Scenario, action_set: ActionSet) -> tuple[tuple[str
             return tuple((button,) if button in scenario.buttons else () for button in everything)
         case _:
             assert_never(action_set)
-
-
-def num_actions(scenario: Scenario, action_set: ActionSet) -> int:
-    """How many actions there are."""
-    return len(action_buttons(scenario, action_set))

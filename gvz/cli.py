@@ -14,9 +14,9 @@ from gvz.core.errors import GvzError
 from gvz.core.registry import discover
 
 EXIT_BROKEN_PIPE = 141
-"""what a shell says of a program that SIGPIPE ended"""
+"""exit code that a shell shows for a program that SIGPIPE ended"""
 DESCRIPTION = (
-    "GViZDoom: graded visual generalization in Doom. `gvz COMMAND --help` says more; `gvz --version` which it is."
+    "GViZDoom: a benchmark of visual generalization in Doom. Help: `gvz COMMAND --help`. Version: `gvz --version`."
 )
 
 
@@ -29,21 +29,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except GvzError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
-    except BrokenPipeError:  # who read our output has what they wanted: gvz tasks | head
+    except BrokenPipeError:  # the reader of our output has closed it: gvz tasks | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at the end
         return EXIT_BROKEN_PIPE
 
 
 def run(arguments: Sequence[str]) -> int:
-    """The exit code of what is asked for.
+    """Runs the command and returns its exit code.
 
     Raises:
-        GvzError: it failed, or cannot be done.
+        GvzError: it failed, or it is not possible.
     """
     if arguments == ["--version"]:
         print(f"gvizdoom {gvz.__version__}")
         return 0
-    if arguments[:1] == ["train"]:  # its flags come from a config file: they are parsed there
+    if arguments[:1] == ["train"]:  # its flags depend on a config file, so launch parses them
         from gvz import launch
 
         return launch.main(arguments[1:])
@@ -51,15 +51,18 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def parse(arguments: Sequence[str], **other_commands: type) -> Any:
-    """The command that is asked for, with its flags.
+    """The chosen command with its flags.
 
     Args:
         arguments: of `gvz`.
-        **other_commands: name -> dataclass, in place of the one in gvz/commands.
+        **other_commands: name -> dataclass, instead of the one in gvz/commands.
     """
     found = {name: module.COMMAND for name, module in discover("gvz.commands").items()} | other_commands
-    overview = arguments[:1] in ([], ["-h"], ["--help"])
-    choices: list[Any] = [Annotated[command, _subcommand(name, command, overview)] for name, command in found.items()]
+    overview = arguments[:1] in ([], ["-h"], ["--help"])  # shows only the first sentence of each command
+    choices: list[Any] = []
+    for name, command in found.items():
+        sentence = (command.__doc__ or "").partition("\n")[0] if overview else None
+        choices.append(Annotated[command, tyro.conf.subcommand(name, description=sentence)])
     return tyro.cli(
         functools.reduce(operator.or_, choices),
         args=arguments,
@@ -67,13 +70,6 @@ def parse(arguments: Sequence[str], **other_commands: type) -> Any:
         description=DESCRIPTION,
         config=(tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff),
     )
-
-
-def _subcommand(name: str, command: type, overview: bool) -> Any:
-    """In the overview of all commands each is said in a sentence."""
-    if not overview:
-        return tyro.conf.subcommand(name)
-    return tyro.conf.subcommand(name, description=(command.__doc__ or "").partition("\n")[0])
 
 
 if __name__ == "__main__":

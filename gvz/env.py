@@ -1,4 +1,4 @@
-"""A task as a Gymnasium environment: observation, actions, reward, time-out, seeds, an engine that may crash."""
+"""A task as a Gymnasium environment: observation, actions, reward, time-out, seeds, crashes of the engine."""
 
 import dataclasses
 import time
@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Discrete
 
-from gvz.actions import action_buttons, num_actions
+from gvz.actions import action_buttons
 from gvz.core.env_config import EnvConfig, typed
 from gvz.core.errors import ConfigError, EngineError
 from gvz.engine.engine import Engine, EngineConfig, check_config
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 TICS_PER_SECOND = 35
 _WEAPON_UP_TIC = 10
-"""tic at which the weapon is up: episodes with a weapon start there, as LevDoom's do"""
+"""tic at which the weapon is ready: episodes with a weapon start there, as LevDoom's do"""
 _SOLVED_EPISODES = 10
 _MAX_CRASHES = 3
-"""engines of one environment that may crash with no whole episode between before it gives up"""
+"""crashes in a row, without a complete episode in between, after which the environment raises an error"""
 _EPISODE_SEEDS = 2**31
 
 
@@ -41,16 +41,16 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
       `depth` [H, W, 1], `labels` [H, W, 1] (numbers of gvz.LABEL_CLASSES) and `automap` [H, W, C] (the whole map).
     - Actions: `action_meanings`, each held for `config.frame_skip` game tics.
     - Reward: the sum of `info["reward_components"]`.
-    - Termination: the agent died; the final observation is the moment of it. (The buffers are those before it.)
-    - Truncation: the time-out, with its true final observation; or the engine crashed (`info["engine_crash"]`), then
-      the last observation is given once more and the reward is 0.
+    - Termination: the agent died; the final observation shows this moment. (The buffers are those before it.)
+    - Truncation: the time-out, with its true final observation; or a crash of the engine (`info["engine_crash"]`): then
+      the last observation is repeated and the reward is 0.
     - Info, each step: score (at most upper_bound), normalized_score (percent of upper_bound), upper_bound,
-      reward_components, variables (what the agent may see), kills (the engine's whole count: enemies that enemies
-      killed are in it), player_kills (what the agent killed itself), episode_frames,
-      episode_seed, engine_crash (of `reset`: the engine had died and is replaced); with the last one solved_episode
-      (a survival scenario's time-out was reached).
-    - Seeds: `reset(seed=n)` seeds the sequence of episodes; each draws its own, `info["episode_seed"]`, and
-      `reset(options={"episode_seed": m})` plays that episode again, alone.
+      reward_components, variables (those that the agent may see), kills (the engine's count, including enemies that
+      enemies killed), player_kills (enemies that the agent killed), episode_frames, episode_seed, engine_crash (in
+      `reset`: the engine had died and was replaced); in the last step also solved_episode (a survival scenario's
+      time-out was reached).
+    - Seeds: `reset(seed=n)` seeds the sequence of episodes. Each episode has its own seed, `info["episode_seed"]`, and
+      `reset(options={"episode_seed": m})` replays that episode alone. In a `varied` task it also chooses the map.
     """
 
     metadata = {  # noqa: RUF012  Gymnasium's; an instance's has the pictures per second of its own frame skip
@@ -67,18 +67,18 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         recycle_episodes: int | None = None,
         **fields: Any,
     ):
-        """Compiles the task's map and proves that it loads; the engine itself starts with the first `reset`.
+        """Compiles the task's map and checks that it loads; the engine itself starts at the first `reset`.
 
         Args:
             task: a task or its id, "defend_the_center/gore+mossy_bricks".
             config: sizes, action set, profile.
             render_mode: rgb_array: `render()` gives the screen, uint8 [render_height, render_width, 3];
-                human: a window shows the game at its true speed.
-            recycle_episodes: restart the engine after at most this many episodes; default: where the task needs it. A
-                task with fuzzy enemies gets a fresh engine for every episode, whatever the number: the engine's fuzz
-                goes on from episode to episode, so only a fresh engine draws it the same again. Nothing else that can
-                be seen depends on it. 0 never restarts, not even there: for players that do not look.
-            **fields: single fields of EnvConfig, in place of those of `config`: `frame_skip=8`,
+                human: a window shows the game at its normal speed.
+            recycle_episodes: restart the engine after at most this many episodes; default: only if the task needs it.
+                A task with fuzzy enemies always restarts it after every episode: the engine's fuzz effect continues
+                from episode to episode, so only a fresh engine repeats it. Nothing else in the picture depends on
+                earlier episodes. 0 never restarts, for players that ignore observations.
+            **fields: single fields of EnvConfig, instead of those of `config`: `frame_skip=8`,
                 `reward_weights={"kill": 2.0}`.
 
         Raises:
@@ -121,7 +121,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         )
         check_config(self._engine_config)
         ensure_loads(self._compiled.wad_path, self._compiled.map_name)
-        self.action_space = Discrete(num_actions(scenario, config.action_set))
+        self.action_space = Discrete(len(self.action_meanings))
         self.observation_space = observation_space(config)
         fuzzy = "STYLE_Fuzzy" in task_content(self.task, config.profile).entity.values()
         if recycle_episodes is None or (fuzzy and recycle_episodes > 0):
@@ -143,12 +143,12 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         """Starts an episode.
 
         Args:
-            seed: starts a new sequence of episodes; without one the sequence goes on.
-            options: {"episode_seed": n} plays the episode with this seed; the sequence stands still.
+            seed: starts a new sequence of episodes; without it the sequence continues.
+            options: {"episode_seed": n} plays the episode with this seed; the sequence does not advance.
 
         Raises:
             ValueError: an unknown option, or an episode seed outside [0, 2^31).
-            EngineError: the engine cannot be started, or does not run the task's map.
+            EngineError: the engine does not start, or does not run the task's map.
             ResourceError: render_mode human without a display, or too little shared memory.
         """
         super().reset(seed=seed)
@@ -177,12 +177,12 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         return self._observe(engine), info
 
     def step(self, action: int | np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Holds the action's buttons for `frame_skip` tics, or what is left until the time-out.
+        """Holds the action's buttons for `frame_skip` tics, or for the rest until the time-out.
 
         Raises:
             ResetNeeded: no episode is running.
             ValueError: no such action.
-            EngineError: the engine crashed again and again.
+            EngineError: the engine crashed too often in a row.
         """
         engine = self._engine
         if engine is None or not self._playing:
@@ -206,7 +206,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         return self._observe(engine), sum(components.values()), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
-        """The screen as it was last rendered, uint8 [render_height, render_width, 3]; None in mode human."""
+        """The last rendered screen, uint8 [render_height, render_width, 3]; None in mode human."""
         if self.render_mode != "rgb_array":
             return None
         if self._screen is None:
@@ -214,7 +214,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         return self._screen.copy()
 
     def labels(self) -> "Sequence[Label]":
-        """What was in sight at the last observation, with name and place on the rendered screen.
+        """The things in sight at the last observation, with name and place on the rendered screen.
 
         Raises:
             ValueError: "labels" is not among `config.buffers`.
@@ -224,9 +224,9 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         return () if self._state is None or self._state.labels is None else self._state.labels
 
     def close(self) -> None:
-        """Ends the engine and its window; nothing of the engine's memory is kept.
+        """Ends the engine and its window, and frees the engine's memory. Can be repeated.
 
-        May be called again. Afterwards `render` raises ResetNeeded, and `reset` would start another engine.
+        Afterwards `render` raises ResetNeeded, and `reset` starts a new engine.
         """
         self._stop_engine()
         self._screen = None
@@ -236,28 +236,29 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         self._playing = False
 
     def _begin(self) -> tuple[Engine, EngineError | None]:
-        """Starts the episode, on a new engine if there is none or the old one has died; how it died."""
+        """Starts the episode, on a new engine if needed; returns the engine, and the error if an engine died."""
         crash = None
+        map_name, map_magic = self._compiled.map_of(self._episode_seed)
         while True:
             if self._engine is None:
                 self._engine = Engine(self._engine_config)
             try:
-                self._engine.new_episode(self._episode_seed)
+                self._engine.new_episode(self._episode_seed, map_name)
                 magic = self._engine.variable(BOOKKEEPING["MAP_MAGIC"])
             except EngineError as error:
                 crash = error
                 self._note_crash(error)
                 continue
-            if magic != self._compiled.map_magic:  # where a file has no such map, ViZDoom plays another one
+            if magic != map_magic:  # if a file has no such map, ViZDoom plays another one
                 self._stop_engine()
                 raise EngineError(
                     f"{self.task.id}: {self._compiled.wad_path} runs a map with magic number {magic:.0f}, "
-                    f"want {self._compiled.map_magic}"
+                    f"want {map_magic}, that of {map_name}"
                 )
             return self._engine, crash
 
     def _read(self, engine: Engine) -> None:
-        """Keeps what the game says after a decision."""
+        """Reads the game's variables after a decision."""
         self._variables = dict(zip(self._names, engine.variables(), strict=True))
         self._frames = engine.tic() - self._start_tic
 
@@ -272,7 +273,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         return self._observation
 
     def _crashed(self, error: EngineError) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """The engine died: what the episode was up to the last decision stands, cut off there."""
+        """The engine died: the episode is truncated after the last decision."""
         assert self._observation is not None
         self._note_crash(error)
         self._playing = False
@@ -297,7 +298,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
     def _info(self, components: dict[str, float], terminated: bool, truncated: bool) -> dict[str, Any]:
         variables, scenario = self._variables, self.task.scenario
         score = float(self._frames)
-        if scenario.metric == "kills":  # enemies that kill each other can take the count beyond the best possible score
+        if scenario.metric == "kills":  # enemies that kill each other can raise the count above the bound
             score = min(variables["KILLCOUNT"], self._upper_bound)
         info = {
             "score": score,
@@ -316,7 +317,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         return info
 
     def _show(self, tics: int) -> None:
-        """Draws the screen in the window, when so many tics have passed on the viewer's clock."""
+        """Draws the screen in the window `tics` game tics after the last one, at the game's normal speed."""
         assert self._screen is not None
         if self._window is None:
             self._window = Window(self.task.id, self.config.render_width, self.config.render_height)
@@ -327,7 +328,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
 
 
 def make_env(task_id: str, env_config: Mapping[str, Any], **options: Any) -> DoomEnv:
-    """A DoomEnv from plain data: fields of EnvConfig, and options of DoomEnv. What actors call."""
+    """A DoomEnv from plain data: fields of EnvConfig, and options of DoomEnv. Actors call this."""
     return DoomEnv(task_id, **env_config, **options)
 
 

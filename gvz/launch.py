@@ -1,7 +1,7 @@
-"""The command line of the trainer, nothing else: `python -m gvz.launch --config rainbow_4task.py`.
+"""The command line of the trainer: `python -m gvz.launch --config rainbow_4task.py`.
 
-Everything that can be wrong with a configuration is said here, before any process starts. jax is imported only
-after that, so `--help` and errors are quick.
+All errors of a configuration are reported here, before any process starts. jax is imported only after that, so `--help`
+and errors are quick.
 """
 
 import dataclasses
@@ -16,7 +16,8 @@ import tyro
 
 from gvz.core.errors import GvzError
 from gvz.core.stop import StopRequest
-from gvz.run.config import RunConfig, load_config
+from gvz.run.config import RunConfig, with_agent
+from gvz.run.config_files import load_config
 from gvz.run.rundir import RunDir, move_aside
 
 DEFAULT_CONFIG = "rainbow_4task.py"
@@ -32,48 +33,52 @@ class Launch:
     config: str = DEFAULT_CONFIG
     """config file: a name in configs/, or a path"""
     fresh: bool = False
-    """start anew: an old run in the run directory is moved aside, never overwritten"""
-    run: Annotated[RunConfig, tyro.conf.arg(name="")]
+    """start a new run; an old run in the run directory is moved aside, never overwritten"""
+    run: Annotated[RunConfig, tyro.conf.arg(name=""), tyro.conf.AvoidSubcommands]
 
 
-def config_argument(arguments: Sequence[str]) -> str:
-    """The value of --config, which decides the defaults of all other flags."""
-    for i, argument in enumerate(arguments):
-        if argument == "--config" and i + 1 < len(arguments):
+def argument(arguments: Sequence[str], flag: str) -> str | None:
+    """The value of a flag that decides the defaults of other flags; None if it is not given."""
+    for i, text in enumerate(arguments):
+        if text == flag and i + 1 < len(arguments):
             return arguments[i + 1]
-        if argument.startswith("--config="):
-            return argument.removeprefix("--config=")
-    return DEFAULT_CONFIG
+        if text.startswith(f"{flag}="):
+            return text.removeprefix(f"{flag}=")
+    return None
 
 
 def parse(arguments: Sequence[str]) -> Launch:
-    """Parses the command line.
+    """Parses the command line. The flags are those of the configuration's agent.
 
     Raises:
-        ConfigError, TaskError: a value that cannot be run. SystemExit(2): flags that do not parse.
+        ConfigError, TaskError: an invalid value. SystemExit(2): flags that do not parse.
     """
-    name = config_argument(arguments)
-    default = Launch(config=name, run=load_config(name))
-    return tyro.cli(Launch, args=arguments, default=default, prog="python -m gvz.launch")
+    name = argument(arguments, "--config") or DEFAULT_CONFIG
+    config = load_config(name)
+    if (agent := argument(arguments, "--agent.name")) is not None and agent != config.agent.name:
+        config = with_agent(config, agent)
+    return tyro.cli(
+        Launch,
+        args=arguments,
+        default=Launch(config=name, run=config),
+        prog="python -m gvz.launch",
+    )
 
 
 def resumed_config(run: RunDir, config: RunConfig) -> RunConfig:
-    """`config`, with the number of actors and games the run began with where the command leaves them open."""
-    saved = run.saved_config()
+    """`config` with the run's first number of actors and games, if the command does not set them."""
+    saved = run.saved_config(config.agent_file)
     if saved is None or config.mode == "sync":
         return config
-    actors = config.actors
-    if actors.num_actors is None:
-        actors = dataclasses.replace(actors, num_actors=saved.actors.num_actors)
-    if actors.games_per_actor is None:
-        actors = dataclasses.replace(actors, games_per_actor=saved.actors.games_per_actor)
-    return dataclasses.replace(config, actors=actors)
+    unset = [name for name in ("num_actors", "games_per_actor") if getattr(config.actors, name) is None]
+    first = {name: getattr(saved.actors, name) for name in unset}
+    return dataclasses.replace(config, actors=dataclasses.replace(config.actors, **first))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns the exit code: 0 done, 1 failed, 2 bad input, 130 and 143 stopped and saved."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    with StopRequest(at_once=True) as stop:  # until the trainer has something to save
+    with StopRequest(at_once=True) as stop:  # before the trainer exists, a signal ends the command at once
         try:
             launch = parse(arguments)
             directory = launch.run.resolved_run_dir
@@ -83,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 config = resumed_config(run, launch.run)
                 run.check_resumable(config)
                 stop.importing = True
-                from gvz.run.train import train  # imports jax: only once the input is known to be good
+                from gvz.run.train import train  # imports jax, so only after the input is checked
 
                 stop.importing = False
                 return train(config, run, stop)
@@ -94,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print("stopped at once", file=sys.stderr)
             sys.stdout.flush()
             sys.stderr.flush()
-            os._exit(stop.exit_code)  # the interpreter's own end would wait for a thread that writes a checkpoint
+            os._exit(stop.exit_code)  # a normal exit would wait for a thread that writes a checkpoint
 
 
 if __name__ == "__main__":

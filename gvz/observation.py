@@ -1,4 +1,4 @@
-"""From what the engine renders to what the agent observes: sizes, colours, buffers."""
+"""From the engine's rendered screen to the agent's observation: sizes, colours, buffers."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -12,17 +12,17 @@ if TYPE_CHECKING:
     from gvz.engine.engine import GameState
 
 Observation = np.ndarray | dict[str, np.ndarray]
-"""uint8 [H, W, C]; with `EnvConfig.buffers` a dict of `screen` and those."""
+"""uint8 [H, W, C]; with `EnvConfig.buffers` a dict of `screen` and these buffers."""
 
-# Shrinking 256x144 to 84x84 (one core of an EPYC 7003): linear 20 us, area 224 us. Linear looks at 2 of 3 columns.
-# Over 216 sightings of the farthest enemies of Defend the Center (4-8 pixels wide before) they stood out from the
-# wall by 40 grey levels with linear and 29 with area, and by 6.3 (at worst 3.0) and 7.0 (4.5) times the wall's own
-# variation: coarser walls, stronger enemies, none lost.
+# Shrinking 256x144 to 84x84 (one core of an EPYC 7003): linear 20 us, area 224 us. Linear reads 2 of 3 columns.
+# Measured over 216 sightings of the farthest enemies of Defend the Center (4-8 pixels wide before shrinking): they
+# differ from the wall by 40 grey levels with linear and 29 with area. In units of the wall's own variation, this is 6.3
+# (at worst 3.0) and 7.0 (4.5). So linear makes walls coarser and enemies stronger, and no enemy is lost.
 _INTERPOLATIONS = {"linear": cv2.INTER_LINEAR, "area": cv2.INTER_AREA}
 
 _CLASS_OF_NAME = {
     "Poison": "poison",  # a class of our own, derived from Health as kits are
-    "BulletPuff": "effect",  # these two are Explosive to ViZDoom, as missiles are
+    "BulletPuff": "effect",  # ViZDoom's category of these two is Explosive, as for missiles
     "RevenantTracerSmoke": "effect",
 }
 _CLASS_OF_CATEGORY = {
@@ -51,14 +51,14 @@ def observation_space(config: EnvConfig) -> spaces.Space[Any]:
 
 
 def observe_screen(screen: np.ndarray, config: EnvConfig) -> np.ndarray:
-    """u8[H W 3] as rendered -> u8[frame_height frame_width C]; a new array with each call."""
+    """Rendered u8[H W 3] -> u8[frame_height frame_width C]; a new array with each call."""
     size = (config.frame_width, config.frame_height)
     frame = cv2.resize(screen, size, interpolation=_INTERPOLATIONS[config.interpolation])
     return cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)[:, :, None] if config.grayscale else frame
 
 
 def observe_buffers(state: "GameState", config: EnvConfig) -> dict[str, np.ndarray]:
-    """The buffers that `config` asks for, each in the observation's size; new arrays with each call.
+    """The buffers of `config`, each in the observation's size; new arrays with each call.
 
     `labels` holds numbers of LABEL_CLASSES.
     """
@@ -73,7 +73,7 @@ def observe_buffers(state: "GameState", config: EnvConfig) -> dict[str, np.ndarr
 
 
 def _values(pixels: np.ndarray, config: EnvConfig) -> np.ndarray:
-    """u8[H W] -> u8[frame_height frame_width 1], without making new values up."""
+    """u8[H W] -> u8[frame_height frame_width 1], without new values (nearest neighbour)."""
     size = (config.frame_width, config.frame_height)
     return cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST)[:, :, None]
 
@@ -84,7 +84,7 @@ def label_class(category: str, name: str) -> str:
 
 
 def _class_numbers(state: "GameState") -> np.ndarray:
-    """u8[256]: value in the engine's labels buffer -> number in LABEL_CLASSES. The values are drawn for each frame."""
+    """u8[256]: value in the engine's labels buffer -> number in LABEL_CLASSES. The values change with each frame."""
     numbers = np.full(256, LABEL_CLASSES.index("other"), np.uint8)
     numbers[:2] = LABEL_CLASSES.index("wall"), LABEL_CLASSES.index("plane")  # the only values that are fixed
     for label in state.labels or ():

@@ -20,7 +20,7 @@ def gymnasium_id(task: "Task") -> str:
 
 
 def register_envs() -> None:
-    """Makes every named task known to gymnasium.make."""
+    """Registers every named task in Gymnasium."""
     import gymnasium
 
     from gvz.tasks import named_tasks
@@ -32,10 +32,10 @@ def register_envs() -> None:
 
 
 def register_with_gymnasium() -> None:
-    """`register_envs` now if gymnasium is loaded, else as soon as it is.
+    """Calls `register_envs` now if gymnasium is loaded, else as soon as it is loaded.
 
-    Gymnasium 1 has no plugins: a package registers when it is imported. But loading gymnasium for that takes half a
-    second, which the learner and `--help` need not pay.
+    Gymnasium 1 has no plugins: a package registers its tasks when it is imported. But loading gymnasium takes half a
+    second, which the learner and `--help` can save.
     """
     if "gymnasium" in sys.modules:
         register_envs()
@@ -44,7 +44,7 @@ def register_with_gymnasium() -> None:
 
 
 class _GymnasiumFinder:
-    """An import hook, used once: finds gymnasium as ever and has the tasks registered after it is loaded."""
+    """An import hook for one use: finds gymnasium as usual and registers the tasks after it is loaded."""
 
     def find_spec(self, name: str, _path: object = None, _target: object = None) -> ModuleSpec | None:
         if name != "gymnasium":

@@ -1,18 +1,24 @@
 """Tasks by name: ids, levels, the named tasks, training and test sets."""
 
+import re
 from functools import cache
-from typing import get_args
+from typing import Literal, get_args
 
-from gvz.core.errors import TaskError
+from gvz.core.errors import TaskError, nearest
 from gvz.core.registry import discover
-from gvz.scenarios.base import Scenario, Split, Task, nearest
+from gvz.scenarios.base import MAX_LEVEL, MAX_VARIED_MAPS, VARIED, Scenario, Split, Task
 
-__all__ = ["Scenario", "Split", "Task", "named_tasks", "parse_task", "scenario_named", "scenarios"]
+LEVELS = range(MAX_LEVEL + 1)
+"""levels of tasks, the easiest first"""
+TaskSet = Literal[Split, "gate"]
+"""a training or test set, or the gate set: the named tasks of GATE_LEVEL that are in none of these"""
+GATE_LEVEL = 2
+"""of the tasks on which choices about training are made, so that the test tasks stay unseen (docs/EXPERIMENTS.md)"""
 
 
 @cache
 def scenarios() -> dict[str, Scenario]:
-    """Every scenario there is, by id: the modules of gvz.scenarios that have a SCENARIO."""
+    """All scenarios by id: the modules of gvz.scenarios that have a SCENARIO."""
     found = {n: m.SCENARIO for n, m in discover("gvz.scenarios").items() if hasattr(m, "SCENARIO")}
     assert all(name == scenario.id for name, scenario in found.items()), "a scenario's id is its file name"
     return found
@@ -22,7 +28,7 @@ def scenario_named(name: str) -> Scenario:
     """The scenario with this id.
 
     Raises:
-        TaskError: there is none; lists those there are, and the nearest.
+        TaskError: there is none; the message lists all and names the nearest.
     """
     known = scenarios()
     if name not in known:
@@ -35,12 +41,12 @@ def parse_task(text: str) -> Task:
 
     Args:
         text: `<scenario>/default`, `<scenario>/complete` or `<scenario>/<attribute>+<attribute>...`, attributes
-            in any order.
+            in any order; `<scenario>/varied` or `<scenario>/varied-<number of maps>`.
 
     Raises:
-        TaskError: not of that form, an unknown name, or two attributes of one group; says what is possible.
+        TaskError: another form, an unknown name, or two attributes of one group; the message says what is possible.
     """
-    scenario_id, slash, name = str(text).partition("/")  # whatever it is, the error below names it
+    scenario_id, slash, name = str(text).partition("/")  # str: any wrong type gets the error below
     if not slash or not name:
         raise TaskError(
             f"task: got {text!r}, want '<scenario>/<task>', for example 'defend_the_center/gore+mossy_bricks'; "
@@ -49,29 +55,56 @@ def parse_task(text: str) -> Task:
     scenario = scenario_named(scenario_id)
     whole_sets = {"default": (), "complete": scenario.complete}
     names = tuple(name.split("+"))
-    for whole in whole_sets:
+    for whole in (*whole_sets, *(one for one in names if one.partition("-")[0] == VARIED)):
         if whole in names and len(names) > 1:
             raise TaskError(f"task: got {text!r}, but {whole!r} is a task and no attribute; want {scenario.choices()}")
+    if name.partition("-")[0] == VARIED:
+        return Task(scenario, num_maps=_num_maps(text, name))
     return Task(scenario, whole_sets.get(name, names))
 
 
-def named_tasks(scenario: str | None = None, level: int | None = None, split: Split | None = None) -> tuple[Task, ...]:
-    """The thesis's tasks, by scenario in alphabetical order, within a scenario in the thesis's order.
+def _num_maps(text: str, name: str) -> int:
+    """The number in `varied-<number of maps>`."""
+    if name == VARIED:
+        return MAX_VARIED_MAPS
+    number = name.removeprefix(f"{VARIED}-")
+    if not re.fullmatch(r"[1-9][0-9]{0,3}", number) or int(number) > MAX_VARIED_MAPS:
+        raise TaskError(
+            f"task: got {text!r}, want {VARIED!r} or '{VARIED}-<number of maps>' with 1 to {MAX_VARIED_MAPS} maps, "
+            f"for example '{VARIED}-10'"
+        )
+    return int(number)
+
+
+def named_tasks(
+    scenario: str | None = None, level: int | None = None, split: TaskSet | None = None
+) -> tuple[Task, ...]:
+    """The named tasks: scenarios in alphabetical order, the tasks of a scenario in the thesis's order.
 
     Args:
-        scenario: only this one's.
-        level: only this level's, 0..4.
-        split: only the training or test set of this name.
+        scenario: only tasks of this scenario.
+        level: only tasks of this level, 0..4.
+        split: only tasks of this training or test set, or of the gate set.
 
     Raises:
         TaskError: an unknown scenario, level or split.
     """
-    if level is not None and level not in range(5):
-        raise TaskError(f"level: got {level!r}, want 0..4")
-    if split is not None and split not in get_args(Split):
-        raise TaskError(f"split: got {split!r}, want one of {', '.join(get_args(Split))}")
+    if level is not None and level not in LEVELS:
+        raise TaskError(f"level: got {level!r}, want 0..{MAX_LEVEL}")
+    if split is not None and split not in get_args(TaskSet):
+        raise TaskError(f"split: got {split!r}, want one of {', '.join(get_args(TaskSet))}")
     chosen = scenarios().values() if scenario is None else (scenario_named(scenario),)
-    tasks = (
-        parse_task(f"{one.id}/{name}") for one in chosen for name in (one.tasks if split is None else one.splits[split])
+    tasks = (parse_task(f"{one.id}/{name}") for one in chosen for name in _names(one, split))
+    return tuple(
+        task for task in tasks if level in (None, task.level) and (split != "gate" or task.level == GATE_LEVEL)
     )
-    return tuple(task for task in tasks if level is None or task.level == level)
+
+
+def _names(scenario: Scenario, split: TaskSet | None) -> tuple[str, ...]:
+    """Names of a set's tasks; of the gate set, those of every level."""
+    if split is None:
+        return scenario.tasks
+    if split == "gate":
+        used = {name for names in scenario.splits.values() for name in names}
+        return tuple(name for name in scenario.tasks if name not in used)
+    return scenario.splits[split]

@@ -1,4 +1,4 @@
-"""A window that shows a game to people."""
+"""A window that shows a game."""
 
 import os
 
@@ -8,23 +8,18 @@ from gvz.core.errors import ResourceError
 
 _MIN_HEIGHT = 480
 _UNSEEN_DRIVERS = ("dummy", "offscreen")
-"""what SDL falls back on without a display; only who asks for one of them by $SDL_VIDEODRIVER is given it"""
+"""SDL's drivers without a display; used only if $SDL_VIDEODRIVER names one"""
 
 
 class Window:
-    """One window; shows frames enlarged by a whole factor, so that every pixel stays one.
+    """One window; shows frames enlarged by an integer factor, so that pixels stay sharp.
 
     Attributes:
-        closed: somebody has closed it or pressed Escape; nothing happens by itself then.
+        closed: the user has closed it or pressed Escape; the caller must react to this.
     """
 
     def __init__(self, title: str, width: int, height: int):
-        """Opens the window.
-
-        Args:
-            title: its title.
-            width: of the frames it will show, pixels.
-            height: likewise.
+        """Opens the window, for frames of this width and height, pixels.
 
         Raises:
             ResourceError: there is no display.
@@ -51,7 +46,7 @@ class Window:
         picture = self._pygame.surfarray.make_surface(frame.swapaxes(0, 1))
         self._pygame.transform.scale(picture, self._surface.get_size(), self._surface)
         self._pygame.display.flip()
-        for event in self._pygame.event.get():  # unread, the desktop would call the window unresponsive
+        for event in self._pygame.event.get():  # else the desktop would call the window unresponsive
             escape = event.type == self._pygame.KEYDOWN and event.key == self._pygame.K_ESCAPE
             self.closed = self.closed or escape or event.type == self._pygame.QUIT
 

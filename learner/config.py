@@ -1,17 +1,41 @@
-"""Configuration of agent, replay and learner."""
+"""Configuration of agents, replay and learners. jax is not imported here: `--help` and errors are to be quick."""
 
+import dataclasses
 from dataclasses import dataclass
-from typing import Literal
+from functools import cache
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_type_hints
 
 from gvz.core.errors import ConfigError
+from gvz.core.registry import find
 
-Noisy = Literal["off", "factorized", "independent"]
 ConvForm = Literal["auto", "direct", "shifted"]
 
 
-def _check(prefix: str, config: object, ranges: dict[str, tuple[float, float]]) -> None:
-    """Raises ConfigError for the first field outside its closed range; None passes (a value to be derived)."""
-    for name, (low, high) in ranges.items():
+class Range(NamedTuple):
+    """What a field may be, ends included: `Annotated[float, Range(0.0, 10.0)]`."""
+
+    low: float
+    high: float
+
+
+Share = Annotated[float, Range(0.0, 1.0)]
+
+
+@cache
+def _ranges(kind: type) -> dict[str, Range]:
+    """The ranges of a class's fields. A field whose default alone is changed in a subclass keeps its range."""
+    return {
+        name: item
+        for owner in reversed(kind.__mro__)
+        for name, hint in get_type_hints(owner, include_extras=True).items()
+        for item in getattr(hint, "__metadata__", ())
+        if isinstance(item, Range)
+    }
+
+
+def check_ranges(prefix: str, config: object) -> None:
+    """Raises ConfigError for the first field outside its range; None passes (a value to be derived)."""
+    for name, (low, high) in _ranges(type(config)).items():
         value = getattr(config, name)
         if value is not None and not low <= value <= high:
             raise ConfigError(f"{prefix}.{name}: got {value}, want {low:g}..{high:g}")
@@ -19,37 +43,25 @@ def _check(prefix: str, config: object, ranges: dict[str, tuple[float, float]]) 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class AgentConfig:
-    """The agent. Every component of Rainbow is one switch; with all of them off it is DQN.
+    """What every agent has: what it observes, and its network. Each agent adds its own, in learner/agents/configs."""
 
-    Source: thesis Tables 5.1 and 5.2.
-    """
+    on_policy: ClassVar[bool] = False
+    """it learns from rollouts (`OnPolicyConfig`, no replay), not from a replay"""
 
-    name: str = "rainbow"
+    name: str
     """module in learner/agents, or the path of a Python file (docs/AGENTS.md)"""
-    double: bool = True
-    """double Q-learning (thesis eq. 4.9)"""
-    dueling: bool = True
-    """dueling streams (eq. 4.10)"""
-    noisy: Noisy = "factorized"
-    """noisy linear layers (eq. 4.14); off explores by epsilon"""
-    distributional: bool = True
-    """categorical distributional loss (eq. 4.17); off uses the Huber loss"""
-    n_steps: int = 3
-    """n of the n-step return (eq. 4.15); 1 switches it off"""
-    discount: float = 0.99
+    discount: Annotated[float, Range(0.0, 0.99999)] = 0.99
     """gamma of one decision"""
-    num_atoms: int = 51
-    """atoms of the return distribution"""
-    v_min: float | None = None
-    """smallest atom; default from the scenario's reward range"""
-    v_max: float | None = None
-    """largest atom; default from the scenario's reward range"""
-    initial_value: float = 0.0
-    """Q(s, a) of a fresh network, for every state and action; inside the atoms' range if distributional"""
-    noisy_sigma: float = 0.017
-    """initial sigma of the noisy layers"""
-    hidden_units: int = 512
-    """units of the hidden layer, per stream if dueling"""
+    stack_size: Annotated[int, Range(1, 16)] = 4
+    """frames in an observation"""
+    past_actions: Annotated[int, Range(0, 64)] = 0
+    """last actions in an observation"""
+    game_variables: bool = False
+    """observe the scenario's game variables (health, ammunition, ...)"""
+    task_conditioned: bool = False
+    """give the policy the task's index, pi(a | s, z) (eq. 4.18)"""
+    encoder: str = "nature"
+    """module in learner/encoders, or the path of a Python file: what makes features of frames"""
     conv_channels: tuple[int, ...] = (32, 64, 64)
     """output channels of the convolutions"""
     conv_kernels: tuple[int, ...] = (8, 4, 3)
@@ -58,35 +70,13 @@ class AgentConfig:
     """strides, pixels"""
     conv_form: ConvForm = "auto"
     """how convolutions are computed: shifted (matmul and shifted adds, for a CPU) or direct (nn.Conv)"""
+    hidden_units: Annotated[int, Range(1, 65536)] = 512
+    """units of the hidden layer, per stream if dueling"""
     activation_dtype: Literal["float32", "bfloat16"] = "float32"
     """dtype of activations; parameters and losses stay float32"""
-    task_conditioned: bool = False
-    """give the policy the task's index, pi(a | s, z) (eq. 4.18)"""
-    stack_size: int = 4
-    """frames in an observation"""
-    epsilon_start: float = 1.0
-    """epsilon after warm-up, before decay; used when noisy is off"""
-    epsilon_end: float = 0.001
-    """epsilon after decay"""
-    epsilon_decay_steps: int = 50_000
-    """decisions over which epsilon falls linearly, counted after warm-up"""
 
     def __post_init__(self) -> None:
-        _check(
-            "agent",
-            self,
-            {
-                "n_steps": (1, 64),
-                "discount": (0.0, 0.99999),
-                "num_atoms": (2, 1001),
-                "noisy_sigma": (0.0, 10.0),
-                "hidden_units": (1, 65536),
-                "stack_size": (1, 16),
-                "epsilon_start": (0.0, 1.0),
-                "epsilon_end": (0.0, 1.0),
-                "epsilon_decay_steps": (1, 10**12),
-            },
-        )
+        check_ranges("agent", self)
         if not len(self.conv_channels) == len(self.conv_kernels) == len(self.conv_strides) >= 1:
             raise ConfigError(
                 "agent.conv_channels, conv_kernels, conv_strides: got lengths "
@@ -94,98 +84,191 @@ class AgentConfig:
             )
         if min(*self.conv_channels, *self.conv_kernels, *self.conv_strides) < 1:
             raise ConfigError("agent.conv_channels, conv_kernels, conv_strides: want integers of at least 1")
-        if self.v_min is not None and self.v_max is not None and not self.v_min < self.v_max:
-            raise ConfigError(f"agent.v_min, v_max: got {self.v_min}, {self.v_max}, want v_min < v_max")
 
-    def value_range(self, v_min: float, v_max: float) -> tuple[float, float]:
-        """(v_min, v_max) as configured; what is left open is the given one, that of the scenario's returns."""
-        return v_min if self.v_min is None else self.v_min, v_max if self.v_max is None else self.v_max
+    def epsilon(self, env_steps: int) -> float:
+        """Probability of a uniformly random action after this number of decisions since warm-up."""
+        return 0.0
+
+    def support(self, v_min: float, v_max: float) -> tuple[float, float] | None:
+        """The range of the atoms of an agent that learns return distributions; None for any other agent.
+
+        Args:
+            v_min: smallest return of the run's tasks.
+            v_max: largest return.
+        """
+        return None
+
+    def with_support(self, v_min: float, v_max: float) -> Self:
+        """The same with atoms of this range, if it has atoms."""
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class EpsilonConfig(AgentConfig):
+    """An agent that learns action values, and acts at random with probability epsilon."""
+
+    initial_value: float = 0.0
+    """Q(s, a) of a fresh network, for every state and action; inside the atoms' range if distributional"""
+    epsilon_start: Share = 1.0
+    """epsilon after warm-up, before decay; used when there is no noise"""
+    epsilon_end: Share = 0.001
+    """epsilon after decay"""
+    epsilon_decay_steps: Annotated[int, Range(1, 10**12)] = 50_000
+    """decisions over which epsilon falls linearly, counted after warm-up; PQN's code has a tenth of all"""
+
+    def epsilon(self, env_steps: int) -> float:
+        progress = min(1.0, env_steps / self.epsilon_decay_steps)
+        return self.epsilon_start + progress * (self.epsilon_end - self.epsilon_start)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ValueConfig(EpsilonConfig):
+    """An agent that learns from n-step transitions. Source: thesis Tables 5.1 and 5.2."""
+
+    n_steps: Annotated[int, Range(1, 64)] = 1
+    """n of the n-step return (eq. 4.15); 1 switches it off"""
+    augmentations: tuple[str, ...] = ()
+    """random changes of the online network's frames in training (learner/augment.py), in this order: shift random_conv
+    contrast gamma inversion cutout grey. Targets see clean frames"""
+    augmentation_strength: Share = 1.0
+    """0..1, of every augmentation"""
+    augmentation_clean_share: Share = 0.5
+    """share of a batch that stays clean"""
+    hidden_input_share: Share = 0.0
+    """share of a batch whose game variables and past actions are hidden from the online network in training"""
+
+
+def agent_config_class(name: str) -> type[AgentConfig]:
+    """The configuration class of an agent: `CONFIG` of a module in learner/agents/configs, or of the agent's own file.
+
+    Args:
+        name: a module's name, or the path of a Python file, which is executed.
+
+    Raises:
+        ConfigError: no such agent.
+    """
+    return find("learner.agents.configs", "CONFIG", name, "agent.name")
+
+
+def change_agent(config: AgentConfig, name: str) -> AgentConfig:
+    """The configuration of another agent, with what both agents have as in `config`.
+
+    Raises:
+        ConfigError: no such agent, or its configuration does not take these values.
+    """
+    kind = agent_config_class(name)
+    wanted = {field.name for field in dataclasses.fields(kind)} - {"name"}
+    shared: dict[str, Any] = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name in wanted}
+    return kind(name=name, **shared)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ReplayConfig:
     """The prioritized replay. Source: thesis 4.1.1, eq. 4.11-4.13, Table 5.2."""
 
-    capacity: int = 100_000
+    capacity: Annotated[int, Range(64, 10**9)] = 100_000
     """step records kept on the learner's device, over all games"""
     prioritized: bool = True
     """sample in proportion to priority; off samples uniformly"""
-    priority_exponent: float = 0.6
+    priority_exponent: Annotated[float, Range(0.0, 2.0)] = 0.6
     """omega: 0 is uniform, 1 fully proportional"""
-    importance_sampling_exponent: float = 0.4
+    importance_sampling_exponent: Share = 0.4
     """beta at the start of training"""
-    importance_sampling_exponent_end: float = 1.0
+    importance_sampling_exponent_end: Share = 1.0
     """beta at the end of training"""
-    min_priority: float = 0.01
+    min_priority: Annotated[float, Range(1e-8, 100.0)] = 0.01
     """added to a TD error before the exponent"""
-    num_newest: int = 0
+    num_newest: Annotated[int, Range(0, 10**6)] = 0
     """newest transitions at the end of every batch (combined experience replay)"""
 
     def __post_init__(self) -> None:
-        _check(
-            "replay",
-            self,
-            {
-                "capacity": (64, 10**9),
-                "priority_exponent": (0.0, 2.0),
-                "importance_sampling_exponent": (0.0, 1.0),
-                "importance_sampling_exponent_end": (0.0, 1.0),
-                "min_priority": (1e-8, 100.0),
-                "num_newest": (0, 10**6),
-            },
-        )
+        check_ranges("replay", self)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LearnerConfig:
     """The update loop. A gradient step is one update; steps are decisions of the agent. Source: Tables 5.1, 5.2."""
 
-    total_updates: int = 200_000
+    total_updates: Annotated[int, Range(1, 10**12)] = 200_000
     """gradient steps of the whole run"""
-    warmup_steps: int = 10_000
+    warmup_steps: Annotated[int, Range(1, 10**12)] = 10_000
     """decisions gathered before the first update, by uniformly random actions"""
-    env_steps_per_update: float = 4.0
+    env_steps_per_update: Annotated[float, Range(0.001, 10**6)] = 4.0
     """decisions (all games together) per gradient step after warm-up; Rainbow's published ratio"""
-    step_tolerance: int = 256
+    step_tolerance: Annotated[int, Range(1, 10**9)] = 256
     """decisions by which learner and actors may run apart"""
-    batch_size: int = 32
+    batch_size: Annotated[int, Range(1, 65536)] = 32
     """transitions a gradient step"""
-    num_updates_per_call: int | None = None
+    num_updates_per_call: Annotated[int | None, Range(1, 10**4)] = None
     """gradient steps in one jitted call; default 1 on a CPU, 8 on a GPU"""
-    learning_rate: float = 1e-4
+    learning_rate: Annotated[float, Range(1e-12, 10.0)] = 1e-4
     """Adam"""
-    adam_eps: float = 1e-7
+    adam_eps: Annotated[float, Range(1e-16, 1.0)] = 1e-7
     """Adam"""
-    max_grad_norm: float | None = None
+    max_grad_norm: Annotated[float | None, Range(1e-12, 1e12)] = None
     """clip the global gradient norm; default off, as in the thesis"""
-    target_period_updates: int = 3_000
+    weight_decay: Annotated[float, Range(0.0, 10.0)] = 0.0
+    """Adam's decoupled decay of all weights (AdamW), times the learning rate"""
+    target_ema: Annotated[float | None, Range(0.0, 1.0)] = None
+    """share of themselves that target parameters keep at a gradient step (0.995: a moving average); default: copies
+    every target_period_updates"""
+    average_ema: Annotated[float | None, Range(0.0, 1.0)] = None
+    """likewise of a moving average of the parameters, which checkpoints keep for evaluation; default: no average"""
+    target_period_updates: Annotated[int, Range(1, 10**12)] = 3_000
     """gradient steps between copies into the target network"""
-    publish_period_updates: int = 10
+    publish_period_updates: Annotated[int, Range(1, 10**9)] = 10
     """gradient steps between publications of the parameters to the actors"""
     kpi_weighting: bool = False
     """scale a sample's loss by max KPI / KPI of its task (eq. 4.19, 4.20)"""
-    kpi_window_episodes: int = 30
+    kpi_window_episodes: Annotated[int, Range(1, 10**6)] = 30
     """episodes in the running mean of a task's score"""
-    kpi_max_weight: float = 10.0
+    kpi_max_weight: Annotated[float, Range(1.0, 10**6)] = 10.0
     """bound of a task's weight"""
 
     def __post_init__(self) -> None:
-        _check(
-            "learner",
-            self,
-            {
-                "total_updates": (1, 10**12),
-                "warmup_steps": (1, 10**12),
-                "env_steps_per_update": (0.001, 10**6),
-                "step_tolerance": (1, 10**9),
-                "batch_size": (1, 65536),
-                "num_updates_per_call": (1, 10**4),
-                "learning_rate": (1e-12, 10.0),
-                "adam_eps": (1e-16, 1.0),
-                "max_grad_norm": (1e-12, 1e12),
-                "target_period_updates": (1, 10**12),
-                "publish_period_updates": (1, 10**9),
-                "kpi_window_episodes": (1, 10**6),
-                "kpi_max_weight": (1.0, 10**6),
-            },
-        )
+        check_ranges("learner", self)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class OnPolicyConfig:
+    """The learner of agents without a replay: rollouts of all games, each learnt from and dropped.
+
+    Defaults: PPO's for Atari, Schulman et al. 2017, Table 5 (its 3 epochs, and batches of a quarter of a rollout).
+    """
+
+    total_updates: Annotated[int, Range(1, 10**12)] = 200_000
+    """gradient steps of the whole run"""
+    rollout_steps: Annotated[int, Range(1, 10**6)] = 128
+    """steps of a window; a rollout is as many windows as there are games"""
+    num_epochs: Annotated[int, Range(1, 1000)] = 3
+    """passes over a rollout"""
+    num_minibatches: Annotated[int, Range(1, 10**6)] = 4
+    """equal parts of a rollout, a gradient step each"""
+    learning_rate: Annotated[float, Range(1e-12, 10.0)] = 2.5e-4
+    """Adam"""
+    learning_rate_decay: bool = False
+    """the learning rate falls linearly, to 0 at total_updates"""
+    optimizer: Literal["adam", "radam"] = "adam"
+    """radam is rectified Adam, as in PQN's published code"""
+    adam_eps: Annotated[float, Range(1e-16, 1.0)] = 1e-5
+    """Adam"""
+    max_grad_norm: Annotated[float | None, Range(1e-12, 1e12)] = 0.5
+    """clip the global gradient norm"""
+
+    def __post_init__(self) -> None:
+        check_ranges("learner", self)
+
+    @property
+    def updates_per_rollout(self) -> int:
+        """Gradient steps that a rollout is learnt from by."""
+        return self.num_epochs * self.num_minibatches
+
+    @property
+    def publish_period_updates(self) -> int:
+        """Gradient steps between publications of the parameters: one after each rollout."""
+        return self.updates_per_rollout
+
+    @property
+    def warmup_steps(self) -> int:
+        """Decisions by chance before the first update: none, the agent explores from the start."""
+        return 0

@@ -1,4 +1,4 @@
-"""Valid strided convolution in two forms with the same parameters: `direct` and `shifted`.
+"""Valid strided convolution in two forms with the same parameters, `direct` and `shifted`, and stacks of it.
 
 XLA's own convolution is right on a GPU. On a CPU a few large matrix products are much faster, above all for the
 first layer (few input channels, large kernel, large stride).
@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from learner.config import ConvForm
+from gvz.core.errors import ConfigError
+from learner.config import AgentConfig, ConvForm
 
 
 def conv2d(
@@ -80,3 +81,32 @@ class Conv(nn.Module):
             default=lambda x, w: conv2d(x, w, self.stride, "direct"),
         )
         return y + bias
+
+
+def conv_stack(
+    x: Float[Array, "B H W C"], config: AgentConfig, *, layer_norm: bool = False, where: str = "agent.conv_kernels"
+) -> Float[Array, "B h w F"]:
+    """The configured convolutions conv_0, conv_1, ..., a rectifier after each. Call it in an `@nn.compact` method.
+
+    Args:
+        x: images.
+        config: reads conv_channels, conv_kernels, conv_strides and conv_form.
+        layer_norm: normalize every position over its channels before the rectifier, in layers norm_0, norm_1, ...
+        where: what the kernels are called in the error.
+
+    Raises:
+        ConfigError: an image becomes smaller than a kernel.
+    """
+    layers = zip(config.conv_channels, config.conv_kernels, config.conv_strides, strict=True)
+    for i, (features, kernel, stride) in enumerate(layers):
+        height, width = x.shape[1:3]
+        if min(height, width) < kernel:
+            raise ConfigError(
+                f"{where}[{i}]: got {kernel}, want at most {min(height, width)}, the size of the "
+                f"{height}x{width} image that reaches this layer; use smaller kernels or strides, or larger frames"
+            )
+        x = Conv(features, kernel, stride, config.conv_form, name=f"conv_{i}")(x)
+        if layer_norm:
+            x = nn.LayerNorm(dtype=x.dtype, name=f"norm_{i}")(x)
+        x = nn.relu(x)
+    return x

@@ -5,13 +5,15 @@ CPU wherever the learner runs. An actor calls them without importing this packag
 """
 
 import hashlib
+from dataclasses import fields
 
 import jax
 import jax.numpy as jnp
 from jax import export
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from learner.agents.base import Agent, Params
+from learner.observation import Observation
 
 
 def flatten_params(params: Params) -> Float[Array, "P"]:
@@ -35,21 +37,24 @@ def export_policy(agent: Agent, template: Params, batch_size: int) -> bytes:
         batch_size: games acted on in one call.
 
     Returns:
-        Bytes for `jax.export.deserialize`; `.call` takes (the parameters' leaves as a list, obs u8[B, H, W, C],
-        task i32[B], key u32[2], epsilon f32[]) and returns the actions, i32[B]. A flat vector is cut into leaves by
-        the caller, once a version: within the function it would be copied in every call (27 MB, 2.5 ms).
+        Bytes for `jax.export.deserialize`; `.call` takes (the parameters' leaves as a list, the observation as a dict
+        of the fields of `learner.observation.Observation`, key u32[2], epsilon f32[]) and returns what `Agent.act`
+        does. A flat vector is cut into leaves by the caller, once a version: within the function it would be copied in
+        every call (27 MB, 2.5 ms).
     """
     template_leaves, treedef = jax.tree.flatten(template)
 
-    def policy(leaves: list[Array], obs: Array, task: Array, key_data: Array, epsilon: Array) -> Array:
+    def policy(
+        leaves: list[Array], obs: dict[str, Array], key_data: Array, epsilon: Array
+    ) -> tuple[Int[Array, "B"], Float[Array, "B E"]]:
         params = jax.tree.unflatten(treedef, leaves)
         key = jax.random.wrap_key_data(key_data, impl="threefry2x32")
-        return agent.act(params, key, obs, task, epsilon)
+        return agent.act(params, key, Observation(**obs), epsilon)
 
+    observation = jax.eval_shape(lambda: agent.spec.zeros(batch_size))
     arguments = (
         [jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in template_leaves],
-        jax.ShapeDtypeStruct((batch_size, *agent.spec.obs_shape), jnp.uint8),
-        jax.ShapeDtypeStruct((batch_size,), jnp.int32),
+        {f.name: shape for f in fields(observation) if (shape := getattr(observation, f.name)) is not None},
         jax.ShapeDtypeStruct((2,), jnp.uint32),
         jax.ShapeDtypeStruct((), jnp.float32),
     )

@@ -1,4 +1,4 @@
-"""From the actors' blocks to the replay's: one fixed size, checked and counted.
+"""From the actors' blocks to the learner's: checked and counted, for a replay in blocks of one fixed size.
 
 What is handed on stands in fresh memory that nothing writes to again. JAX on a CPU may use an aligned numpy array as
 it is, without a copy, and runs behind its caller; a staging buffer filled again with the next records would change the
@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gvz.core.errors import TransportError
-from gvz.transport.messages import STEP_DTYPE, StepBlock
-from learner.replay import ReplaySpec, StepArrays
+from gvz.transport.messages import StepBlock, step_dtype
+from learner.replay import ReplaySpec
+from learner.store import StepArrays, StoreSpec
 
 BLOCK_SIZE = 64
 """records of one `replay.add`, which takes 0.5 ms with frames of 84x84x3 (2026-11-21, 2-core AMD EPYC)"""
@@ -33,10 +34,11 @@ class Staleness:
 class Ingest:
     """Packs step records, and counts the decisions in them and the age of the parameters that made these."""
 
-    def __init__(self, spec: ReplaySpec, block_size: int = BLOCK_SIZE):
+    def __init__(self, spec: StoreSpec, block_size: int = BLOCK_SIZE):
         """Packs `block_size` records at a time, or as many as the replay takes at once if those are fewer."""
         self._spec = spec
-        self._block_size = min(block_size, spec.max_block)
+        self._block_size = min(block_size, spec.max_block) if isinstance(spec, ReplaySpec) else block_size
+        self._dtype = step_dtype(spec.num_variables, spec.num_extras)
         self._in_episode = [False] * spec.num_lanes
         self._env_steps = 0
         self._ages: Counter[int] = Counter()
@@ -51,20 +53,26 @@ class Ingest:
         Raises:
             TransportError: a record does not belong to this run, or does not continue its lane's stream.
         """
+        self.check(blocks, params_version)
         size = self._block_size
         num_records = sum(map(len, blocks))
         num_padded = -(-num_records // size) * size
-        steps = np.zeros(num_padded, STEP_DTYPE)
+        steps = np.zeros(num_padded, self._dtype)
         frames = np.empty((num_padded, *self._spec.frame_shape), np.uint8)
         end = 0
         for block in blocks:
-            self._check(block)
             start, end = end, end + len(block)
             steps[start:end], frames[start:end] = block.steps, block.frames
-        self._count(steps[:num_records], params_version)
         for start in range(0, num_padded, size):
             part = slice(start, start + size)
             yield _step_arrays(steps[part], frames[part], min(size, num_records - start))
+
+    def check(self, blocks: Sequence[StepBlock], params_version: int) -> None:
+        """Checks and counts the records of `blocks`, which `arrays` does itself; arguments and errors are the same."""
+        for block in blocks:
+            self._check(block)
+        for block in blocks:
+            self._count(block.steps, params_version)
 
     def take_env_steps(self) -> int:
         """Decisions since the last call: every record but the last of an episode is one."""
@@ -99,6 +107,11 @@ class Ingest:
                 f"ingest: got frames {block.frames.dtype}{shape}, want uint8{list(spec.frame_shape)}; actors and "
                 "learner were started with different sizes"
             )
+        if steps.dtype != self._dtype:
+            raise TransportError(
+                f"ingest: got records of {steps.dtype.itemsize} bytes, want {self._dtype.itemsize}; actors and learner "
+                "were started with different observations"
+            )
         for name, limit in (("lane", spec.num_lanes), ("task", spec.num_tasks)):
             if (wrong := np.flatnonzero(steps[name] >= limit)).size:
                 record = steps[wrong[0]]
@@ -106,12 +119,14 @@ class Ingest:
                     f"ingest: record {record['sequence']}: got {name} {record[name]}, want less than {limit}; actors "
                     "and learner were started with different runs"
                 )
-        if (wrong := np.flatnonzero(~np.isfinite(steps["reward"]))).size:
-            record = steps[wrong[0]]
-            raise TransportError(
-                f"ingest: record {record['sequence']} of lane {record['lane']}: got the reward {record['reward']}, "
-                "want a finite one"
-            )
+        for name in ("reward", "vector", "extras"):
+            finite = np.isfinite(steps[name])
+            if (wrong := np.flatnonzero(~finite.all(axis=tuple(range(1, finite.ndim))))).size:
+                record = steps[wrong[0]]
+                raise TransportError(
+                    f"ingest: record {record['sequence']} of lane {record['lane']}: got the {name} {record[name]}, "
+                    "want a finite one"
+                )
         is_last = (steps["terminated"] | steps["truncated"]).tolist()
         for sequence, lane, first, last in zip(
             steps["sequence"].tolist(), steps["lane"].tolist(), steps["first"].tolist(), is_last, strict=True
@@ -146,5 +161,7 @@ def _step_arrays(steps: np.ndarray, frames: np.ndarray, num_valid: int) -> StepA
         first=steps["first"] != 0,
         terminated=steps["terminated"] != 0,
         truncated=steps["truncated"] != 0,
+        vector=steps["vector"] if steps["vector"].size else None,
+        extras=steps["extras"] if steps["extras"].size else None,
         num_valid=np.array(num_valid, np.int32),
     )

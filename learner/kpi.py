@@ -23,7 +23,7 @@ class TaskKpis:
 
         Args:
             task: index of its task.
-            score: the scenario's metric, >= 0.
+            score: in percent of the task's upper bound, >= 0: tasks of all scenarios compare.
 
         Raises:
             ValueError: no such task, or a score that is negative or not finite.

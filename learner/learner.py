@@ -1,15 +1,19 @@
 """What a learner is to the training loop: step records in, gradient steps, parameters out.
 
-The loop in gvz/run/train.py knows this protocol alone. How records are kept and drawn (a replay, rollouts) and on which
-device is the learner's own matter. `learner.off_policy` learns from a replay.
+The loop in gvz/run/train.py knows these protocols alone. How records are kept and drawn (a replay, rollouts), and on
+which device, is the learner's own matter. `learner.off_policy` learns from a replay.
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
+import jax
 import numpy as np
 
 from gvz.transport.messages import StepBlock
+from learner.agents.base import Agent
+from learner.checkpoint import Restored
 from learner.ingest import Staleness
 
 
@@ -33,8 +37,8 @@ class Learner(Protocol):
         """
         ...
 
-    def add_episode(self, task: int, score: float) -> None:
-        """Takes the score of a finished episode of the task with this index."""
+    def add_episode(self, task: int, normalized_score: float) -> None:
+        """Takes the score of a finished episode of the task with this index, in percent of the task's upper bound."""
         ...
 
     def can_update(self) -> bool:
@@ -46,7 +50,7 @@ class Learner(Protocol):
         ...
 
     def epsilon(self, env_steps: int) -> float:
-        """Probability of a uniformly random action after so many decisions of the run."""
+        """Probability of a uniformly random action after this number of decisions of the run."""
         ...
 
     def acting_params(self) -> np.ndarray:
@@ -79,4 +83,44 @@ class Learner(Protocol):
 
     def state(self) -> dict[str, Any]:
         """All that it remembers on the host, for a checkpoint: msgpack types."""
+        ...
+
+
+class LearnerParts(Protocol):
+    """What a learner is made of: sizes and settings, before anything is allocated."""
+
+    @property
+    def agent(self) -> Agent:
+        """Whose acting function and loss."""
+        ...
+
+    @property
+    def num_slots(self) -> int:
+        """Step records that the learner keeps."""
+        ...
+
+    @property
+    def batch_size(self) -> int:
+        """Samples of a gradient step."""
+        ...
+
+    def memory_bytes(self) -> int:
+        """Bytes of the records that the learner keeps on its device."""
+        ...
+
+    def array_shapes(self) -> dict[str, Any]:
+        """Shapes and dtypes of `Learner.arrays()`."""
+        ...
+
+    def make(
+        self, key: jax.Array, tasks: Sequence[str], diagnostics_dir: Path, restored: Restored | None = None
+    ) -> Learner:
+        """Makes the learner: an empty one, or one that goes on from a checkpoint.
+
+        Args:
+            key: JAX key of parameters, noise and sampling.
+            tasks: a name for each task index, for the metrics.
+            diagnostics_dir: existing directory where the batch of a non-finite update is saved.
+            restored: a checkpoint with what `arrays()` and `state()` gave; further entries of either are ignored.
+        """
         ...

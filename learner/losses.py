@@ -1,4 +1,4 @@
-"""The losses of DQN and Rainbow as pure functions over a batch, in the papers' symbols.
+"""The losses of DQN, Rainbow, QR-DQN, IQN and Munchausen as pure functions over a batch, in the papers' symbols.
 
 Every function returns one number (or distribution) per sample; means and weights are the train step's work.
 Subscripts: `tm1` is time t - 1, where the action was taken; `t` is where the n-step window ended. `discount_t` is
@@ -43,7 +43,7 @@ def q_learning_td(
     return jax.lax.stop_gradient(target) - take_action(q_tm1, a_tm1)
 
 
-def huber(td: Float[Array, "B"], delta: float = 1.0) -> Float[Array, "B"]:
+def huber(td: Float[Array, "*batch"], delta: float = 1.0) -> Float[Array, "*batch"]:
     """0.5 td^2 inside [-delta, delta], linear outside with the same slope.
 
     Source: thesis 5.1.2 (Huber loss); Mnih et al. 2015 clip the error's derivative at 1, which is delta = 1.
@@ -131,3 +131,96 @@ def categorical_q_learning(
 def expectation(probabilities: Float[Array, "*batch N"], atoms: Float[Array, "N"]) -> Float[Array, "*batch"]:
     """Mean of a distribution on the atoms: Q(s, a) = E[Z(s, a)]. Source: thesis 4.2.6."""
     return jnp.einsum("...n,n->...", probabilities, atoms, precision=jax.lax.Precision.HIGHEST)
+
+
+def quantile_midpoints(num_quantiles: int) -> Float[Array, "1 N"]:
+    """QR-DQN's fractions (2i - 1) / 2N. Source: Dabney et al. 2018 (QR-DQN), Lemma 2."""
+    return ((jnp.arange(num_quantiles, dtype=jnp.float32) + 0.5) / num_quantiles)[None]
+
+
+def quantile_target(
+    r_t: Float[Array, "B"],
+    discount_t: Float[Array, "B"],
+    z_t_value: Float[Array, "B A M"],
+    q_t_selector: Float[Array, "B A"] | None = None,
+) -> Float[Array, "B M"]:
+    """r + discount * Z'(s', argmax_a S(s', a)), quantile by quantile; no gradient flows through it.
+
+    Args:
+        r_t: (n-step) reward.
+        discount_t: 0 where terminated.
+        z_t_value: target network's quantile values at t; M of QR-DQN, or at M fractions that IQN sampled.
+        q_t_selector: action values that choose the action at t (double); None lets the target network choose by the
+            means of its quantiles.
+
+    Source: Dabney et al. 2018 (QR-DQN), Algorithm 1; Dabney et al. 2018 (IQN), eq. 2.
+    """
+    chex.assert_rank([r_t, discount_t, z_t_value], [1, 1, 3])
+    selector = z_t_value.mean(axis=-1) if q_t_selector is None else q_t_selector
+    chex.assert_equal_shape([selector, z_t_value[:, :, 0]])
+    z_t = take_action(z_t_value, jnp.argmax(selector, axis=-1))
+    return jax.lax.stop_gradient(r_t[:, None] + discount_t[:, None] * z_t)
+
+
+def munchausen_target(
+    q_tm1: Float[Array, "B A"],
+    a_tm1: Int[Array, "B"],
+    r_t: Float[Array, "B"],
+    discount_t: Float[Array, "B"],
+    z_t: Float[Array, "B A M"],
+    alpha: float = 0.9,
+    temperature: float = 0.03,
+    lowest: float = -1.0,
+) -> Float[Array, "B M"]:
+    """r + alpha [T ln pi(a|s)] + discount * sum over a' of pi(a'|s') (Z'(s', a') - T ln pi(a'|s')).
+
+    pi = softmax(q / T); the bracket is clipped to [lowest, 0]. With n steps there is one such bonus, that of the first
+    action, as in BTR.
+
+    M = 1 is Munchausen-DQN (its TD error is the target's one column less Q(s, a)); more are quantiles, as M-IQN and BTR
+    use it: pi comes of their means, and quantiles of one fraction are mixed over the actions. There is no form for
+    categorical distributions: neither the paper nor BTR has one.
+
+    Args:
+        q_tm1: action values at t - 1 that pi(a|s) comes of: the target network's in the paper. BTR takes the online
+            network's, which saves a forward pass. No gradient flows through them.
+        a_tm1: actions taken.
+        r_t: (n-step) reward.
+        discount_t: 0 where terminated.
+        z_t: target network's values at t.
+        alpha: scale of the bonus.
+        temperature: T, the paper's tau; in units of the return.
+        lowest: bound of the bonus, the paper's l0.
+
+    Source: Vieillard, Pietquin and Geist 2020, eq. 1 and 2, appendix B (M-IQN, the default values); Clark et al. 2024
+    (BTR).
+    """
+    chex.assert_rank([q_tm1, a_tm1, r_t, discount_t, z_t], [2, 1, 1, 1, 3])
+    chex.assert_equal_shape([q_tm1, z_t[:, :, 0]])
+    bonus = temperature * take_action(jax.nn.log_softmax(q_tm1 / temperature), a_tm1)
+    log_pi_t = jax.nn.log_softmax(z_t.mean(axis=-1) / temperature)
+    soft = z_t - temperature * log_pi_t[:, :, None]
+    value = jnp.einsum("ba,bam->bm", jnp.exp(log_pi_t), soft, precision=jax.lax.Precision.HIGHEST)
+    reward = r_t + alpha * jnp.clip(bonus, lowest, 0.0)
+    return jax.lax.stop_gradient(reward[:, None] + discount_t[:, None] * value)
+
+
+def quantile_huber(
+    z_tm1: Float[Array, "B N"], fractions: Float[Array, "#B N"], targets: Float[Array, "B M"], kappa: float = 1.0
+) -> Float[Array, "B"]:
+    """Quantile regression: sum over i of the mean over j of |f_i - 1(u_ij < 0)| huber(u_ij, kappa) / kappa.
+
+    u_ij = target_j - z_i. QR-DQN and IQN share it: the fractions f are fixed there and sampled here.
+
+    Args:
+        z_tm1: online quantile values of the action taken.
+        fractions: of which they are the quantiles, in 0..1; `quantile_midpoints(N)` in QR-DQN.
+        targets: samples of the target distribution, constant: `quantile_target` or `munchausen_target`.
+        kappa: where the loss becomes linear, > 0.
+
+    Source: Dabney et al. 2018 (QR-DQN), eq. 10; Dabney et al. 2018 (IQN), eq. 3.
+    """
+    chex.assert_rank([z_tm1, fractions, targets], 2)
+    u = jax.lax.stop_gradient(targets)[:, None, :] - z_tm1[:, :, None]  # [B, N, M]
+    weight = jnp.abs(fractions[:, :, None] - (u < 0))
+    return jnp.sum(jnp.mean(weight * huber(u, kappa) / kappa, axis=2), axis=1)

@@ -1,4 +1,4 @@
-"""The Q-network: convolutions, then one or two streams of (noisy) dense layers.
+"""The Q-network: an encoder of frames, then one or two streams of (noisy) dense layers.
 
 One module with switches serves every agent. Parameters are float32; activations may be bfloat16; outputs are
 float32. Noise is explicit: `add_noise` moves the parameters, or the network is given what `draw_noise` drew.
@@ -11,11 +11,12 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from gvz.core.errors import ConfigError
-from learner.config import AgentConfig, Noisy
-from learner.conv import Conv
+from learner.agents.configs.rainbow import Noisy
+from learner.config import AgentConfig
+from learner.encoders.base import make_encoder
+from learner.observation import Observation
 
 Params = Any
 """A pytree of float32 arrays: {"params": {layer: {name: array}}}."""
@@ -39,14 +40,12 @@ class NoisyDense(nn.Module):
 
     Attributes:
         features: number of outputs.
-        noisy: whether the layer has noisy weights at all.
-        sigma: initial value of every noisy weight and bias.
+        sigma: initial value of every noisy weight and bias; None for a layer without noise.
         outputs: what the layer answers at first, whatever its input: its biases, and its kernel starts at 0.
     """
 
     features: int
-    noisy: bool
-    sigma: float
+    sigma: float | None
     outputs: tuple[float, ...] | None = None
 
     @nn.compact
@@ -59,7 +58,7 @@ class NoisyDense(nn.Module):
         kernel = self.param("kernel", kernel_init, shape).astype(x.dtype)
         bias = self.param("bias", bias_init, shape[:1]).astype(x.dtype)[None]
         y = (kernel @ x.T).T + bias
-        if not self.noisy:
+        if self.sigma is None:
             return y
         sigma = nn.initializers.constant(self.sigma)
         kernel_sigma = self.param("kernel_sigma", sigma, shape).astype(x.dtype)
@@ -115,51 +114,48 @@ def _noisy_layers(params: Params) -> Params:
 
 
 class QNetwork(nn.Module):
-    """Stacked frames (and the task) to logits `[B, A, N]`; N = 1 and the logit is Q(s, a) if not distributional.
+    """Observations to logits `[B, A, N]`; N = 1 and the logit is Q(s, a) if not distributional.
 
     Architecture: thesis 4.1.5 (convolutions, rectifiers, one hidden dense layer), Figure 4.2 and eq. 4.10 (dueling:
-    a hidden layer per stream; the advantage's mean is taken off, per atom if distributional, as in Rainbow).
+    a hidden layer per stream; the advantage's mean is taken off, per atom if distributional, as in Rainbow). The
+    encoder makes features of the frames. Game variables in hundredths, past actions one-hot and, if
+    `config.task_conditioned`, the task one-hot stand behind them.
 
-    Differs: output layers start with kernel 0 (thesis 4.1.5: He-uniform), so that every Q(s, a) is at first
-    `config.initial_value` but for noise. A return distribution starts as the one of the largest entropy with this
-    mean; it is the value stream's where there are two.
+    Differs: output layers start with kernel 0 (thesis 4.1.5: He-uniform), so that all outputs are at first
+    `first_outputs` but for noise; they are the value stream's where there are two.
 
     Attributes:
-        config: the agent's configuration; reads the network's fields only.
+        config: the agent's configuration; reads the fields of every agent.
         num_actions: A.
-        num_tasks: length of the one-hot task vector appended to the features if `task_conditioned`.
-        value_range: v_min and v_max; needed if distributional.
+        num_tasks: length of the one-hot task vector.
+        first_outputs: N numbers, what each action's logits are at first, whatever the observation.
+        dueling: a stream each for the value and the advantages.
+        noisy_sigma: initial sigma of noisy layers; None for layers without noise.
+        layer_norm: hidden layers are normalized before their rectifier.
     """
 
     config: AgentConfig
     num_actions: int
     num_tasks: int
-    value_range: tuple[float, float] | None = None
+    first_outputs: tuple[float, ...]
+    dueling: bool = False
+    noisy_sigma: float | None = None
+    layer_norm: bool = False
 
     @nn.compact
-    def __call__(
-        self,
-        obs: UInt8[Array, "B H W C"],
-        task: Int[Array, "B"],
-        noise: dict[str, Float[Array, "B _"]] | None = None,
-    ) -> Float[Array, "B A N"]:
+    def __call__(self, obs: Observation, noise: dict[str, Float[Array, "B _"]] | None = None) -> Float[Array, "B A N"]:
         """Applies the network: by its means, or by each row's own noise, see `draw_noise`."""
         config, dtype = self.config, jnp.dtype(self.config.activation_dtype)
-        x = obs.astype(dtype) / 255
-        layers = zip(config.conv_channels, config.conv_kernels, config.conv_strides, strict=True)
-        for i, (channels, kernel, stride) in enumerate(layers):
-            x = nn.relu(Conv(channels, kernel, stride, config.conv_form, name=f"conv_{i}")(x))
-        x = x.reshape(x.shape[0], -1)
+        x = make_encoder(config.encoder)(obs.frames.astype(dtype) / 255, config)
+        parts = [obs.vector.astype(dtype) / 100] if obs.vector.shape[1] else []
+        if K := obs.actions.shape[1]:
+            parts.append(jax.nn.one_hot(obs.actions, self.num_actions, dtype=dtype).reshape(-1, K * self.num_actions))
         if config.task_conditioned:
-            x = jnp.concatenate([x, jax.nn.one_hot(task, self.num_tasks, dtype=dtype)], axis=-1)
+            parts.append(jax.nn.one_hot(obs.task, self.num_tasks, dtype=dtype))
+        x = jnp.concatenate([x, *parts], axis=-1) if parts else x
         noise = {} if noise is None else noise
-        first = (config.initial_value,)
-        if config.distributional:
-            if self.value_range is None:
-                raise ValueError("QNetwork.value_range: got None, want (v_min, v_max) for a distributional network")
-            first = initial_logits(*self.value_range, config.num_atoms, config.initial_value)
-        num_atoms = len(first)
-        if not config.dueling:
+        first, num_atoms = self.first_outputs, len(self.first_outputs)
+        if not self.dueling:
             q = self._stream("q", x, first * self.num_actions, noise)
             return q.reshape(-1, self.num_actions, num_atoms).astype(jnp.float32)
         value = self._stream("value", x, first, noise)[:, None, :]  # [B, 1, N]
@@ -169,10 +165,12 @@ class QNetwork(nn.Module):
 
     def _stream(self, name: str, x: Array, first: tuple[float, ...], noise: dict[str, Array]) -> Array:
         """Hidden layer, rectifier, output layer, which answers `first` until it has learnt."""
-        config, noisy = self.config, self.config.noisy != "off"
-        hidden = NoisyDense(config.hidden_units, noisy, config.noisy_sigma, name=f"{name}_hidden")
-        output = NoisyDense(len(first), noisy, config.noisy_sigma, first, name=f"{name}_output")
-        return output(nn.relu(hidden(x, noise.get(f"{name}_hidden"))), noise.get(f"{name}_output"))
+        hidden = NoisyDense(self.config.hidden_units, self.noisy_sigma, name=f"{name}_hidden")
+        output = NoisyDense(len(first), self.noisy_sigma, first, name=f"{name}_output")
+        h = hidden(x, noise.get(f"{name}_hidden"))
+        if self.layer_norm:
+            h = nn.LayerNorm(dtype=h.dtype, name=f"{name}_norm")(h)
+        return output(nn.relu(h), noise.get(f"{name}_output"))
 
 
 @cache
@@ -196,18 +194,3 @@ def initial_logits(v_min: float, v_max: float, num_atoms: int, mean: float) -> t
         masses = np.exp(slope * atoms - abs(slope) / 2)
         low, high = (slope, high) if masses @ atoms < wanted * masses.sum() else (low, slope)
     return tuple((slope * atoms).tolist())
-
-
-def check_fits(config: AgentConfig, height: int, width: int) -> None:
-    """Follows an image through the convolutions.
-
-    Raises:
-        ConfigError: the image becomes smaller than a kernel.
-    """
-    for i, (kernel, stride) in enumerate(zip(config.conv_kernels, config.conv_strides, strict=True)):
-        if min(height, width) < kernel:
-            raise ConfigError(
-                f"agent.conv_kernels[{i}]: got {kernel}, want at most {min(height, width)}, the size of the "
-                f"{height}x{width} image that reaches this layer; use smaller kernels or strides, or larger frames"
-            )
-        height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1

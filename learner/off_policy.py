@@ -14,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from gvz.transport.messages import StepBlock
-from learner import replay, train_step
-from learner.agents.base import Agent, Params
-from learner.config import AgentConfig, LearnerConfig, ReplayConfig
+from learner import replay, store, train_step
+from learner.agents.base import OffPolicyAgent, Params
+from learner.checkpoint import Restored
+from learner.config import LearnerConfig, ReplayConfig
 from learner.export import flatten_params
 from learner.ingest import Ingest, Staleness
 from learner.kpi import TaskKpis
@@ -26,10 +27,9 @@ from learner.replay import ReplaySpec
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class OffPolicyParts:
-    """What an `OffPolicyLearner` is made of."""
+    """What an `OffPolicyLearner` is made of (`LearnerParts`)."""
 
-    agent: Agent
-    agent_config: AgentConfig
+    agent: OffPolicyAgent
     config: LearnerConfig
     replay_config: ReplayConfig
     replay_spec: ReplaySpec
@@ -43,9 +43,25 @@ class OffPolicyParts:
             "replay": jax.eval_shape(lambda: replay.init(self.replay_spec)),
         }
 
+    @property
+    def num_slots(self) -> int:
+        return self.replay_spec.num_slots
+
+    @property
+    def batch_size(self) -> int:
+        return self.config.batch_size
+
+    def memory_bytes(self) -> int:
+        return replay.memory_bytes(self.replay_spec)
+
     def init(self, key: jax.Array) -> train_step.LearnerState:
         """The state before the first update."""
         return train_step.init(self.agent, self.replay_spec, self.config, key)
+
+    def make(
+        self, key: jax.Array, tasks: Sequence[str], diagnostics_dir: Path, restored: Restored | None = None
+    ) -> "OffPolicyLearner":
+        return OffPolicyLearner(self, key, tasks, diagnostics_dir, restored)
 
 
 class OffPolicyLearner:
@@ -57,17 +73,9 @@ class OffPolicyLearner:
         key: jax.Array,
         tasks: Sequence[str],
         diagnostics_dir: Path,
-        restored: tuple[dict[str, Any], dict[str, Any]] | None = None,
+        restored: Restored | None = None,
     ):
-        """Starts with an empty replay, or goes on from a checkpoint.
-
-        Args:
-            parts: what it is made of.
-            key: JAX key of parameters, noise and sampling.
-            tasks: a name for each task index, for the metrics.
-            diagnostics_dir: existing directory where the batch of a non-finite update is saved.
-            restored: what `arrays()` and `state()` gave; further entries of either are ignored.
-        """
+        """As `LearnerParts.make`."""
         config, spec = parts.config, parts.replay_spec
         self._parts, self._tasks, self._diagnostics_dir = parts, tuple(tasks), diagnostics_dir
         self._add = jax.jit(partial(replay.add, spec), donate_argnums=0)
@@ -81,7 +89,7 @@ class OffPolicyLearner:
         if restored is None:
             self._state, self._replay = jax.jit(parts.init)(key), replay.init(spec)
         else:
-            arrays, state = restored
+            arrays, state = restored.arrays, restored.host
             # copies: a borrowed buffer cannot be donated
             self._state, self._replay = jax.tree.map(jnp.array, (arrays["learner"], arrays["replay"]))
             self._ingest.restore(state["ingest"])
@@ -90,7 +98,8 @@ class OffPolicyLearner:
 
     @property
     def params(self) -> Params:
-        return self._state.params
+        average = self._state.average_params
+        return self._state.params if average is None else average
 
     def num_steps_allowed(self) -> int:
         return self._limiter.num_steps_allowed()
@@ -102,8 +111,8 @@ class OffPolicyLearner:
         self._limiter.insert(steps)
         return steps
 
-    def add_episode(self, task: int, score: float) -> None:
-        self._kpis.add(task, score)
+    def add_episode(self, task: int, normalized_score: float) -> None:
+        self._kpis.add(task, normalized_score)
 
     def can_update(self) -> bool:
         return self._limiter.num_updates_allowed() > 0
@@ -132,14 +141,9 @@ class OffPolicyLearner:
         return self._train_steps[num_updates]
 
     def epsilon(self, env_steps: int) -> float:
-        """1 during warm-up, whatever the agent. Then 0 with noise, else linear from start to end."""
-        agent, since_warmup = self._parts.agent_config, env_steps - self._parts.config.warmup_steps
-        if since_warmup < 0:
-            return 1.0
-        if agent.noisy != "off":
-            return 0.0
-        progress = min(1.0, since_warmup / agent.epsilon_decay_steps)
-        return agent.epsilon_start + progress * (agent.epsilon_end - agent.epsilon_start)
+        """1 during warm-up, whatever the agent; then the agent's."""
+        since_warmup = env_steps - self._parts.config.warmup_steps
+        return 1.0 if since_warmup < 0 else self._parts.agent.epsilon(since_warmup)
 
     def acting_params(self) -> np.ndarray:
         return np.asarray(self._flatten(self._state.params))
@@ -147,7 +151,7 @@ class OffPolicyLearner:
     def take_metrics(self) -> dict[str, float]:
         """Means of the train step as `learner/...`, shares of the tasks in the replay as `replay/share/...`."""
         means, self._state = train_step.read_metrics(self._state, self._tasks, self._diagnostics_dir)
-        stored = np.asarray(replay.records_per_task(self._parts.replay_spec, self._replay))
+        stored = np.asarray(store.records_per_task(self._parts.replay_spec, self._replay.store))
         shares = zip(self._tasks, (stored / stored.sum()).tolist(), strict=True)
         learner = {f"learner/{name}": value for name, value in means.items()}
         return {**learner, **{f"replay/share/{name}": share for name, share in shares}}

@@ -1,21 +1,13 @@
 """The replay: step records in, batches of n-step transitions out, all of it on the device.
 
-Pure functions over `ReplayState`; jit them once at the edge, with the state donated. They read an array that they
-also write only where what is written depends on what was read: then XLA writes in place, else it copies the array.
+Pure functions over `ReplayState`, as in `learner.store`, which keeps the records.
 
-Every lane (one game) owns `lane_capacity` consecutive slots, written in a circle. Frames are stored once; stacks,
-returns and discounts are put together when a batch is drawn. A *transition* is named by its anchor, the slot of o_t
-and a_t. An anchor can be drawn when its leaf in the sum tree is positive, and no other rule exists. `add` keeps that
-true exactly while
+A *transition* is named by its anchor, the slot of o_t and a_t. An anchor can be drawn when its leaf in the sum tree is
+positive, and no other rule exists. `add` keeps that true exactly while
 
 - the anchor is not the last record of its episode (no action was taken there),
 - its window is complete: n records follow it, or fewer and the last of its episode is among them, and
-- every frame of its stack is still stored.
-
-An empty slot counts as the last record of an episode, so that no window or stack reaches into one.
-
-The pytrees are `no_type_check`: their shapes hold for what functions take and return (and are checked there), while
-jax also builds them of numpy arrays, of shapes alone, and with batch axes.
+- every record that its observation reads is still stored.
 """
 
 from dataclasses import dataclass, replace
@@ -24,26 +16,19 @@ from typing import no_type_check
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from gvz.core.errors import ConfigError
-from learner import sum_tree
+from learner import store, sum_tree
+from learner.observation import Observation
+from learner.store import StepArrays, Store, StoreSpec, Written, moved
 from learner.sum_tree import SumTree
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class ReplaySpec:
+class ReplaySpec(StoreSpec):
     """Sizes and constants of a replay; static under jit."""
 
-    num_lanes: int
-    """games of the run"""
-    capacity: int
-    """step records; what does not divide by num_lanes is left unused"""
-    frame_shape: tuple[int, int, int]
-    """(H, W, C) of one frame, uint8"""
-    num_tasks: int
-    stack_size: int
-    """frames of an observation"""
     n_steps: int
     """longest window of a return"""
     discount: float
@@ -58,47 +43,17 @@ class ReplaySpec:
     """newest transitions at the end of every batch"""
 
     def __post_init__(self) -> None:
-        if self.lane_capacity < self.stack_size + self.n_steps:
+        if self.lane_capacity < self.history + self.n_steps:
             raise ConfigError(
                 f"replay.capacity: got {self.capacity} records over {self.num_lanes} games, {self.lane_capacity} "
-                f"each; want at least {self.num_lanes * (self.stack_size + self.n_steps)}, so that a stack of "
-                f"{self.stack_size} and a window of {self.n_steps} steps fit into a game's share"
+                f"each; want at least {self.num_lanes * (self.history + self.n_steps)}, so that an observation of "
+                f"{self.history} records and a window of {self.n_steps} steps fit into a game's share"
             )
-
-    @property
-    def lane_capacity(self) -> int:
-        """Slots of one lane."""
-        return self.capacity // self.num_lanes
-
-    @property
-    def num_slots(self) -> int:
-        """Slots of all lanes."""
-        return self.lane_capacity * self.num_lanes
 
     @property
     def max_block(self) -> int:
         """Largest block `add` takes: the slots it writes and those it looks back on must not meet in the circle."""
-        return self.lane_capacity - self.stack_size - self.n_steps + 1
-
-
-@jax.tree_util.register_dataclass
-@no_type_check
-@dataclass(frozen=True, kw_only=True, slots=True)
-class StepArrays:
-    """A block of step records (gvz.transport.messages.STEP_DTYPE), in the order of each lane's stream.
-
-    The first `num_valid` are records; the rest is padding and may hold anything.
-    """
-
-    frames: UInt8[Array | np.ndarray, "N H W C"]
-    action: Int[Array | np.ndarray, "N"]
-    reward: Float[Array | np.ndarray, "N"]
-    lane: Int[Array | np.ndarray, "N"]
-    task: Int[Array | np.ndarray, "N"]
-    first: Bool[Array | np.ndarray, "N"]
-    terminated: Bool[Array | np.ndarray, "N"]
-    truncated: Bool[Array | np.ndarray, "N"]
-    num_valid: Int[Array | np.ndarray, ""]
+        return self.lane_capacity - self.history - self.n_steps + 1
 
 
 @jax.tree_util.register_dataclass
@@ -107,19 +62,9 @@ class StepArrays:
 class ReplayState:
     """Everything stored, K = num_slots."""
 
-    frames: UInt8[Array, "K HWC"]
-    action: Int[Array, "K"]
-    reward: Float[Array, "K"]
-    task: Int[Array, "K"]
-    """num_tasks in an empty slot"""
-    first: Bool[Array, "K"]
-    last: Bool[Array, "K"]
-    """the episode ended or was cut here, or the slot is empty"""
-    terminated: Bool[Array, "K"]
-    """the episode ended by the rules here: nothing to bootstrap from"""
-    heads: Int[Array, "lanes"]
-    """where in its circle each lane writes next, 0..lane_capacity-1 (a running count would overflow)"""
+    store: Store
     tree: SumTree
+    """a leaf a slot"""
     max_priority: Float[Array, ""]
     """largest leaf ever set; what new transitions enter with"""
     newest: Int[Array, "num_newest"]
@@ -135,17 +80,20 @@ class Transitions:
 
     `r_t` = sum over k = 0..m-1 of gamma^k times the k-th reward after the anchor and `discount_t` = gamma^m, with m
     the length of the window: n, or less where the episode ends earlier. `discount_t` is 0 where it *terminated*.
-    Stacks are oldest frame first on the channel axis, the episode's first frame repeated at its start.
 
     Source: thesis eq. 4.15, 4.16. Differs: gamma^k from k = 0, and the bootstrap is discounted by gamma^m.
     """
 
-    obs_tm1: UInt8[Array, "B H W SC"]
+    obs_tm1: Observation
     a_tm1: Int[Array, "B"]
     r_t: Float[Array, "B"]
     discount_t: Float[Array, "B"]
-    obs_t: UInt8[Array, "B H W SC"]
-    task: Int[Array, "B"]
+    obs_t: Observation
+
+    @property
+    def task(self) -> Int[Array, "B"]:
+        """Index of each transition's task."""
+        return self.obs_tm1.task
 
 
 @jax.tree_util.register_dataclass
@@ -164,19 +112,11 @@ class SampleInfo:
 
 def init(spec: ReplaySpec) -> ReplayState:
     """Returns an empty replay."""
-    K = spec.num_slots
     return ReplayState(
-        frames=jnp.zeros((K, int(np.prod(spec.frame_shape))), jnp.uint8),
-        action=jnp.zeros(K, jnp.int32),
-        reward=jnp.zeros(K, jnp.float32),
-        task=jnp.full(K, spec.num_tasks, jnp.int32),
-        first=jnp.zeros(K, bool),
-        last=jnp.ones(K, bool),
-        terminated=jnp.zeros(K, bool),
-        heads=jnp.zeros(spec.num_lanes, jnp.int32),
-        tree=sum_tree.init(K),
+        store=store.init(spec),
+        tree=sum_tree.init(spec.num_slots),
         max_priority=jnp.ones((), jnp.float32),
-        newest=jnp.full(spec.num_newest, K, jnp.int32),
+        newest=jnp.full(spec.num_newest, spec.num_slots, jnp.int32),
         newest_head=jnp.zeros((), jnp.int32),
     )
 
@@ -188,10 +128,7 @@ def memory_bytes(spec: ReplaySpec) -> int:
 
 
 def add(spec: ReplaySpec, state: ReplayState, block: StepArrays) -> ReplayState:
-    """Stores a block of records and brings the leaves up to date; the same as adding its records one by one.
-
-    A record that is `first` after one that was not last says that the stream broke off there (actor or engine
-    died): the earlier one becomes the last of its episode, truncated.
+    """Stores a block of records (`store.write`) and brings the leaves up to date; the same as one by one.
 
     Raises:
         ValueError: the block is larger than `spec.max_block`.
@@ -200,23 +137,11 @@ def add(spec: ReplaySpec, state: ReplayState, block: StepArrays) -> ReplayState:
     if spec.max_block < N:
         raise ValueError(
             f"replay.add: got a block of {N} records, want at most {spec.max_block} with {spec.lane_capacity} slots a "
-            f"game, stacks of {spec.stack_size} and windows of {spec.n_steps}; raise replay.capacity"
+            f"game, observations of {spec.history} records and windows of {spec.n_steps}; raise replay.capacity"
         )
-    valid = jnp.arange(N) < block.num_valid
-    lane = jnp.where(valid, block.lane, spec.num_lanes)  # padding lies beyond the last slot, where writes are dropped
-    earlier_in_lane = jnp.tril(lane[:, None] == lane[None, :], k=-1)  # [N, N]
-    rank = earlier_in_lane.sum(1, dtype=jnp.int32)
-    slot = _moved(spec, lane * spec.lane_capacity, state.heads.at[lane].get(mode="clip") + rank)
-
-    is_last = jnp.logical_or(block.terminated, block.truncated)
-    first = state.first.at[slot].set(block.first, mode="drop")
-    last = state.last.at[slot].set(is_last, mode="drop")
-    previous = _moved(spec, slot, -1)
-    cut = ~_at(last, previous) & block.first
-    last = last.at[jnp.where(cut, previous, spec.num_slots)].set(True, mode="drop")
-
-    completed = _completed(spec, last, slot, is_last, cut)  # [N, n]
-    stale = _reading(spec, first, slot)  # [N, S]
+    records, written = store.write(spec, state.store, block)
+    completed = _completed(spec, records.last, written)  # [N, n]
+    stale = _reading(spec, records.first, written.slot)  # [N, history]
     # one call sets both: a slot of this block that is already complete is in both lists, and the larger value wins
     tree = sum_tree.set(
         state.tree,
@@ -225,18 +150,7 @@ def add(spec: ReplaySpec, state: ReplayState, block: StepArrays) -> ReplayState:
     )
     newest, newest_head = _keep_newest(spec, state, stale.ravel(), completed.ravel())
     return ReplayState(
-        frames=state.frames.at[slot].set(block.frames.reshape(N, -1), mode="drop"),
-        action=state.action.at[slot].set(block.action, mode="drop"),
-        reward=state.reward.at[slot].set(block.reward, mode="drop"),
-        task=state.task.at[slot].set(block.task, mode="drop"),
-        first=first,
-        last=last,
-        terminated=state.terminated.at[slot].set(block.terminated, mode="drop"),
-        heads=state.heads.at[lane].add(1, mode="drop") % spec.lane_capacity,
-        tree=tree,
-        max_priority=state.max_priority,
-        newest=newest,
-        newest_head=newest_head,
+        store=records, tree=tree, max_priority=state.max_priority, newest=newest, newest_head=newest_head
     )
 
 
@@ -301,11 +215,6 @@ def update_priorities(
     )
 
 
-def records_per_task(spec: ReplaySpec, state: ReplayState) -> Int[Array, "num_tasks"]:
-    """Counts the stored records of each task. Reads all task numbers: for the log, not for every step."""
-    return jnp.zeros(spec.num_tasks, jnp.int32).at[state.task].add(1, mode="drop")
-
-
 def check_can_sample(spec: ReplaySpec, state: ReplayState) -> None:
     """Refuses, on the host, a replay without a complete transition. Waits for the device.
 
@@ -317,43 +226,32 @@ def check_can_sample(spec: ReplaySpec, state: ReplayState) -> None:
     """
     if not float(sum_tree.total(state.tree)) > 0:
         raise ConfigError(
-            f"replay: no complete transition among {int(records_per_task(spec, state).sum())} records, nothing can be "
-            f"drawn; want learner.warmup_steps of at least {spec.num_lanes * spec.n_steps} ({spec.num_lanes} games "
-            f"times agent.n_steps {spec.n_steps}), and actors that do not die at the start of an episode"
+            f"replay: no complete transition among {int(store.records_per_task(spec, state.store).sum())} records, "
+            f"nothing can be drawn; want learner.warmup_steps of at least {spec.num_lanes * spec.n_steps} "
+            f"({spec.num_lanes} games times agent.n_steps {spec.n_steps}), and actors that do not die at the start of "
+            "an episode"
         )
 
 
-def _moved(spec: ReplaySpec, slot: Array, steps: Array | int) -> Array:
-    """The slot that many records later (earlier if negative) in the same lane's circle."""
-    lane_start = slot // spec.lane_capacity * spec.lane_capacity
-    return lane_start + (slot + steps) % spec.lane_capacity
-
-
-def _at(flags: Bool[Array, "K"], slots: Int[Array, "..."]) -> Bool[Array, "..."]:
-    """flags[slots]; True beyond the last slot, where padding lies: it is the last and the first of everything."""
-    return flags.at[slots].get(mode="fill", fill_value=True)
-
-
-def _completed(
-    spec: ReplaySpec, last: Bool[Array, "K"], slot: Int[Array, "N"], is_last: Bool[Array, "N"], cut: Bool[Array, "N"]
-) -> Int[Array, "N n"]:
+def _completed(spec: ReplaySpec, last: Bool[Array, "K"], written: Written) -> Int[Array, "N n"]:
     """The anchors whose windows each new record completes, oldest first; num_slots in place of none.
 
     A record completes the window of the anchor n records back, and if it is the last of its episode also those of
     the anchors between. After a cut it does the latter for the record before it, which was not known to be the last.
     """
-    closing = jnp.where(cut, _moved(spec, slot, -1), slot)
+    slot, is_last, cut = written
+    closing = jnp.where(cut, moved(spec, slot, -1), slot)
     back = jnp.arange(1, spec.n_steps + 1)[None, :]
-    anchors = _moved(spec, closing[:, None], -back)  # [N, n]
-    same_episode = jnp.cumprod(~_at(last, anchors), axis=1, dtype=jnp.int32) > 0
+    anchors = moved(spec, closing[:, None], -back)  # [N, n]
+    same_episode = jnp.cumprod(~store.at(last, anchors), axis=1, dtype=jnp.int32) > 0
     completes = jnp.where(back == spec.n_steps, ~cut[:, None], (is_last | cut)[:, None])
     return jnp.where(same_episode & completes, anchors, spec.num_slots)[:, ::-1]
 
 
-def _reading(spec: ReplaySpec, first: Bool[Array, "K"], slot: Int[Array, "N"]) -> Int[Array, "N S"]:
-    """The anchors whose stacks reach back to each written slot, itself included; num_slots in place of none."""
-    ahead = _moved(spec, slot[:, None], jnp.arange(1, spec.stack_size)[None, :])
-    reaches_back = jnp.cumprod(~_at(first, ahead), axis=1, dtype=jnp.int32) > 0
+def _reading(spec: ReplaySpec, first: Bool[Array, "K"], slot: Int[Array, "N"]) -> Int[Array, "N history"]:
+    """The anchors whose observations read each written slot, itself included; num_slots in place of none."""
+    ahead = moved(spec, slot[:, None], jnp.arange(1, spec.history)[None, :])
+    reaches_back = jnp.cumprod(~store.at(first, ahead), axis=1, dtype=jnp.int32) > 0
     return jnp.concatenate([slot[:, None], jnp.where(reaches_back, ahead, spec.num_slots)], axis=1)
 
 
@@ -373,35 +271,17 @@ def _keep_newest(
 
 
 def _transitions(spec: ReplaySpec, state: ReplayState, anchors: Int[Array, "B"]) -> Transitions:
-    n = spec.n_steps
+    n, records = spec.n_steps, state.store
     powers = jnp.asarray(spec.discount ** np.arange(n + 1), jnp.float32)
-    window = _moved(spec, anchors[:, None], jnp.arange(1, n + 1)[None, :])  # [B, n]
-    ended = jnp.cumsum(state.last[window], axis=1)
+    window = moved(spec, anchors[:, None], jnp.arange(1, n + 1)[None, :])  # [B, n]
+    ended = jnp.cumsum(records.last[window], axis=1)
     within = jnp.concatenate([jnp.ones_like(ended[:, :1], bool), ended[:, :-1] == 0], axis=1)
     length = within.sum(1)
-    end = _moved(spec, anchors, length)
+    end = moved(spec, anchors, length)
     return Transitions(
-        obs_tm1=_stacks(spec, state, anchors),
-        a_tm1=state.action[anchors],
-        r_t=jnp.sum(jnp.where(within, powers[None, :n] * state.reward[window], 0.0), axis=1),
-        discount_t=powers[length] * ~state.terminated[end],
-        obs_t=_stacks(spec, state, end),
-        task=state.task[anchors],
+        obs_tm1=store.observations(spec, records, anchors),
+        a_tm1=records.action[anchors],
+        r_t=jnp.sum(jnp.where(within, powers[None, :n] * records.reward[window], 0.0), axis=1),
+        discount_t=powers[length] * ~records.terminated[end],
+        obs_t=store.observations(spec, records, end),
     )
-
-
-def _stacks(spec: ReplaySpec, state: ReplayState, slots: Int[Array, "B"]) -> UInt8[Array, "B H W SC"]:
-    """Observations at `slots`: frames of one episode, oldest first, its first one repeated.
-
-    Measured at 100K frames of 84x84x3, batch 32: a whole `sample`, both stacks, takes 1.4 ms (2026-11-21, 2-core AMD
-    EPYC, minimum). Walking back in a scan matters: XLA would fuse the arithmetic of an unrolled walk into the gather
-    and redo it for every byte (measured: 47 ms). To gather the S + n frames of a window once, instead of 2 S, would
-    save at most an eighth.
-    """
-
-    def back(slot: Array, _: None) -> tuple[Array, Array]:
-        return jnp.where(state.first[slot], slot, _moved(spec, slot, -1)), slot
-
-    _, history = jax.lax.scan(back, slots, length=spec.stack_size, reverse=True)  # [S, B], oldest first
-    S, B, (H, W, C) = *history.shape, spec.frame_shape
-    return state.frames[history].reshape(S, B, H, W, C).transpose(1, 2, 3, 0, 4).reshape(B, H, W, S * C)

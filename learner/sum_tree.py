@@ -124,28 +124,6 @@ def sample(tree: SumTree, key: Key[Array, ""], batch_size: int) -> tuple[Int[Arr
     return indices, probabilities
 
 
-def check_valid(tree: SumTree) -> None:
-    """Checks on the host that every sum is exactly that of its children and every leaf is finite and not negative.
-
-    Raises:
-        ValueError: it is not so; names the first wrong leaf or node.
-    """
-    nodes = np.asarray(tree.nodes)
-    starts = _level_starts(tree.num_leaves)
-    leaves, padding = np.split(nodes[starts[-2] :], [tree.num_leaves])
-    if not (good := np.isfinite(leaves) & (leaves >= 0)).all():
-        wrong = int(np.argmin(good))
-        raise ValueError(f"sum tree: leaf {wrong} is {leaves[wrong]}, want a finite number of at least 0")
-    if padding.any():
-        raise ValueError(f"sum tree: padding after leaf {tree.num_leaves - 1} is {padding}, want zeros")
-    for start, stop, children_stop in zip(starts, starts[1:], starts[2:], strict=False):
-        sums = np.zeros(stop - start, np.float32)
-        sums[: (children_stop - stop) // FANOUT] = _sum_row(nodes[stop:children_stop].reshape(-1, FANOUT))
-        if (wrong := np.flatnonzero(nodes[start:stop] != sums)).size:
-            node = int(wrong[0])
-            raise ValueError(f"sum tree: node {start + node} is {nodes[start + node]}, its children are {sums[node]}")
-
-
 def _level_starts(num_leaves: int) -> list[int]:
     """Where each level begins in `nodes`, topmost first, and at the end the length of `nodes`."""
     widths = [-(-num_leaves // FANOUT) * FANOUT]

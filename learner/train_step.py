@@ -1,13 +1,14 @@
 """One jitted, donated call: sample -> loss -> update -> priorities.
 
 Everything the loop needs lives on the device in two pytrees, `LearnerState` and the replay's state; nothing comes to
-the host between log periods. `read_metrics` is the only reader.
+the host between log periods. `read_metrics` is the only reader. `learner.rollout_step` makes its gradient steps, and
+reads its metrics, by the functions here.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from gvz.core.errors import NonFiniteError
 from learner import replay
-from learner.agents.base import Agent, AgentLoss, Params
+from learner.agents.base import AgentLoss, OffPolicyAgent, Params
 from learner.config import LearnerConfig, ReplayConfig
 from learner.replay import ReplaySpec, ReplayState, SampleInfo, Transitions
 
@@ -25,7 +26,10 @@ from learner.replay import ReplaySpec, ReplayState, SampleInfo, Transitions
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True, slots=True)
 class MetricSums:
-    """What has been added up since the last read, one number or one per task (`[num_tasks]`)."""
+    """What has been added up since the last read: of updates, or in task_... of the samples of each task.
+
+    A name that ends in _max stands for the largest number seen.
+    """
 
     num_updates: Int[Array, ""]
     loss: Float[Array, ""]
@@ -34,10 +38,8 @@ class MetricSums:
     """of magnitudes, as `task_td_error`"""
     q_mean: Float[Array, ""]
     q_max: Float[Array, ""]
-    """the largest seen, not a sum"""
     grad_norm: Float[Array, ""]
     grad_norm_max: Float[Array, ""]
-    """the largest seen, not a sum"""
     importance_weight: Float[Array, ""]
     task_samples: Float[Array, "Z"]
     task_loss: Float[Array, "Z"]
@@ -54,9 +56,34 @@ class NonFinite:
     """updates skipped so far for this reason; 0 while all is well"""
     update: Int[Array, ""]
     """number of the first such update"""
-    batch: Transitions
+    batch: Any
+    """a pytree of arrays"""
     loss: Float[Array, "B"]
     weights: Float[Array, "B"]
+
+
+class TrainedState(Protocol):
+    """What `gradient_step` and `read_metrics` need of a learner's state."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def params(self) -> Params: ...
+    @property
+    def opt_state(self) -> optax.OptState: ...
+    @property
+    def num_updates(self) -> Int[Array, ""]: ...
+    @property
+    def metrics(self) -> Any: ...
+    @property
+    def non_finite(self) -> NonFinite: ...
+
+
+class Losses(Protocol):
+    """What an agent says of a batch: one number per sample, and more for the records."""
+
+    @property
+    def loss(self) -> Float[Array, "B"]: ...
 
 
 @jax.tree_util.register_dataclass
@@ -66,6 +93,8 @@ class LearnerState:
 
     params: Params
     target_params: Params
+    average_params: Params | None
+    """moving average of the parameters, if one is kept"""
     opt_state: optax.OptState
     key: PRNGKeyArray
     num_updates: Int[Array, ""]
@@ -74,10 +103,14 @@ class LearnerState:
 
 
 T = TypeVar("T")
+StateT = TypeVar("StateT", bound=TrainedState)
+LossesT = TypeVar("LossesT", bound=Losses)
 TrainStep = Callable[[LearnerState, ReplayState, Float[Array, "Z"]], tuple[LearnerState, ReplayState]]
 
 
-def init(agent: Agent, replay_spec: ReplaySpec, learner_config: LearnerConfig, key: PRNGKeyArray) -> LearnerState:
+def init(
+    agent: OffPolicyAgent, replay_spec: ReplaySpec, learner_config: LearnerConfig, key: PRNGKeyArray
+) -> LearnerState:
     """The state before the first update: target equal to online parameters."""
     key_params, key_state = jax.random.split(key)
     params = agent.init(key_params)
@@ -90,23 +123,18 @@ def init(agent: Agent, replay_spec: ReplaySpec, learner_config: LearnerConfig, k
     state = LearnerState(
         params=params,
         target_params=params,
+        average_params=None if learner_config.average_ema is None else params,
         opt_state=_optimizer(learner_config).init(params),
         key=key_state,
         num_updates=jnp.int32(0),
         metrics=_no_metrics(replay_spec.num_tasks),
-        non_finite=NonFinite(
-            num_skipped=jnp.int32(0),
-            update=jnp.int32(-1),
-            batch=batch,
-            loss=jnp.zeros((batch_size,), jnp.float32),
-            weights=jnp.zeros((batch_size,), jnp.float32),
-        ),
+        non_finite=no_non_finite(batch, batch_size),
     )
     return jax.tree.map(jnp.copy, state)  # donation refuses a buffer that stands in two places
 
 
 def make_train_step(
-    agent: Agent,
+    agent: OffPolicyAgent,
     replay_spec: ReplaySpec,
     learner_config: LearnerConfig,
     replay_config: ReplayConfig,
@@ -126,13 +154,48 @@ def make_train_step(
         once, at its first call.
     """
 
+    def update(
+        state: LearnerState, replay_state: ReplayState, task_weights: Float[Array, "Z"]
+    ) -> tuple[LearnerState, ReplayState]:
+        """One gradient step (thesis Algorithm 1 with prioritized replay)."""
+        key, key_sample, key_loss = jax.random.split(state.key, 3)
+        progress = jnp.minimum(state.num_updates / learner_config.total_updates, 1.0)
+        start, end = replay_config.importance_sampling_exponent, replay_config.importance_sampling_exponent_end
+        batch, info = replay.sample(
+            replay_spec, replay_state, key_sample, learner_config.batch_size, start + progress * (end - start)
+        )
+        weights = info.weights * task_weights[batch.task]
+
+        def weighted_loss(params: Params) -> tuple[Float[Array, ""], AgentLoss]:
+            losses = agent.loss(params, state.target_params, key_loss, batch)
+            return jnp.mean(weights * losses.loss), losses
+
+        optimizer = _optimizer(learner_config)
+        state, loss, losses, grad_norm = gradient_step(
+            state, optimizer, weighted_loss, batch, weights, hold_gradient=True
+        )
+        if (ema := learner_config.target_ema) is not None:
+            target_params = optax.incremental_update(state.params, state.target_params, 1 - ema)
+        else:
+            due = state.num_updates % learner_config.target_period_updates == 0
+            target_params = _when(due, lambda _: state.params, state.target_params)
+        average_params = state.average_params
+        if (ema := learner_config.average_ema) is not None and average_params is not None:
+            average_params = optax.incremental_update(state.params, average_params, 1 - ema)
+        replay_state = replay.update_priorities(
+            replay_spec, replay_state, info.slots, jnp.where(jnp.isfinite(losses.priority), losses.priority, 0.0)
+        )
+        metrics = _add_metrics(state.metrics, loss, losses, grad_norm, info, batch.task)
+        state = replace(state, target_params=target_params, average_params=average_params, key=key, metrics=metrics)
+        return state, replay_state
+
     def train_step(
         state: LearnerState, replay_state: ReplayState, task_weights: Float[Array, "Z"]
     ) -> tuple[LearnerState, ReplayState]:
-        def update(carry: tuple[LearnerState, ReplayState], _: None):
-            return _update(*carry, task_weights, agent, replay_spec, learner_config, replay_config), None
+        def one(carry: tuple[LearnerState, ReplayState], _: None):
+            return update(*carry, task_weights), None
 
-        return jax.lax.scan(update, (state, replay_state), length=num_updates)[0]
+        return jax.lax.scan(one, (state, replay_state), length=num_updates)[0]
 
     return jax.jit(train_step, donate_argnums=(0, 1))
 
@@ -144,9 +207,7 @@ def default_num_updates(learner_config: LearnerConfig) -> int:
     return 1 if jax.default_backend() == "cpu" else 8
 
 
-def read_metrics(
-    state: LearnerState, task_names: Sequence[str], diagnostics_dir: Path
-) -> tuple[dict[str, float], LearnerState]:
+def read_metrics(state: StateT, task_names: Sequence[str], diagnostics_dir: Path) -> tuple[dict[str, float], StateT]:
     """Brings the means since the last read to the host and starts new sums. Waits for the device.
 
     Args:
@@ -155,93 +216,91 @@ def read_metrics(
         diagnostics_dir: existing directory where the batch of a non-finite update is saved.
 
     Returns:
-        (metrics, the state with empty sums). A task without samples has no loss, priority and TD error.
+        (metrics, the state with empty sums). Without updates there are no largest numbers, and a task without samples
+        has its share of them alone.
 
     Raises:
         NonFiniteError: a loss or gradient was NaN or infinite since the last read; the batch is saved.
     """
     check_finite(state, diagnostics_dir)
-    sums = jax.device_get(state.metrics)
-    n = max(int(sums.num_updates), 1)
-    metrics = {
-        "loss": float(sums.loss) / n,
-        "priority": float(sums.priority) / n,
-        "td_error": float(sums.td_error) / n,
-        "q_mean": float(sums.q_mean) / n,
-        "grad_norm": float(sums.grad_norm) / n,
-        "importance_weight": float(sums.importance_weight) / n,
-    }
-    if sums.num_updates > 0:
-        metrics |= {"q_max": float(sums.q_max), "grad_norm_max": float(sums.grad_norm_max)}
-    total = max(float(sums.task_samples.sum()), 1.0)
+    sums: dict[str, Any] = {f.name: getattr(state.metrics, f.name) for f in fields(state.metrics)}
+    sums = jax.device_get(sums | sums.pop("agent", {}))
+    num_updates, samples = int(sums.pop("num_updates")), sums.pop("task_samples")
+    tasks = {name.removeprefix("task_"): x for name, x in sums.items() if x.ndim == 1}
+    means = {name: x for name, x in sums.items() if x.ndim == 0 and not name.endswith("_max")}
+    metrics = {name: float(x) / max(num_updates, 1) for name, x in means.items()}
+    if num_updates > 0:
+        metrics |= {name: float(x) for name, x in sums.items() if name.endswith("_max")}
     for i, name in enumerate(task_names):
-        samples = float(sums.task_samples[i])
-        metrics[f"sample_share/{name}"] = samples / total
-        if samples > 0:
-            metrics[f"loss/{name}"] = float(sums.task_loss[i]) / samples
-            metrics[f"priority/{name}"] = float(sums.task_priority[i]) / samples
-            metrics[f"td_error/{name}"] = float(sums.task_td_error[i]) / samples
-    return metrics, replace(state, metrics=_no_metrics(len(task_names)))
+        metrics[f"sample_share/{name}"] = float(samples[i]) / max(float(samples.sum()), 1.0)
+        if samples[i] > 0:
+            metrics |= {f"{what}/{name}": float(x[i]) / float(samples[i]) for what, x in tasks.items()}
+    return metrics, replace(state, metrics=no_sums(state.metrics))
 
 
-def check_finite(state: LearnerState, diagnostics_dir: Path) -> None:
+def check_finite(state: TrainedState, diagnostics_dir: Path) -> None:
     """Raises NonFiniteError as `read_metrics` does. Waits for the device."""
     if jax.device_get(state.non_finite.num_skipped) > 0:
         raise _save_non_finite(jax.device_get(state.non_finite), diagnostics_dir)
 
 
-def _update(
-    state: LearnerState,
-    replay_state: ReplayState,
-    task_weights: Float[Array, "Z"],
-    agent: Agent,
-    replay_spec: ReplaySpec,
-    learner_config: LearnerConfig,
-    replay_config: ReplayConfig,
-) -> tuple[LearnerState, ReplayState]:
-    """One gradient step (thesis Algorithm 1 with prioritized replay)."""
-    key, key_sample, key_loss = jax.random.split(state.key, 3)
-    progress = jnp.minimum(state.num_updates / learner_config.total_updates, 1.0)
-    start, end = replay_config.importance_sampling_exponent, replay_config.importance_sampling_exponent_end
-    batch, info = replay.sample(
-        replay_spec, replay_state, key_sample, learner_config.batch_size, start + progress * (end - start)
-    )
-    weights = info.weights * task_weights[batch.task]
+def no_non_finite(batch: Any, batch_size: int) -> NonFinite:
+    """No such update yet; `batch` is one of the right shapes."""
+    zeros = jnp.zeros(batch_size, jnp.float32)
+    return NonFinite(num_skipped=jnp.int32(0), update=jnp.int32(-1), batch=batch, loss=zeros, weights=zeros)
 
-    def weighted_loss(params: Params) -> tuple[Float[Array, ""], AgentLoss]:
-        losses = agent.loss(params, state.target_params, key_loss, batch)
-        return jnp.mean(weights * losses.loss), losses
 
-    (loss, losses), grads = jax.value_and_grad(weighted_loss, has_aux=True)(state.params)
+def no_sums(sums: T) -> T:
+    """The same sums of nothing; the largest number of none is -inf."""
+
+    def start(path: tuple[Any, ...], leaf: Array) -> Array:
+        is_max = jax.tree_util.keystr(path, simple=True).endswith("_max")
+        return jnp.full(leaf.shape, -jnp.inf if is_max else 0, leaf.dtype)
+
+    return jax.tree_util.tree_map_with_path(start, sums)
+
+
+def gradient_step(
+    state: StateT,
+    optimizer: optax.GradientTransformation,
+    mean_loss: Callable[[Params], tuple[Float[Array, ""], LossesT]],
+    batch: Any,
+    weights: Float[Array, "B"],
+    *,
+    hold_gradient: bool,
+) -> tuple[StateT, Float[Array, ""], LossesT, Float[Array, ""]]:
+    """One gradient step, which is skipped and noted if its loss or its gradient is not finite.
+
+    Args:
+        state: before it.
+        optimizer: of its parameters.
+        mean_loss: parameters -> (what is made smaller, the samples' losses).
+        batch: what is kept with a loss or gradient that is not finite, a pytree of arrays.
+        weights: of the samples; kept likewise.
+        hold_gradient: do not let XLA compute multiples of the gradient ahead of the loop that `_when` is. The results
+            differ in the last digits.
+
+    Returns:
+        (state with new params, opt_state, num_updates and non_finite; loss; the samples' losses; norm of the gradient).
+    """
+    (loss, losses), grads = jax.value_and_grad(mean_loss, has_aux=True)(state.params)
     grad_norm = jnp.sqrt(sum(jnp.vdot(leaf, leaf) for leaf in jax.tree.leaves(grads)))
     finite = jnp.isfinite(loss) & jnp.isfinite(grad_norm)
 
     def apply_gradient(trained: tuple[Params, optax.OptState]) -> tuple[Params, optax.OptState]:
-        # The barrier keeps XLA from computing multiples of the gradient ahead of the loop that `_when` is.
-        (params, opt_state), here = jax.lax.optimization_barrier((trained, grads))
-        deltas, opt_state = _optimizer(learner_config).update(here, opt_state, params)
+        (params, opt_state), here = trained, grads
+        if hold_gradient:
+            (params, opt_state), here = jax.lax.optimization_barrier((trained, grads))
+        deltas, opt_state = optimizer.update(here, opt_state, params)
         return optax.apply_updates(params, deltas), opt_state
 
     params, opt_state = _when(finite, apply_gradient, (state.params, state.opt_state))
     num_updates = state.num_updates + 1
-    target_params = _when(
-        num_updates % learner_config.target_period_updates == 0, lambda _: params, state.target_params
-    )
-    replay_state = replay.update_priorities(
-        replay_spec, replay_state, info.slots, jnp.where(jnp.isfinite(losses.priority), losses.priority, 0.0)
-    )
-    first_bad = NonFinite(num_skipped=jnp.int32(0), update=num_updates, batch=batch, loss=losses.loss, weights=weights)
-    non_finite = _when(~finite & (state.non_finite.num_skipped == 0), lambda _: first_bad, state.non_finite)
-    state = LearnerState(
-        params=params,
-        target_params=target_params,
-        opt_state=opt_state,
-        key=key,
-        num_updates=num_updates,
-        metrics=_add_metrics(state.metrics, loss, losses, grad_norm, info, batch.task),
-        non_finite=replace(non_finite, num_skipped=non_finite.num_skipped + ~finite),
-    )
-    return state, replay_state
+    bad = NonFinite(num_skipped=jnp.int32(0), update=num_updates, batch=batch, loss=losses.loss, weights=weights)
+    non_finite = _when(~finite & (state.non_finite.num_skipped == 0), lambda _: bad, state.non_finite)
+    non_finite = replace(non_finite, num_skipped=non_finite.num_skipped + ~finite)
+    state = replace(state, params=params, opt_state=opt_state, num_updates=num_updates, non_finite=non_finite)
+    return state, loss, losses, grad_norm
 
 
 def _when(condition: Bool[Array, ""], f: Callable[[T], T], value: T) -> T:
@@ -254,32 +313,19 @@ def _when(condition: Bool[Array, ""], f: Callable[[T], T], value: T) -> T:
 
 
 def _optimizer(config: LearnerConfig) -> optax.GradientTransformation:
-    """Adam (thesis Table 5.1), after clipping by the global norm if configured."""
-    adam = optax.adam(config.learning_rate, eps=config.adam_eps)
+    """Adam (thesis Table 5.1), with decoupled weight decay and after clipping by the global norm if configured."""
+    adam = optax.adamw(config.learning_rate, eps=config.adam_eps, weight_decay=config.weight_decay)
+    if config.weight_decay == 0.0:
+        adam = optax.adam(config.learning_rate, eps=config.adam_eps)
     if config.max_grad_norm is None:
         return adam
     return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adam)
 
 
 def _no_metrics(num_tasks: int) -> MetricSums:
-    scalar = jnp.zeros((), jnp.float32)
-    per_task = jnp.zeros((num_tasks,), jnp.float32)
-    sums = MetricSums(
-        num_updates=jnp.zeros((), jnp.int32),
-        loss=scalar,
-        priority=scalar,
-        td_error=scalar,
-        q_mean=scalar,
-        q_max=jnp.full((), -jnp.inf, jnp.float32),
-        grad_norm=scalar,
-        grad_norm_max=scalar,
-        importance_weight=scalar,
-        task_samples=per_task,
-        task_loss=per_task,
-        task_priority=per_task,
-        task_td_error=per_task,
-    )
-    return jax.tree.map(jnp.copy, sums)  # donation refuses a buffer that stands in two places
+    names = {f.name for f in fields(MetricSums)} - {"num_updates"}
+    sums = {name: jnp.zeros(num_tasks if name.startswith("task_") else (), jnp.float32) for name in names}
+    return no_sums(MetricSums(num_updates=jnp.int32(0), **sums))
 
 
 def _add_metrics(
@@ -311,7 +357,8 @@ def _add_metrics(
 def _save_non_finite(record: NonFinite, directory: Path) -> NonFiniteError:
     update = int(record.update)
     file = directory / f"nonfinite_batch_{update}.npz"
-    arrays = {f.name: getattr(record.batch, f.name) for f in fields(record.batch)}
+    leaves = jax.tree_util.tree_leaves_with_path(record.batch)
+    arrays = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
     np.savez(file, loss=record.loss, weights=record.weights, **arrays)
     bad = int(np.sum(~np.isfinite(record.loss)))
     return NonFiniteError(

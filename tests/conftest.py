@@ -1,18 +1,27 @@
 """Settings of every test process: strict JAX, and a runtime directory of its own, so that tests in other processes
-do not stand in its engine starts or in its records.
+do not stand in its engine starts or in its records. All share one cache of compiled XLA programs: compiling takes most
+of the tests' processor time, and many tests compile the same functions.
 """
 
 import atexit
 import os
 import shutil
 import tempfile
+from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from tests.learner import seeds
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "xla"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 os.environ["XDG_RUNTIME_DIR"] = tempfile.mkdtemp(prefix="gvz-tests-")
+
+# Hypothesis measures time, and the machine may be busy.
+settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any machine")
 
 
 @atexit.register

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gvz.transport.messages import STEP_DTYPE, StepBlock
-from learner.replay import ReplaySpec
+from gvz.transport.messages import StepBlock, step_dtype
+from learner.replay import ReplaySpec, Transitions
 
 
 @dataclass
@@ -25,6 +25,10 @@ class Record:
     terminated: bool
     truncated: bool
     params_version: int = 0
+    vector: tuple[float, ...] = ()
+    extras: tuple[float, ...] = ()
+    past_actions: tuple[int, ...] = ()
+    """oldest first"""
 
     @property
     def last(self) -> bool:
@@ -33,14 +37,12 @@ class Record:
 
 @dataclass
 class Expected:
-    """The transition of one anchor."""
+    """The transition of one anchor; what was observed is that of the records."""
 
-    obs_tm1: np.ndarray
-    a_tm1: int
+    record_tm1: Record
     r_t: float
     discount_t: float
-    obs_t: np.ndarray
-    task: int
+    record_t: Record
 
 
 class ReplayOracle:
@@ -85,8 +87,9 @@ class ReplayOracle:
         for lane, stream in enumerate(self.streams):
             oldest = max(0, len(stream) - L)
             for t in range(oldest, len(stream)):
-                oldest_frame = max(self.episode_start(lane, t), t - self.spec.stack_size + 1)
-                if oldest_frame >= oldest and self.window(lane, t) is not None:
+                records = max(self.spec.stack_size, self.spec.num_past_actions + 1)
+                oldest_read = max(self.episode_start(lane, t), t - records + 1)
+                if oldest_read >= oldest and self.window(lane, t) is not None:
                     found.add(lane * L + t % L)
         return found
 
@@ -100,12 +103,10 @@ class ReplayOracle:
         m = self.window(lane, t)
         assert m is not None, f"slot {slot} holds no complete transition"
         return Expected(
-            obs_tm1=stream[t].observation,
-            a_tm1=stream[t].action,
+            record_tm1=stream[t],
             r_t=sum(self.spec.discount**k * stream[t + 1 + k].reward for k in range(m)),
             discount_t=0.0 if stream[t + m].terminated else self.spec.discount**m,
-            obs_t=stream[t + m].observation,
-            task=stream[t].task,
+            record_t=stream[t + m],
         )
 
     def _note_completed(self, lane: int) -> None:
@@ -125,6 +126,7 @@ def play(rng: np.random.Generator, spec: ReplaySpec, lane: int, *, mean_steps: f
     episode = 0
     while True:
         stack: deque[np.ndarray] = deque(maxlen=spec.stack_size)
+        past = [-1] * spec.num_past_actions
         task = int(rng.integers(spec.num_tasks))
         num_steps = int(rng.geometric(1 / mean_steps)) - 1
         end = rng.choice(["terminated", "truncated", "both", "cut"])
@@ -132,10 +134,11 @@ def play(rng: np.random.Generator, spec: ReplaySpec, lane: int, *, mean_steps: f
             frame = rng.integers(0, 256, spec.frame_shape, dtype=np.uint8)
             stack.extend([frame] * (1 if t else spec.stack_size))
             is_last = t == num_steps and end != "cut"
+            action = 0 if is_last else int(rng.integers(100))
             yield Record(
                 frame=frame,
                 observation=np.concatenate(stack, axis=-1),
-                action=0 if is_last else int(rng.integers(100)),
+                action=action,
                 reward=0.0 if t == 0 else float(np.float32(rng.normal())),
                 lane=lane,
                 task=task,
@@ -143,14 +146,33 @@ def play(rng: np.random.Generator, spec: ReplaySpec, lane: int, *, mean_steps: f
                 first=t == 0,
                 terminated=is_last and end in ("terminated", "both"),
                 truncated=is_last and end in ("truncated", "both"),
+                vector=tuple(np.float32(rng.normal(size=spec.num_variables)).tolist()),
+                extras=tuple(np.float32(rng.normal(size=spec.num_extras)).tolist()),
+                past_actions=tuple(past),
             )
+            past = [*past, action][1:] if past else past
         episode += 1
+
+
+def check_batch(batch: Transitions, want: list[Expected]) -> None:
+    """Asserts that a batch holds these transitions."""
+    for observed, records in (
+        (batch.obs_tm1, [one.record_tm1 for one in want]),
+        (batch.obs_t, [one.record_t for one in want]),
+    ):
+        np.testing.assert_array_equal(observed.frames, [record.observation for record in records])
+        np.testing.assert_array_equal(observed.vector, np.float32([record.vector for record in records]))
+        np.testing.assert_array_equal(observed.actions, np.array([record.past_actions for record in records], int))
+        np.testing.assert_array_equal(observed.task, [record.task for record in records])
+    np.testing.assert_array_equal(batch.a_tm1, [one.record_tm1.action for one in want])
+    np.testing.assert_array_equal(batch.discount_t, np.float32([one.discount_t for one in want]))
+    np.testing.assert_allclose(batch.r_t, [one.r_t for one in want], rtol=1e-5, atol=1e-6)
 
 
 def step_block(records: list[Record], *, sequence: int = 0) -> StepBlock:
     """The records as a ring would hand them over."""
-    steps = np.zeros(len(records), STEP_DTYPE)
-    for name in STEP_DTYPE.names or ():
+    steps = np.zeros(len(records), step_dtype(len(records[0].vector), len(records[0].extras)))
+    for name in steps.dtype.names or ():
         if name not in ("sequence", "pad"):
             steps[name] = [getattr(record, name) for record in records]
     steps["sequence"] = sequence + np.arange(len(records))

@@ -35,16 +35,20 @@ def command_lines(page: Path) -> list[list[str]]:
 @pytest.mark.engine
 @pytest.mark.parametrize("example", EXAMPLES)
 def test_an_example_runs(example, tmp_path):
+    (tmp_path / "example.py").write_text(example)
     done = subprocess.run(
-        [sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False
+        [sys.executable, "example.py"], cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False
     )
     assert done.returncode == 0, done.stderr
     assert not list(tmp_path.glob("_vizdoom*"))
 
 
 @pytest.mark.parametrize("page", [*PAGES, *RECORDS], ids=lambda page: f"{page.parent.name}/{page.name}")
-def test_commands_have_the_flags_they_are_given(page):
-    """Parsed, not run."""
+def test_commands_have_the_flags_they_are_given(page, tmp_path, monkeypatch):
+    """Parsed, not run, in a directory with the agent's file that docs/AGENTS.md writes."""
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "AGENTS.md").read_text(), flags=re.DOTALL)
+    (tmp_path / "munchausen.py").write_text(example)
+    monkeypatch.chdir(tmp_path)
     targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
     for words in command_lines(page):
         if words[0] == "make":

@@ -23,7 +23,8 @@ from gvz.evaluation.dataset import collect_evaluations
 from gvz.evaluation.episode_log import read_rows
 from gvz.evaluation.trained import trained_player
 from gvz.reports.results import read_results
-from gvz.run.config import RunConfig, config_to_dict
+from gvz.run.config import RunConfig
+from gvz.run.config_files import config_to_dict
 from gvz.run.rundir import RunDir
 from gvz.run.telemetry import Telemetry
 from gvz.wad.acs import compile_acs
@@ -38,9 +39,9 @@ UNPICKLERS = {"pickle", "_pickle", "cPickle", "cloudpickle", "dill", "joblib", "
 EXECUTORS = {"eval", "exec", "compile", "__import__", "os.system", "os.popen"}
 EXECUTING_METHODS = {"import_module", "exec_module", "load_module", "run_path", "run_module"}
 ALLOWED = {
-    ("gvz/run/config.py", "exec"): "a config file, which the user names",
-    ("gvz/run/config.py", "compile"): "likewise",
-    ("learner/agents/base.py", "exec_module"): "an agent's file, which the user names",
+    ("gvz/run/config_files.py", "exec"): "a config file, which the user names",
+    ("gvz/run/config_files.py", "compile"): "likewise",
+    ("gvz/core/registry.py", "exec_module"): "the file of an agent or an encoder, which the user names",
     ("gvz/core/registry.py", "import_module"): "modules of our own packages, found on the disk",
     ("actors/loop.py", "import_module"): "the environment's class, which the learner names to the actor it started",
 }
@@ -136,7 +137,7 @@ def test_a_run_directory_and_all_in_it_are_private_whatever_the_umask(tmp_path: 
         saver.save(1, tree, tree, {"num_updates": 1})
         saver.wait()
         assert saver.outcome() == ""
-        telemetry = Telemetry(run, tasks=("a",), upper_bound=1.0, tensorboard=True, num_updates=0)
+        telemetry = Telemetry(run, CONFIG.table, CONFIG.log, 0)
         telemetry.scalars(1, {"learner/loss": 1.0})
         telemetry.close()
     found = modes(tmp_path)
@@ -152,7 +153,7 @@ def test_private_directories_and_the_records_of_them_are_private_whatever_the_um
 ):
     tmp_path.chmod(0o700)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    with janitor.temporary_directory("test") as directory:
+    with janitor.temporary_directory() as directory:
         assert stat.S_IMODE(directory.stat().st_mode) == 0o700
         assert set(modes(tmp_path).values()) == {0o700, 0o600}
 

@@ -10,7 +10,7 @@ import cloudpickle
 import gymnasium
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import gvz
@@ -76,7 +76,6 @@ def test_complete_has_exactly_one_attribute_of_every_group():
         assert sorted(groups) == sorted({group for one in scenario.attributes for group in one.groups})
 
 
-@settings(deadline=None)  # the machine may be busy
 @given(attribute_sets())
 def test_any_set_with_at_most_one_attribute_a_group_is_a_task_in_any_order(chosen: tuple[str, list[str]]):
     scenario, names = chosen
@@ -129,6 +128,28 @@ def test_ids_are_canonical():
     assert parse_task("seek_and_kill/default").attributes == ()
 
 
+def test_a_varied_task_has_a_number_of_maps_and_is_none_of_the_named_ones():
+    for scenario in scenarios():
+        varied, ten = parse_task(f"{scenario}/varied"), parse_task(f"{scenario}/varied-10")
+        assert (varied.num_maps, varied.name, varied.level, varied.attributes) == (1000, "varied", 0, ())
+        assert (ten.num_maps, ten.id) == (10, f"{scenario}/varied-10")
+        assert parse_task(f"{scenario}/varied-1000") == varied
+        assert pickle.loads(pickle.dumps(ten)) == ten != varied
+        assert not {varied, ten} & set(named_tasks())
+
+
+def test_a_scenario_that_does_not_say_what_may_differ_has_no_varied_task():
+    centre = scenario_named("defend_the_center")
+    plain = dataclasses.replace(centre, variety=None)
+    with pytest.raises(TaskError, match="defend_the_center: got varied, but the scenario has no variety"):
+        Task(plain, num_maps=10)
+    assert "varied" not in plain.choices()
+    with pytest.raises(TaskError, match="got varied and gore, want one of them"):
+        Task(centre, ("gore",), num_maps=10)
+    with pytest.raises(TaskError, match="defend_the_center/varied--1: want 1 to 1000 maps"):
+        Task(centre, num_maps=-1)
+
+
 def test_all_of_complete_spelled_out_is_complete():
     names = "+".join(reversed(scenario_named("seek_and_kill").complete))
     assert parse_task(f"seek_and_kill/{names}").id == "seek_and_kill/complete"
@@ -146,6 +167,17 @@ def test_training_sets_grow_and_share_nothing_with_the_test_set():
         assert one < four < eight
         assert not eight & test
         assert test == {parse_task(f"{scenario}/{name}") for name in TEST_SETS[scenario].split(", ")}
+
+
+def test_the_gate_set_is_of_level_2_and_in_no_other_set():
+    sizes = {"defend_the_center": 3, "health_gathering": 4, "seek_and_kill": 3, "dodge_projectiles": 3}
+    assert {scenario: len(named_tasks(scenario, split="gate")) for scenario in scenarios()} == sizes
+    for task in named_tasks(split="gate"):
+        others = [name for name in ("train1", "train4", "train8", "test") if task in named_tasks(split=name)]
+        assert (task.level, others) == (2, [])
+    assert named_tasks(level=3, split="gate") == ()
+    left = [task for task in named_tasks(level=2) if task not in named_tasks(split="test")]
+    assert list(named_tasks(level=2, split="gate")) == left
 
 
 def test_the_main_job_trains_on_default_gore_stone_wall_and_fast_enemies():
@@ -168,6 +200,15 @@ def test_the_main_job_trains_on_default_gore_stone_wall_and_fast_enemies():
         (None, "task: got None, want '<scenario>/<task>'"),
         ("dodge_projectiles/revenants+arachnotron", "both of group entity_type"),
         ("health_gathering/lava++slime", "unknown attribute ''"),
+        (
+            "defend_the_center/varid",
+            r"unknown attribute 'varid' \(did you mean 'varied'\?\).* or varied-<number of maps>",
+        ),
+        ("defend_the_center/varied+gore", "'varied' is a task and no attribute; want default, complete"),
+        ("defend_the_center/gore+varied-10", "'varied-10' is a task and no attribute"),
+        ("seek_and_kill/varied-0", "want 'varied' or 'varied-<number of maps>' with 1 to 1000 maps"),
+        ("seek_and_kill/varied-1001", "want 'varied' or 'varied-<number of maps>' with 1 to 1000 maps"),
+        ("seek_and_kill/varied-ten", "got 'seek_and_kill/varied-ten', want 'varied' or"),
     ],
 )
 def test_what_is_no_task_is_refused_with_what_is_possible(text: str, message: str):
@@ -178,7 +219,7 @@ def test_what_is_no_task_is_refused_with_what_is_possible(text: str, message: st
 def test_unknown_selections_of_named_tasks_are_refused():
     with pytest.raises(TaskError, match=r"level: got 5, want 0\.\.4"):
         named_tasks(level=5)
-    with pytest.raises(TaskError, match="split: got 'train2', want one of train1, train4, train8, test"):
+    with pytest.raises(TaskError, match="split: got 'train2', want one of train1, train4, train8, test, gate"):
         named_tasks(split="train2")
     with pytest.raises(TaskError, match="unknown scenario 'seek'"):
         named_tasks("seek")
@@ -248,7 +289,7 @@ def test_a_scenario_is_the_thesiss_table_3_1(name: str):
 
 
 def test_the_maps_are_made_from_the_engines_own():
-    assert {name: one.base_wad for name, one in scenarios().items()} == {
+    assert {name: one.content.base_wad for name, one in scenarios().items()} == {
         "defend_the_center": "defend_the_center.wad",
         "health_gathering": "health_gathering.wad",
         "seek_and_kill": "health_gathering_supreme.wad",

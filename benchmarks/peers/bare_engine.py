@@ -1,8 +1,8 @@
-"""The engine's limit: one process that does nothing but `make_action` and `get_state`, with random actions.
+"""The engine's limit: one process that only calls `make_action` and `get_state`, with random actions.
 
     python bare_engine.py TASK RENDER_WIDTH RENDER_HEIGHT
 
-The engine is set up as our own environment sets it up: same map, buttons, variables and screen.
+The engine has the settings of our own environment: the same map, buttons, variables and screen.
 """
 
 import sys

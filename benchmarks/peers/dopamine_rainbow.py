@@ -1,8 +1,8 @@
-"""Dopamine's JAX full Rainbow update, its prioritized buffer's sampling included:
+"""Dopamine's JAX full Rainbow update, including the sampling of its prioritized buffer:
 `python dopamine_rainbow.py CAPACITY BATCH_SIZE`.
 
-Observations are 12 grey frames of 84x84, the same array as ours of 4 frames in colour. Its buffer keeps whole stacks,
-10 GB of them at 100K, so it holds at most _MAX_CAPACITY here; a smaller one is no slower to draw from.
+Observations are 12 grey frames of 84x84: the array has the size of ours with 4 frames in colour. The buffer keeps whole
+stacks, 10 GB at 100K, so it holds at most _MAX_CAPACITY here; sampling from a smaller buffer is not slower.
 """
 
 import sys

@@ -11,7 +11,7 @@ from serve import serve
 
 
 def make_env(resolution: str | None) -> gymnasium.Env:
-    """One bare LevDoom game; without a resolution it is LevDoom's own, 320x240."""
+    """One bare LevDoom game; the default resolution is LevDoom's own, 320x240."""
     from levdoom.envs.defend_the_center.scenario import DefendTheCenter
 
     return DefendTheCenter(env="default", render=False, resolution=resolution)

@@ -1,4 +1,4 @@
-"""Takes every version of the parameters that it can, looking as often as a fast actor acts:
+"""Reads new versions of the parameters, and looks for them as often as a fast actor acts:
 `python params_reader.py DESCRIPTOR NUM_PARAMS`."""
 
 import sys

@@ -1,4 +1,4 @@
-"""Writes blocks into a ring as fast as its reader makes room: `python ring_writer.py DESCRIPTOR CAPACITY BLOCK`."""
+"""Writes blocks into a ring as fast as its reader frees slots: `python ring_writer.py DESCRIPTOR CAPACITY BLOCK`."""
 
 import sys
 import time

@@ -1,5 +1,5 @@
-"""The other end of `benchmarks/remote.py`: runs a body for every line of arguments. Standard library only, since every
-peer's process imports it, whatever else is installed there.
+"""The other end of `benchmarks/remote.py`: runs a body for every line of arguments. Standard library only, because
+every peer's process imports it.
 """
 
 import importlib.metadata
@@ -10,12 +10,12 @@ from typing import Any
 
 
 def serve(body: Callable[..., dict[str, Any]], *packages: str, **about: Any) -> None:
-    """Says who this is, then answers each line of JSON arguments with the JSON of `body(**arguments)`.
+    """Prints a description of this process, then answers each line of JSON arguments with `body(**arguments)` as JSON.
 
     Args:
-        body: what is measured.
-        *packages: installed packages whose versions are told.
-        **about: more to tell.
+        body: the measured function.
+        *packages: installed packages whose versions are reported.
+        **about: further fields of the description.
     """
     print(json.dumps({"versions": {name: importlib.metadata.version(name) for name in packages}, **about}), flush=True)
     for line in sys.stdin:

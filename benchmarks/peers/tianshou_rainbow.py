@@ -1,4 +1,4 @@
-"""Tianshou's PyTorch Rainbow update, its prioritized buffer's sampling included:
+"""Tianshou's PyTorch Rainbow update, including the sampling of its prioritized buffer:
 `python tianshou_rainbow.py CAPACITY BATCH_SIZE`.
 
 The network is Tianshou's own (Nature convolutions, dueling, noisy, 51 atoms); frames of 84x84x3 are stored once and
@@ -25,7 +25,7 @@ _EPISODE_STEPS = 100
 
 
 class StackedFrames(RainbowNet):
-    """Takes uint8 [B, stack, 3, 84, 84], as the buffer stacks it."""
+    """Takes uint8 [B, stack, 3, 84, 84], the buffer's form of a stack."""
 
     def forward(self, obs: Any, state: Any = None, info: Any = None) -> Any:
         frames = torch.as_tensor(obs).float().flatten(1, 2) / 255
@@ -33,7 +33,7 @@ class StackedFrames(RainbowNet):
 
 
 def filled_buffer(capacity: int) -> PrioritizedReplayBuffer:
-    """Full of noise in episodes of a hundred steps."""
+    """A buffer full of noise, in episodes of a hundred steps."""
     buffer = PrioritizedReplayBuffer(
         capacity, alpha=0.6, beta=0.4, stack_num=_STACK, ignore_obs_next=True, save_only_last_obs=False
     )

@@ -3,9 +3,7 @@
 import dataclasses
 import json
 import os
-import signal
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,13 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from gvz.core.env_config import EnvConfig, Profile, SimplePlayer
+from gvz.core.env_config import EnvConfig, Profile
 from gvz.core.errors import ConfigError
+from gvz.core.stop import StopRequest
 from gvz.evaluation.selection import ALL_TASKS, TaskSelection
+from gvz.evaluation.simple import SimplePlayerName
 from gvz.scenarios.base import Task
 
 if TYPE_CHECKING:
-    from gvz.evaluation.episode_log import RecordFile
     from gvz.evaluation.play import PlayerSpec, Row
 
 EXIT_INTERRUPTED = 130
@@ -41,9 +40,9 @@ class Evaluate:
         tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[RUN_DIR ...]", help_behavior_hint="")
     ] = ()
     """run directories: their policies play greedily, noise off; by default the test tasks of their scenario"""
-    player: SimplePlayer | None = None
+    player: SimplePlayerName | None = None
     """random: uniformly random buttons; idle: presses nothing; sweep: a fixed sequence of buttons; scripted: the
-    scenario's simple script, which is told what is in sight"""
+    scenario's simple script, which gets names and places of what is in sight"""
     agent: Path | None = None
     """the Python file of the run's agent, if it is in a file of its own: playing executes it"""
     checkpoints: tuple[str, ...] = ("newest",)
@@ -66,25 +65,26 @@ class Evaluate:
         """Plays what the record files do not hold yet, with a progress bar, and prints the scores."""
         workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
         self._check(workers)
-        from gvz.evaluation.episode_log import missing_jobs, play_and_record, wanted_episodes
+        from gvz.evaluation.episode_log import RecordFile, missing_jobs, play_and_record, wanted_episodes
 
         player_specs = self._player_specs()
         files: dict[Path, RecordFile] = {}
-        handler = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
         try:
-            held = {player_spec: _open(files, out) for player_spec, (_, out) in player_specs.items()}
-            jobs = []
-            for player_spec, (tasks, _) in player_specs.items():
-                wanted = wanted_episodes(tasks, self.episodes, self.seeds)
-                jobs += missing_jobs({player_spec: held[player_spec]}, wanted)
-            _show_progress(play_and_record(held, jobs, num_workers=workers), len(jobs))
+            with StopRequest() as stop:
+                held: dict[PlayerSpec, RecordFile] = {}
+                jobs = []
+                for player_spec, (tasks, out) in player_specs.items():
+                    if out not in files:
+                        files[out] = RecordFile(out)
+                    held[player_spec] = files[out]
+                    jobs += missing_jobs({player_spec: files[out]}, wanted_episodes(tasks, self.episodes, self.seeds))
+                _show_progress(play_and_record(held, jobs, num_workers=workers, stop=stop), len(jobs))
             for player_spec, (tasks, _) in player_specs.items():
                 self._print_scores(player_spec, tasks, held[player_spec].rows)
         except KeyboardInterrupt:
             print("interrupted; the same command goes on from here", file=sys.stderr)
             return EXIT_INTERRUPTED
         finally:
-            signal.signal(signal.SIGTERM, handler)
             for file in files.values():
                 file.close()
         return 0
@@ -109,7 +109,7 @@ class Evaluate:
         found = {}
         for run_dir in dict.fromkeys(self.run_dirs):
             config = read_run_config(run_dir, self.agent)
-            tasks = run_tasks(self.select, config.resolved_scenario().id)
+            tasks = run_tasks(self.select, config.table.scenarios[0].id)
             check_tasks(config, tasks)
             out = run_dir / "evaluation.jsonl" if self.out is None else self.out
             for num_updates in find_checkpoints(run_dir, self.checkpoints):
@@ -117,15 +117,15 @@ class Evaluate:
         return found
 
     def _print_scores(self, player_spec: "PlayerSpec", tasks: Sequence[Task], rows: "Sequence[Row]") -> None:
-        from gvz.evaluation.table import score_lines, score_row, scores
+        from gvz.evaluation.table import score_lines, score_rows
 
         player = player_spec.identity["player"]
         for base_seed in self.seeds:
             chosen = [row for row in rows if row.get("base_seed", 0) == base_seed]
-            found = scores(chosen, player_spec.identity, tasks, self.episodes)
+            found = score_rows(chosen, player_spec.identity, tasks, self.episodes)
             if self.json:
                 for one in found:
-                    print(json.dumps({"player": player, "base_seed": base_seed, **score_row(one)}))
+                    print(json.dumps({"player": player, "base_seed": base_seed, **one}))
             else:
                 print(player + (f", base seed {base_seed}" if base_seed else ""))
                 print("\n".join(score_lines(found)))
@@ -135,7 +135,7 @@ COMMAND = Evaluate
 
 
 def run_tasks(select: TaskSelection, scenario: str) -> tuple[Task, ...]:
-    """The tasks a run is evaluated on: as selected, of its own scenario if none is said; else its test set."""
+    """The tasks a run is evaluated on: the selected ones, of its own scenario by default; else its test set."""
     if select == ALL_TASKS:
         select = TaskSelection(split="test")
     if not select.tasks and select.scenario is None:
@@ -143,38 +143,11 @@ def run_tasks(select: TaskSelection, scenario: str) -> tuple[Task, ...]:
     return select.resolve()
 
 
-def _open(files: "dict[Path, RecordFile]", path: Path) -> "RecordFile":
-    """The record file at `path`, opened once."""
-    from gvz.evaluation.episode_log import RecordFile
-
-    if path not in files:
-        files[path] = RecordFile(path)
-    return files[path]
-
-
 def _show_progress(rows: "Iterator[Row]", total: int) -> None:
-    """Draws the rows as they come, on stderr: a bar with rate and time left, or now and then a line."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-    from rich.table import Column
+    """Shows the rows as they come."""
+    from gvz.run.bars import Bar, Bars
 
-    from gvz.run.progress import format_duration
-
-    console = Console(stderr=True)
-    columns = (
-        *(BarColumn(20), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn()),
-        TextColumn("{task.description}", table_column=Column(overflow="fold")),  # long: it may take two lines
-    )
-    first_s = next_line_s = 0.0
-    with Progress(*columns, console=console, disable=not console.is_terminal, speed_estimate_period=300) as bar:
-        shown = bar.add_task("", total=total, rate="")
+    with Bars(LINE_PERIOD_S) as bars:
         for done, row in enumerate(rows, 1):
-            now_s = time.monotonic()
-            first_s = now_s if done == 1 else first_s
-            per_s = (done - 1) / (now_s - first_s) if done > 1 else 0.0  # the start of the workers left out
-            rate, name = f"{per_s:.2f} episodes/s", f"{row['player']}  {row['task']}"
-            bar.update(shown, advance=1, description=name, rate=rate)
-            if not console.is_terminal and (now_s >= next_line_s or done == total):
-                left = format_duration((total - done) / per_s if per_s else None)
-                print(f"{done}/{total}  {rate}  eta {left}  {name}", file=sys.stderr, flush=True)
-                next_line_s = now_s + LINE_PERIOD_S
+            text = f"{row['player']}  {row['task']}"
+            bars.show([Bar(name="episodes", done=done, total=total, unit="episodes", text=text)])

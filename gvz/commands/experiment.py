@@ -3,11 +3,9 @@
 import dataclasses
 import json
 import os
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,19 +14,16 @@ import tyro
 from gvz.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
-
     from gvz.experiments.costs import Cost
     from gvz.experiments.jobs import Job, Slot
     from gvz.experiments.plan import Plan
-    from gvz.experiments.rates import Rates
 
 DEFAULT_RESULTS = Path("runs/experiments")
 
 
 @dataclass(frozen=True, kw_only=True)
 class List:
-    """List the experiments: what they ask, how many runs they have."""
+    """List the experiments: their questions and numbers of runs."""
 
     json: bool = False
     """one JSON object a line instead of text"""
@@ -40,21 +35,21 @@ class List:
         for experiment in experiments().values():
             runs = experiment.runs()
             if self.json:
-                names = ("name", "title", "question", "source", "configs", "scenarios", "trainings", "seeds")
-                row = {name: getattr(experiment, name) for name in names}
-                print(json.dumps({**row, "runs": len(runs), "total_updates": experiment.total_updates}))
+                fields = "name title question source configs scenarios trainings seeds total_updates max_processor_s"
+                row = {name: getattr(experiment, name) for name in fields.split()}
+                print(json.dumps({**row, "variants": dict(experiment.variants), "runs": len(runs)}))
                 continue
             print(f"{experiment.name}: {experiment.question}")
             print(f"    {experiment.source}")
-            grid = (experiment.configs, experiment.scenarios, experiment.trainings, map(str, experiment.seeds))
+            grid = (experiment.agents, experiment.scenarios, experiment.trainings, map(str, experiment.seeds))
             cells = " x ".join(", ".join(values) for values in grid)
-            print(f"    {len(runs)} runs of {experiment.total_updates:,} gradient steps: {cells}")
+            print(f"    {len(runs)} runs of {experiment.budget}: {cells}")
         return 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanFlags:
-    """What is asked for."""
+    """The flags of a plan."""
 
     names: Annotated[
         tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="NAME ...", help_behavior_hint="")
@@ -63,11 +58,11 @@ class PlanFlags:
     results: Path = DEFAULT_RESULTS
     """results directory: runs/ players/ logs/ plan.json"""
     scale: float = 1.0
-    """less than 1 shrinks budgets, episodes and seeds; below 0.01 the grid is thinned too: a check of the pipeline"""
+    """less than 1 shrinks budgets, episodes and seeds; less than 0.01 only checks the pipeline, with few runs"""
     scenario: tuple[str, ...] = ()
     """only these scenarios of each experiment"""
     shard: str = "1/1"
-    """i/n: only every n-th run, from the i-th; n commands with the same results directory do all"""
+    """i/n: only every n-th run, from the i-th; n such commands with one results directory do all runs"""
     jobs: int | None = None
     """jobs at once; default one a GPU, or one a pair of cores without a GPU"""
 
@@ -88,37 +83,33 @@ class PlanFlags:
 class PlanCommand:
     """Print the runs of experiments: gradient steps, environment steps, evaluation episodes, hours.
 
-    Hours are by rates measured on this machine, once for each config: some minutes the first time.
+    Hours are by the records of runs on this machine; a config that has not run here yet has none.
     """
 
     ask: Annotated[PlanFlags, tyro.conf.arg(name="")] = PlanFlags()
-    measure: bool = False
-    """measure the rates again"""
     json: bool = False
     """one JSON object a line for each run of the shard, instead of tables"""
 
     def run(self) -> int:
-        """Measures what is not known yet, then prints."""
-        from gvz.experiments.costs import Cost, run_cost
+        """Prints the plan."""
+        from gvz.experiments.costs import Cost, read_rates, run_cost
         from gvz.experiments.plan import parse_shard, shard
 
         plan, slots = self.ask.plan(), self.ask.slots()
         index, count = parse_shard(self.ask.shard)
-        try:
-            rates = _rates(plan, slots[0], again=self.measure)
-        except KeyboardInterrupt:
-            print("interrupted; nothing was remembered of the rate that was being measured", file=sys.stderr)
-            return 130
+        cores = len(slots[0].cores)
+        agents = sorted({run.agent for run in plan.runs()})
+        rates = {agent: read_rates(self.ask.results, agent, plan.scale, cores) for agent in agents}
         evaluations = plan.evaluations()
-        costs = {run.id: run_cost(run, evaluations[run.id], plan.scale, rates[run.config]) for run in plan.runs()}
+        costs = {run.id: run_cost(run, evaluations[run.id], plan.scale, rates[run.agent], cores) for run in plan.runs()}
         mine = shard(plan.runs(), index, count)
         if self.json:
             for run in mine:
                 names = [e.name for e in plan.experiments() if run in e.runs()]
                 print(json.dumps({"run": run.id, "experiments": names, **dataclasses.asdict(costs[run.id])}))
             return 0
-        rows = [(run.id, costs[run.id]) for run in mine]
-        _print_costs([*rows, (f"{len(mine)} runs", sum((cost for _, cost in rows), Cost()))])
+        whole = sum((costs[run.id] for run in mine), Cost())
+        _print_costs([*((run.id, costs[run.id]) for run in mine), (f"{len(mine)} runs", whole)])
         print()
         of_experiments = [
             (f"{e.name}: {len(e.runs())} runs", sum((costs[run.id] for run in e.runs()), Cost()))
@@ -126,19 +117,21 @@ class PlanCommand:
         ]
         together = f"together, shared runs once: {len(plan.runs())} runs"
         _print_costs([*of_experiments, (together, sum(costs.values(), Cost()))])
-        hours = sum(cost.hours for _, cost in rows) / len(slots)
-        print(f"\nshard {index}/{count}, {len(slots)} jobs at once on this machine: {hours:.2f} hours at most")
-        for config, found in rates.items():
-            print(
-                f"{config}: {found.updates_per_s:.2f} updates/s, {found.evaluation_steps_per_s:.0f} evaluation "
-                f"decisions/s, one job on {len(slots[0].cores)} cores (measured {found.measured})"
-            )
+        jobs = f"shard {index}/{count}, {len(slots)} jobs at once on this machine"
+        if whole.training_hours is None or whole.evaluation_hours is None:
+            print(f"\n{jobs}: hours are not known yet; begin with gvz experiment run, and ask again after a while")
+        else:
+            hours = (whole.training_hours + whole.evaluation_hours) / len(slots)
+            print(f"\n{jobs}: {hours:.2f} hours at most")
+        for agent, found in rates.items():
+            trained, played = (_text(rate) for rate in (found.updates_per_s, found.evaluation_steps_per_s))
+            print(f"{agent}: {trained} updates/s, {played} evaluation decisions/s, one job on {cores} cores")
         return 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunCommand:
-    """Run experiments: train, evaluate, and let the simple players play. The same command goes on where it was stopped.
+    """Run experiments: train, evaluate, play with the simple players. The same command resumes what was stopped.
 
     Example: gvz experiment run training_set_size rainbow_evaluation --results results --shard 1/4
     """
@@ -159,7 +152,7 @@ class RunCommand:
 
 @dataclass(frozen=True, kw_only=True)
 class Status:
-    """Print how far each run is, and why one failed. Exit code 1 if one has."""
+    """Print the progress of each run, and why runs failed. Exit code 1 if one has failed."""
 
     results: Path = DEFAULT_RESULTS
     """results directory"""
@@ -170,7 +163,7 @@ class Status:
 
     def run(self) -> int:
         """Reads logs and records."""
-        from gvz.experiments import inventory as progress
+        from gvz.experiments import inventory
         from gvz.experiments.plan import parse_shard, read_plan
 
         plan = read_plan(self.results)
@@ -179,15 +172,15 @@ class Status:
         states: Counter[str] = Counter()
         for job in _jobs(plan, self.results, *parse_shard(self.shard)):
             outlook = job.outlook()
-            state = progress.job_state(self.results, job.id, done=outlook.next is None, begun=outlook.begun)
+            state = inventory.job_state(self.results, job.id, done=outlook.next is None, begun=outlook.begun)
             states[state] += 1
-            log = progress.log_file(self.results, job.id)
+            log = inventory.log_file(self.results, job.id)
             if self.json:
                 print(json.dumps({"job": job.id, "state": state, "progress": outlook.text, "log": str(log)}))
                 continue
             print(f"{state:8} {job.id}: {outlook.text}")
             if state == "failed":
-                print("\n".join([f"{'':8}     {log}", *(f"{'':8}     {line}" for line in progress.last_words(log))]))
+                print("\n".join([f"{'':8}     {log}", *(f"{'':8}     {line}" for line in inventory.last_words(log))]))
         if not self.json:
             print(f"{', '.join(plan.names)}, scale {plan.scale:g}: {', '.join(f'{n} {s}' for s, n in states.items())}")
         return 1 if states["failed"] else 0
@@ -195,7 +188,7 @@ class Status:
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """List, plan and run the experiments, or see how far they are."""
+    """List, plan and run the experiments, or print their progress."""
 
     action: Annotated[
         Annotated[List, tyro.conf.subcommand("list")]
@@ -225,43 +218,24 @@ def _jobs(plan: "Plan", results: Path, index: int, count: int) -> "tuple[Job, ..
 
 
 def _check_flags(plan: "Plan") -> None:
-    """Says what is wrong with the trainer's flags now, not in every job's log."""
+    """Raises ConfigError for bad flags of the trainer here, before every job fails with them."""
     from gvz.experiments.jobs import training_flags
     from gvz.launch import parse
 
-    for run in {run.config: run for run in plan.runs()}.values():
+    for run in {run.agent: run for run in plan.runs()}.values():
         parse(training_flags(run, plan.scale))
 
 
-def _rates(plan: "Plan", slot: "Slot", *, again: bool) -> "dict[str, Rates]":
-    """Config -> its rates in a slot like this one, measured if they are not known."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
-
-    from gvz.experiments.rates import MEASURE_S, measure, rates_file, read_rates
-
-    console = Console(file=sys.stderr)
-    rates: dict[str, Rates] = {}
-    for config, run in {run.config: run for run in reversed(plan.runs())}.items():
-        known = None if again else read_rates(rates_file(config, plan.scale, slot))
-        if known is None:
-            console.print(f"measuring {config} on this machine, once; --measure does it again", highlight=False)
-            with Progress(TextColumn("{task.description}"), BarColumn(), console=console, transient=True) as bar:
-                task = bar.add_task(config, total=MEASURE_S)
-                known = measure(run, plan.scale, slot, partial(_show_rate, bar, task))
-        rates[config] = known
-    return rates
-
-
-def _show_rate(bar: "Progress", task: "TaskID", text: str, seconds: float) -> None:
-    bar.update(task, description=text, completed=seconds)
+def _text(number: float | None) -> str:
+    return "-" if number is None else f"{number:.2f}"
 
 
 def _print_costs(rows: "Sequence[tuple[str, Cost]]") -> None:
     """A line each, numbers in columns."""
     width = max(len(name) for name, _ in rows)
-    head = ("gradient steps", "environment steps", "episodes", "hours at most")
+    head = ("gradient steps", "environment steps", "episodes", "training hours", "evaluation hours at most")
     print(f"{'':{width}}  {'  '.join(head)}")
     for name, cost in rows:
-        cells = (f"{cost.updates:,}", f"{cost.env_steps:,}", f"{cost.episodes:,}", f"{cost.hours:.2f}")
+        counts = (f"{cost.updates:,}", f"{cost.env_steps:,}", f"{cost.episodes:,}")
+        cells = (*counts, _text(cost.training_hours), _text(cost.evaluation_hours))
         print(f"{name:{width}}  {'  '.join(cell.rjust(len(h)) for cell, h in zip(cells, head, strict=True))}")

@@ -2,15 +2,16 @@
 
 import json
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from gvz.core import records
 from gvz.core.errors import ConfigError
-from gvz.run.rundir import RECORD_FILES, START_RECORDS, read_records
+from gvz.run.rundir import RECORD_FILES, START_RECORDS
 
 if TYPE_CHECKING:
     import polars as pl
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 class Export:
     """Write the records of runs as CSV or Parquet: a table each of metrics, episodes, faults, starts and evaluations.
 
-    The rows of all runs go into one table; `run_dir`, `run` and `run_seed` say whose they are.
+    The rows of all runs go into one table, with the columns `run_dir`, `run` and `run_seed`.
 
     Example: gvz export runs/rainbow_4task/seed_* --format parquet --out tables
     """
@@ -35,7 +36,7 @@ class Export:
     """directory to write to"""
 
     def run(self) -> int:
-        """Writes the tables that have rows; says where they are, and what could not be read."""
+        """Writes the tables that have rows; prints their paths, and what could not be read."""
         if not self.run_dirs:
             raise ConfigError("export: got no run directory, want at least one")
         from gvz.evaluation.dataset import collect_evaluations
@@ -75,6 +76,8 @@ def run_table(run_dirs: Sequence[Path], name: str, problems: list[str]) -> "pl.D
     Raises:
         ConfigError: not a run directory.
     """
+    import polars as pl
+
     rows: list[dict[str, Any]] = []
     for run_dir in run_dirs:
         try:
@@ -84,16 +87,14 @@ def run_table(run_dirs: Sequence[Path], name: str, problems: list[str]) -> "pl.D
             raise ConfigError(f"{run_dir} is not a run directory (config.json: {error.strerror})") from error
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise ConfigError(f"{run_dir / 'config.json'} cannot be read: {error!r}") from error
-        for file in (run_dir / name, run_dir / f"{name}.gz"):
-            if file.exists():
-                found, damaged = read_records(file)
-                rows += ({**whose, **_flat(row)} for row in found)
-                problems += damaged
-    names = dict.fromkeys(name for row in rows for name in row)
-    if len(names) > MAX_COLUMNS:
-        problems.append(f"{name}: got rows of {len(names)} different fields, want at most {MAX_COLUMNS}; not written")
-        rows = []
-    return _frame(rows)
+        found, damaged = records.read_stored(run_dir / name)
+        rows += ({**whose, **_flat(row)} for row in found)
+        problems += damaged
+    columns = list(dict.fromkeys(column for row in rows for column in row))
+    if len(columns) > MAX_COLUMNS:
+        problems.append(f"{name}: got rows of {len(columns)} different fields, want at most {MAX_COLUMNS}; not written")
+        columns = []
+    return pl.DataFrame([pl.Series(column, [row.get(column) for row in rows], strict=False) for column in columns])
 
 
 def write_table(table: "pl.DataFrame", file: Path) -> Path:
@@ -126,11 +127,3 @@ def _cell(value: Any) -> Any:
 
 def _text(value: str) -> str:
     return value.encode(errors="backslashreplace").decode()  # half a pair of surrogates has no place in a file
-
-
-def _frame(rows: Iterable[dict[str, Any]]) -> "pl.DataFrame":
-    import polars as pl
-
-    rows = list(rows)
-    names = dict.fromkeys(name for row in rows for name in row)
-    return pl.DataFrame([pl.Series(name, [row.get(name) for row in rows], strict=False) for name in names])

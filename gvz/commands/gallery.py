@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from gvz.core.errors import ConfigError
 from gvz.tasks import scenario_named, scenarios
@@ -9,12 +10,15 @@ from gvz.tasks import scenario_named, scenarios
 
 @dataclass(frozen=True, kw_only=True)
 class Gallery:
-    """Draw a contact sheet of each scenario: a frame of every named task, same seed and pose."""
+    """Draw a contact sheet of each scenario: by default a frame of every named task, same seed and pose."""
 
     out: Path = Path("gallery")
-    """directory for gallery_<scenario>.png"""
+    """directory for <kind>_<scenario>.png"""
     scenario: str | None = None
     """only this one"""
+    kind: Literal["gallery", "varied", "augmented"] = "gallery"
+    """gallery: the named tasks; varied: the first maps of the task `varied`; augmented: the default task under each
+    augmentation that a learner can train with"""
     moving: bool = False
     """also agents.webp: the scripted agents of all scenarios at play, level after level"""
 
@@ -28,7 +32,7 @@ class Gallery:
         from gvz.evaluation.gallery import write_contact_sheet, write_moving_picture
 
         for scenario in chosen:
-            print(write_contact_sheet(scenario, self.out))
+            print(write_contact_sheet(scenario, self.out, self.kind))
         if self.moving:
             print(write_moving_picture(self.out / "agents.webp"))
         return 0

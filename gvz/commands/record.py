@@ -1,8 +1,9 @@
 """`gvz record`: an episode as a video."""
 
 import contextlib
+import math
 import sys
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from gvz.core.errors import ConfigError
-from gvz.evaluation.choice import ANY_EPISODE, EpisodeChoice, make_panel
+from gvz.evaluation.choice import ANY_EPISODE, EpisodeChoice
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -25,7 +26,7 @@ ANIMATION_S = 20.0
 
 @dataclass(frozen=True, kw_only=True)
 class Record:
-    """Record an evaluation episode as a video: the game, and beside it action, values, rewards and score.
+    """Record an evaluation episode as a video: the game with action, values, rewards and score.
 
     Needs no display. An .mp4 shows every tic and needs the extra: pip install 'gvizdoom[video]'; .webp and .gif show
     every decision.
@@ -45,9 +46,11 @@ class Record:
     def run(self) -> int:
         """Plays and writes; says how the episode ended."""
         from gvz.env import TICS_PER_SECOND
+        from gvz.evaluation.panel import Panel
         from gvz.evaluation.play import Episode
         from gvz.evaluation.playback import perform
         from gvz.evaluation.video import add_to_tensorboard, check_video_file, write_video
+        from gvz.run.bars import Bar, Bars
 
         if self.seconds is not None and self.seconds <= 0:
             raise ConfigError(f"--seconds: got {self.seconds:g}, want more than 0")
@@ -55,7 +58,8 @@ class Record:
             raise ConfigError("--tensorboard: want a run directory and an --out that ends with .gif, which it can show")
         check_video_file(self.out)
         player_spec, task = self.choice.resolve()
-        panel, every_tic = make_panel(player_spec, task), self.out.suffix == ".mp4"
+        name, every_tic = player_spec.identity["player"], self.out.suffix == ".mp4"
+        panel = Panel(name, task, player_spec.env)
         seconds = self.seconds if every_tic or self.seconds is not None else ANIMATION_S
         timeout = task.scenario.timeout_frames(player_spec.env.profile)
         num_tics = timeout if seconds is None else min(timeout, int(seconds * TICS_PER_SECOND))
@@ -63,13 +67,13 @@ class Record:
 
         def pictures() -> "Generator[Image, None, None]":
             episode = Episode(task.id, self.choice.episode, self.choice.seed)
-            with contextlib.closing(perform(player_spec, episode)) as moments, _progress(num_tics) as advance:
+            with contextlib.closing(perform(player_spec, episode)) as moments, Bars(math.inf) as bars:
                 for moment in moments:
                     shown[:] = [moment]
                     picture = panel.draw(moment)
                     if every_tic or moment.decided or moment.terminated or moment.truncated:
                         yield picture
-                    advance(moment.frames)
+                    bars.show([Bar(name=task.id, done=moment.frames, total=num_tics, unit="tics")])
                     if moment.frames >= num_tics:
                         return
 
@@ -85,20 +89,8 @@ class Record:
             add_to_tensorboard(self.out, events, f"episode/{task.id}", player_spec.identity["num_updates"])
         [last] = shown
         how = "died" if last.terminated else "reached the time-out" if last.truncated else "was cut off"
-        print(f"{self.out}: {player_spec.identity['player']} {how} at tic {last.frames}, score {last.score:g}")
+        print(f"{self.out}: {name} {how} at tic {last.frames}, score {last.score:g}")
         return 0
 
 
 COMMAND = Record
-
-
-@contextlib.contextmanager
-def _progress(total: int) -> Generator[Callable[[int], None], None, None]:
-    """A bar on a terminal; gives the function that moves it."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    with Progress(console=console, disable=not console.is_terminal) as bar:
-        shown = bar.add_task("tics", total=total)
-        yield lambda done: bar.update(shown, completed=done)

@@ -2,18 +2,18 @@
 
 import json
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import tyro
 
 from gvz.evaluation.selection import ALL_TASKS, TaskSelection
 from gvz.scenarios.base import Task
-from gvz.tasks import named_tasks
+from gvz.tasks import TaskSet, named_tasks
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tasks:
-    """List the tasks: level, training and test sets, scenario and attributes."""
+    """List the tasks: level, training, test and gate sets, scenario and attributes."""
 
     select: Annotated[TaskSelection, tyro.conf.arg(name="")] = ALL_TASKS
     json: bool = False
@@ -42,11 +42,11 @@ COMMAND = Tasks
 
 
 def task_row(task: Task) -> dict[str, Any]:
-    """What is to be said of a task, as JSON types."""
+    """The row of a task, as JSON types."""
     from gvz.registration import gymnasium_id
 
     scenario = task.scenario
-    sets = [name for name in scenario.splits if task in named_tasks(scenario.id, split=name)]
+    sets = [name for name in get_args(TaskSet) if task in named_tasks(scenario.id, split=name)]
     return {
         "task": task.id,
         "scenario": scenario.id,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from gvz.core.errors import ConfigError, ResourceError
-from gvz.evaluation.choice import ANY_EPISODE, EpisodeChoice, make_panel
+from gvz.evaluation.choice import ANY_EPISODE, EpisodeChoice
 from gvz.scenarios.base import Task
 
 if TYPE_CHECKING:
@@ -70,10 +70,11 @@ class Watch:
         import numpy as np
 
         from gvz.env import TICS_PER_SECOND
+        from gvz.evaluation.panel import Panel
         from gvz.evaluation.play import Episode
         from gvz.evaluation.playback import perform
 
-        panel, begun_s = make_panel(player_spec, task), time.monotonic()
+        panel, begun_s = Panel(player_spec.identity["player"], task, player_spec.env), time.monotonic()
         with contextlib.closing(perform(player_spec, Episode(task.id, episode, self.choice.seed))) as moments:
             for moment in moments:
                 if moment.frames == 0:

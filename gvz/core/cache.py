@@ -1,4 +1,4 @@
-"""Where things are kept that can always be made again: compiled maps and compiled XLA programs."""
+"""The cache: compiled maps and compiled XLA programs, which can always be made again."""
 
 import os
 from pathlib import Path

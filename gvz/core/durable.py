@@ -1,4 +1,4 @@
-"""What is written survives a power cut: data and names are on the disk before anything vouches for them. Tier 0."""
+"""Files that survive a power cut: their data and names are on the disk before other files refer to them. Tier 0."""
 
 import os
 from pathlib import Path

@@ -1,8 +1,8 @@
 """The vocabulary of sizes that game, actors and learner share, and the check of a field's type."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -20,8 +20,6 @@ LABEL_CLASSES = (
 """What a pixel of the buffer `labels` shows, by number: 0 walls and the HUD; 1 floors and ceilings; 2 the agent's
 own weapon; 3 living enemies; 4 their missiles and fire; 5 what heals; 6 vials of poison; 7 decorations, lights and
 corpses; 8 puffs, smoke and blood; 9 anything that is in none of our scenarios. A number never changes its meaning."""
-SimplePlayer = Literal["random", "idle", "sweep", "scripted"]
-"""who plays without training"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -132,6 +130,16 @@ def typed(kind: Any, value: Any, where: str) -> Any:
     if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
         raise ConfigError(f"{where}: got {value!r}, want {kind.__name__}")
     return value
+
+
+def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """(dotted name, value) of every field of a dataclass and of the dataclasses in it."""
+    for field in fields(config):
+        value = getattr(config, field.name)
+        if is_dataclass(value):
+            yield from leaves(value, f"{prefix}{field.name}.")
+        else:
+            yield prefix + field.name, value
 
 
 def check_types(config: Any, prefix: str) -> None:

@@ -4,6 +4,9 @@ Arguments that are simply wrong raise `ValueError`; a broken own invariant is an
 can go wrong at run time has a class here, and its message says what, where, got, wanted, and what to do.
 """
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+
 
 class GvzError(Exception):
     """Base of all errors of this project."""
@@ -51,6 +54,12 @@ class WaitTimeoutError(GvzError, TimeoutError):
 
 class WorkerError(GvzError):
     """An actor failed for good: its restart budget is spent. Carries the last log lines in its message."""
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """A hint at the known name that is most similar to `name`, for an error message; empty if none is similar."""
+    match = get_close_matches(name, list(known), n=1)
+    return f" (did you mean {match[0]!r}?)" if match else ""
 
 
 class ResourceError(GvzError):

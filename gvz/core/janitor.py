@@ -1,17 +1,16 @@
-"""Finds and removes what dead processes of ours left behind. Linux; standard library and gvz.core.errors only.
+"""Finds and removes what dead processes of ours left behind. Linux; standard library and gvz.core only.
 
 A SIGKILL leaves private directories and, at worst, engines with their files in /dev/shm. (Our own shared memory is
-anonymous: the kernel frees it.) So whoever makes such a thing first writes a record of it: a small private file that
-names the thing and its owner (process id and start time, so that a reused process id is not mistaken for its owner).
-`clean_dead_instances` removes what belongs to records whose owner is gone, and nothing else: nothing is ever matched
-by a pattern of names.
+anonymous: the kernel frees it.) Before a process makes a private directory, it writes a record of it, a small private
+file, and holds the lock of that file until the directory is gone. The kernel unlocks it when the process ends, however
+it ends. `clean_dead_instances` removes what belongs to unlocked records, and nothing else: nothing is ever matched by a
+pattern of names. A fork of an owner holds the lock, too.
 
 Every step can be repeated and any number of janitors may run at once: names are never used twice.
 """
 
 import contextlib
 import ctypes
-import hashlib
 import json
 import os
 import re
@@ -23,36 +22,34 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from pathlib import Path
-from typing import Literal
+from typing import IO
 
+from gvz.core import records
 from gvz.core.errors import ResourceError, WaitTimeoutError
 
-Kind = Literal["engine", "directory"]
-"""engine: `name` is an engine's private directory; directory: a `temporary_directory`."""
-
 SHM_DIR = Path("/dev/shm")
-ENGINE_DIR_PREFIX = "gvz-engine-"
-"""every engine's private directory is called so, followed by random letters"""
+PREFIX = "gvz-engine-"
+"""every private directory is called so, followed by random letters"""
 INSTANCE_FILE = "instance"
-"""in an engine's private directory: "pid start id" of its engine, written by `gvz/engine/wrapper.py`"""
+"""in an engine's private directory: "pid start id" of the engine, written by `gvz/engine/wrapper.py`"""
 ARGUMENTS_FILE = "arguments"
-"""likewise: the engine's arguments, which its launcher writes first of all, some milliseconds before it is an engine"""
+"""in the same directory: the engine's arguments; the launcher writes them milliseconds before it becomes the engine"""
 LAUNCHER_FILE = "launch"
-"""likewise: what the client launches"""
+"""in the same directory: the script that the client launches"""
 _LAUNCH_S = 0.05
-"""from fork to the first line of a launcher, and ample"""
-_PARTIAL_S = 3600.0
-"""a record that is half written after this time will never be whole"""
+"""more than a launcher takes from its fork to its first line"""
 KILL_TIMEOUT_S = 30.0
 """the kernel takes milliseconds over a SIGKILL, unless the process hangs in a driver or in a dead file system"""
-_ENGINE_SHM_PREFIXES = ("ViZDoomSM", "ViZDoomMQCtr", "ViZDoomMQDoom")
-_DIRECTORY = re.compile(r"gvz-[a-z]+-[0-9a-f]{16}")
-"""names of a `temporary_directory`"""
+QUEUE_PREFIXES = ("ViZDoomMQCtr", "ViZDoomMQDoom")
+"""of the names of an engine's message queues in shared memory, each followed by its instance id"""
+_ENGINE_SHM_PREFIXES = ("ViZDoomSM", *QUEUE_PREFIXES)
 _PR_SET_PDEATHSIG = 1
 _UNREADABLE = (OSError, ValueError, KeyError, TypeError, RecursionError)
 """what reading a damaged or forged record ends in"""
+_held: dict[Path, IO[str]] = {}
+"""the records of this process, locked"""
 
 
 def runtime_dir() -> Path:
@@ -79,44 +76,42 @@ def runtime_dir() -> Path:
     return path
 
 
-def record(kind: Kind, name: str) -> None:
-    """Notes that this process owns `name`. Call it before the thing is made: no instant is unprotected."""
-    _check_name(kind, name)
-    path = _record_path(kind, name)
-    content = {
-        "kind": kind,
-        "name": name,
-        "owner_pid": os.getpid(),
-        "owner_start": process_start(os.getpid()),
-        "machine": _machine(),
-    }
-    # whole or not at all: a janitor never sees half a record
-    partial = path.with_suffix(".partial")
-    with os.fdopen(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
-        json.dump(content, file)
-    partial.replace(path)
-
-
-def forget(kind: Kind, name: str) -> None:
-    """Takes back this process's `record`; call it after the thing is gone. Unknown names are ignored."""
-    _record_path(kind, name).unlink(missing_ok=True)
+def make_directory() -> Path:
+    """A new private directory of this process; who is done with it calls `clean_engine` and `forget`."""
+    directory = Path(tempfile.gettempdir()) / (PREFIX + secrets.token_hex(8))
+    record(directory)
+    directory.mkdir(mode=0o700)
+    return directory
 
 
 @contextlib.contextmanager
-def temporary_directory(purpose: str) -> Generator[Path, None, None]:
-    """A private directory that goes with the block; if this process is killed in it, with the next start.
-
-    Args:
-        purpose: becomes a part of its name; lower-case letters.
-    """
-    directory = Path(tempfile.gettempdir()) / f"gvz-{purpose}-{secrets.token_hex(8)}"
-    record("directory", str(directory))
+def temporary_directory() -> Generator[Path, None, None]:
+    """A private directory that goes with the block; if this process is killed in it, with the next start."""
+    directory = make_directory()
     try:
-        directory.mkdir(mode=0o700)
         yield directory
     finally:
-        shutil.rmtree(directory, ignore_errors=True)
-        forget("directory", str(directory))
+        clean_engine(directory)
+        forget(directory)
+
+
+def record(directory: Path) -> None:
+    """Notes that this process owns a private directory. Call it before that is made: no instant is unprotected."""
+    path = _record_path(_checked(directory))
+    file = _opened(path)
+    while not (records.lock(file) and path.exists()):  # a janitor has taken the empty file for one of a dead owner
+        file.close()
+        file = _opened(path)
+    json.dump({"directory": str(directory), "owner_pid": os.getpid()}, file)
+    file.flush()
+    _held[directory] = file
+
+
+def forget(directory: Path) -> None:
+    """Takes back this process's `record`; call it after the directory is gone. Unknown ones are ignored."""
+    _record_path(directory).unlink(missing_ok=True)
+    if directory in _held:
+        _held.pop(directory).close()
 
 
 def clean_dead_instances() -> list[str]:
@@ -126,17 +121,13 @@ def clean_dead_instances() -> list[str]:
         One line for each thing removed, and for each record that cannot be read (these are left alone).
     """
     done: list[str] = []
-    for partial in runtime_dir().glob("*.partial"):  # whose writer was killed: writing takes no millisecond
-        with contextlib.suppress(FileNotFoundError):
-            if time.time() - partial.stat().st_mtime > _PARTIAL_S:
-                partial.unlink()
     for path in _records():
         try:
-            dead = _read_dead(path)
-            if dead is not None:
-                kind, name = dead
-                done += _REMOVE[kind](name)
-                path.unlink(missing_ok=True)
+            with path.open() as file:
+                if records.lock(file):  # else its owner lives, or another janitor is at it
+                    directory = _read(file)
+                    done += [] if directory is None else clean_engine(directory)
+                    path.unlink(missing_ok=True)
         except FileNotFoundError:
             continue  # its owner, or another janitor, was faster
         except _UNREADABLE as error:
@@ -148,10 +139,9 @@ def dead_instances() -> list[str]:
     """What `clean_dead_instances` would remove: private directories."""
     found: list[str] = []
     for path in _records():
-        with contextlib.suppress(*_UNREADABLE):
-            dead = _read_dead(path)
-            if dead is not None:
-                found.append(dead[1])
+        with contextlib.suppress(*_UNREADABLE), path.open() as file:
+            directory = _read(file) if records.lock(file) else None
+            found += [] if directory is None else [str(directory)]
     return found
 
 
@@ -159,16 +149,25 @@ def _records() -> list[Path]:
     return sorted(runtime_dir().glob("*.json"))
 
 
-def _read_dead(path: Path) -> tuple[str, str] | None:
-    """Kind and name of a record whose owner is gone; None if it lives, or belongs to another machine."""
-    content = json.loads(path.read_text())
-    kind, name, pid, start = (content[key] for key in ("kind", "name", "owner_pid", "owner_start"))
-    _check_name(kind, name)
-    if type(pid) is not int or type(start) is not int:
-        raise ValueError(f"got owner {pid!r} of start {start!r}, want two numbers")
-    if content["machine"] != _machine() or process_start(pid) == start:
-        return None
-    return kind, name
+def _record_path(directory: Path) -> Path:
+    return runtime_dir() / f"{directory.name}.json"
+
+
+def _opened(path: Path) -> IO[str]:
+    return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600), "w")
+
+
+def _read(file: IO[str]) -> Path | None:
+    """The directory that a record names; None if its owner died before it wrote the name."""
+    text = file.read()
+    return _checked(Path(json.loads(text)["directory"])) if text else None
+
+
+def _checked(directory: Path) -> Path:
+    """A damaged or forged record must not make us delete anything but what we could have made."""
+    if not directory.is_absolute() or not directory.name.startswith(PREFIX) or ".." in str(directory):
+        raise ValueError(f"record of {str(directory)!r}: want an absolute path that ends in {PREFIX}...")
+    return directory
 
 
 def clean_engine(directory: Path) -> list[str]:
@@ -187,7 +186,10 @@ def clean_engine(directory: Path) -> list[str]:
             done.append(f"engine {instance_id} (pid {pid})")
         for prefix in _ENGINE_SHM_PREFIXES:
             done += _unlink_shm(prefix + instance_id)
-    return done + _remove_directory(directory)
+    if directory.is_dir():
+        shutil.rmtree(directory, ignore_errors=True)
+        done.append(f"directory {directory}")
+    return done
 
 
 def read_instance(directory: Path) -> tuple[int, int, str] | None:
@@ -206,7 +208,8 @@ def _launched_or_orphaned(directory: Path) -> list[str]:
     """What may be in shared memory of an engine that died before it noted who it is.
 
     Its client makes two message queues and then launches it. The launcher's first line notes their id. If the client
-    died before that line, they are what nobody holds any more of the queues that are younger than the launcher.
+    died before that line, the queues are found in another way: they are younger than the launcher, and no process has
+    mapped them.
     """
     launcher = directory / LAUNCHER_FILE
     if not launcher.exists():
@@ -241,10 +244,10 @@ def _unheld_queues(since_s: float) -> set[str]:
     return names
 
 
-def die_with_parent(parent_pid: int) -> None:
-    """Has the kernel kill this process when the thread that started it ends; exits if that has happened already."""
+def die_with_parent(parent_pid: int, number: int = signal.SIGKILL) -> None:
+    """Has the kernel send this process a signal when the thread that started it ends; exits if that has happened."""
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL) != 0:
+    if libc.prctl(_PR_SET_PDEATHSIG, number) != 0:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
     if os.getppid() != parent_pid:
         sys.exit(1)
@@ -286,48 +289,9 @@ def _arguments(pid: int) -> list[str]:
         return []
 
 
-def _machine() -> str:
-    """Process ids mean something only within one boot and one pid namespace (containers may share a disk)."""
-    boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-    return f"{boot} {Path('/proc/self/ns/pid').readlink()}"
-
-
-def _record_path(kind: Kind, name: str) -> Path:
-    digest = hashlib.blake2b(name.encode(), digest_size=8).hexdigest()
-    return runtime_dir() / f"{kind}-{os.getpid()}-{process_start(os.getpid())}-{digest}.json"
-
-
-def _check_name(kind: str, name: str) -> None:
-    """A damaged or forged record must not make us delete anything but what we could have made."""
-    if kind == "engine":
-        good = Path(name).is_absolute() and Path(name).name.startswith(ENGINE_DIR_PREFIX) and ".." not in name
-        wanted = f"an absolute path that ends in {ENGINE_DIR_PREFIX}..."
-    elif kind == "directory":
-        good = Path(name).is_absolute() and ".." not in name and _DIRECTORY.fullmatch(Path(name).name) is not None
-        wanted = "an absolute path that ends in gvz-PURPOSE-0123456789abcdef"
-    else:
-        raise ValueError(f"record of kind {kind!r}: want engine or directory")
-    if not good:
-        raise ValueError(f"record of kind {kind!r}: got name {name!r}, want {wanted}")
-
-
 def _unlink_shm(name: str) -> list[str]:
     try:
         (SHM_DIR / name).unlink()
     except FileNotFoundError:
         return []
     return [f"shared memory {name}"]
-
-
-def _remove_directory(directory: Path) -> list[str]:
-    if not directory.is_dir():
-        return []
-    shutil.rmtree(directory, ignore_errors=True)
-    return [f"directory {directory}"]
-
-
-_REMOVE: dict[str, Callable[[str], list[str]]] = {
-    "engine": lambda name: clean_engine(Path(name)),
-    "directory": lambda name: _remove_directory(Path(name)),
-}
-"""by kind: removes what a record names, returns a line for each thing removed"""

@@ -1,21 +1,24 @@
 """Discovery by file name: the modules of a package are its registry."""
 
 import pkgutil
+import sys
+from functools import cache
 from importlib import import_module
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
 from types import ModuleType
+from typing import Any
+
+from gvz.core.errors import ConfigError, nearest
 
 
 def discover(package: str) -> dict[str, ModuleType]:
-    """Imports every module directly inside `package`.
+    """Imports every module directly inside `package`, a dotted name such as "gvz.scenarios".
 
     Adding a scenario or an agent is adding a file; no list of names is kept by hand. A module that registers
     something says so by a constant that the caller looks for (`SCENARIO`, ...).
 
-    Args:
-        package: dotted name, for example "gvz.scenarios".
-
-    Returns:
-        File name without suffix -> module, in alphabetical order. Sub-packages are left out.
+    Returns: file name without suffix -> module, in alphabetical order. Sub-packages are left out.
 
     Raises:
         ImportError: the package or one of its modules cannot be imported.
@@ -26,3 +29,42 @@ def discover(package: str) -> dict[str, ModuleType]:
         raise ValueError(f"discover: {package!r} is a module, want a package")
     names = sorted(info.name for info in pkgutil.iter_modules(parent.__path__) if not info.ispkg)
     return {name: import_module(f"{package}.{name}") for name in names}
+
+
+def find(package: str, constant: str, name: str, field: str) -> Any:
+    """What `name` names: the constant of a module of `package`, or of a Python file anywhere.
+
+    A file is executed once in a process: whoever asks again gets the same object.
+
+    Args:
+        package: dotted name, for example "learner.encoders".
+        constant: what such a module sets, for example "ENCODER".
+        name: a module's file name without suffix, or a path that ends in .py.
+        field: the field of the configuration that `name` was read from; errors begin with it.
+
+    Raises:
+        ConfigError: no such module or file, or the file does not set the constant.
+    """
+    if name.endswith(".py"):
+        file = Path(name).resolve()
+        if not file.is_file():
+            raise ConfigError(f"{field}: no file {file}; give a path from here, or an absolute one")
+        module = _module_in_file(file)
+        if not hasattr(module, constant):
+            raise ConfigError(f"{field}: {file} does not set {constant}, want a line `{constant} = ...` at its end")
+        return getattr(module, constant)
+    found = {n: getattr(m, constant) for n, m in discover(package).items() if hasattr(m, constant)}
+    if name not in found:
+        raise ConfigError(
+            f"{field}: got {name!r}{nearest(name, found)}, want one of {', '.join(found)}, or the path of a file, "
+            "./mine.py"
+        )
+    return found[name]
+
+
+@cache
+def _module_in_file(file: Path) -> ModuleType:
+    name = f"file_{file.stem}"
+    module = sys.modules[name] = ModuleType(name)
+    SourceFileLoader(name, str(file)).exec_module(module)
+    return module

@@ -1,7 +1,8 @@
-"""Ends a process whose main loop is stuck where no Python code of its own can time it out: in a call into the device's
-runtime, or in C code that holds the interpreter's lock. Standard library only.
+"""A clock that leaves out our own pauses, and a watchdog for a process that hangs. Standard library only.
 
-The clock is in a process of its own: `python watchdog.py WHO TIMEOUT_S`. A thread of the watched process stays silent
+`Watchdog` ends a process whose main loop is stuck where no Python code of its own can time it out: in a call into the
+device's runtime, or in C code that holds the interpreter's lock. Its clock is in a process of its own, `python
+watchdog.py WHO TIMEOUT_S`. A thread of the watched process stays silent
 while C code holds the lock. `faulthandler.dump_traceback_later` does not need the lock, but its clock goes on while the
 process is stopped, so that a process that is continued after a long stop would be ended at once.
 """
@@ -15,12 +16,32 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import TracebackType
 
 _LAST_SIGNAL = signal.SIGVTALRM
-"""writes the stacks and ends the process. Nobody else's: Slurm sends USR1 and USR2, pytest-timeout ALRM"""
+"""writes the stacks and ends the process. Not used by others: Slurm sends USR1 and USR2, pytest-timeout ALRM"""
 _DUMP_TIMEOUT_S = 5.0
 """for the stacks; then SIGKILL"""
+
+
+class AwakeClock:
+    """Counts the seconds in which this process looked at it.
+
+    A process that was stopped (Ctrl-Z, a paused container) or busy for a while has heard nothing of the others in that
+    time, and that is not their silence. So the time between two looks counts as `longest_s` at most.
+
+    Attributes:
+        now_s: seconds that count, at the last look.
+    """
+
+    def __init__(self, longest_s: float):
+        self.now_s, self._longest_s, self._looked_s = 0.0, longest_s, time.monotonic()
+
+    def look(self) -> float:
+        """Seconds that count, now."""
+        time_s = time.monotonic()
+        self.now_s += min(time_s - self._looked_s, self._longest_s)
+        self._looked_s = time_s
+        return self.now_s
 
 
 class Watchdog:
@@ -43,7 +64,7 @@ class Watchdog:
         os.close(reading)
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._process.kill()
         self._process.wait()
         os.close(self._writing)
@@ -61,17 +82,13 @@ class Watchdog:
 def _watch(who: str, timeout_s: float) -> None:
     """Reads signs of life from standard input until its other end is closed; ends the parent if they stay away."""
     parent, period_s = os.getppid(), timeout_s / 20
-    silent_s, before_s = 0.0, time.monotonic()
-    while silent_s <= timeout_s:
+    clock, heard_s = AwakeClock(2 * period_s), 0.0
+    while (silent_s := clock.look() - heard_s) <= timeout_s:
         beating = bool(select.select([sys.stdin], [], [], period_s)[0])
         if beating and not os.read(sys.stdin.fileno(), 4096):
             return
-        now_s = time.monotonic()
-        if beating:
-            silent_s = 0.0
-        elif not _is_stopped(parent):  # two periods at most: this process may have been stopped as well
-            silent_s += min(now_s - before_s, 2 * period_s)
-        before_s = now_s
+        if beating or _is_stopped(parent):
+            heard_s = clock.look()
     print(
         f"error: {who} gave no sign of life for {silent_s:.0f} s and is ended; the stacks of its threads, the newest "
         "call first:",

@@ -1,10 +1,11 @@
 """One ViZDoom engine: a process, its private directory, its shared memory. The only importer of vizdoom.
 
-What is known of ViZDoom 1.3 and decides the shape of this file:
+These facts about ViZDoom 1.3 explain this file:
 - An engine that fails before its first frame takes the client process with it (the library reads a null
   pointer). So nothing here ends an engine that is still starting, and a file that was never loaded before is first
   loaded in a sub-process (gvz/engine/probe.py).
-- An engine that is killed later makes the blocked call raise: so a hung engine is ended by killing it.
+- When an engine is killed later, the call that waits for it raises, if no lock is lost with it (gvz/engine/
+  queue_locks.py). So a hung engine is ended by a kill.
 - After the player's death there is no state; single variables can still be read.
 """
 
@@ -12,7 +13,6 @@ import contextlib
 import mmap
 import os
 import signal
-import time
 import weakref
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
@@ -25,6 +25,8 @@ import numpy as np
 from gvz.core import janitor
 from gvz.core.errors import ConfigError, EngineError
 from gvz.engine import process as engine_process
+from gvz.engine import queue_locks
+from gvz.wad.lumps import read_wad
 
 if TYPE_CHECKING:
     from vizdoom import DoomGame, GameState
@@ -32,7 +34,9 @@ if TYPE_CHECKING:
 
 _START_ATTEMPTS = 3
 _LOG_BYTES = 2**20
-"""the engine prints a few lines an episode; beyond this size its log is emptied"""
+"""a log larger than this is emptied; the engine prints a few lines per episode"""
+_MAP_VARIABLE = "gvz_map"
+"""the engine's console variable that names the map of the next episode"""
 _OVERRIDE = Path("_vizdoom.cfg")
 """ViZDoom loads a file of this name in the working directory over everything that was configured"""
 
@@ -61,19 +65,15 @@ class EngineConfig:
     """fill state.labels_buffer, u8[H W], and state.labels"""
     automap: bool = False
     """fill state.automap_buffer, u8[H W 3]"""
-    objects: bool = False
-    """fill state.objects"""
     start_tic: int = 1
     """the tic at which an episode starts; those before it pass without an action"""
-    skill: int = 3
-    """difficulty of the game, 1..5"""
     start_timeout_s: float = 60.0
-    """an engine that has not started by then is given up"""
+    """after this time the start of an engine is given up"""
     step_timeout_s: float = 10.0
-    """an engine that has not answered by then is killed; less than actors' heartbeat_timeout_s, so that a stuck engine
-    costs its episode and not its actor"""
+    """an engine that does not answer in this time is killed. Less than actors' heartbeat_timeout_s, so that a stuck
+    engine ends its episode and not its actor"""
     log: Path | None = None
-    """where the engine's output goes; default a file in its private directory"""
+    """file for the engine's output; by default one in its private directory"""
 
 
 class Engine:
@@ -107,25 +107,48 @@ class Engine:
         instance = janitor.read_instance(directory)
         assert instance is not None, "an engine that answered has written its instance file"
         self.pid, self._process_start, self.instance_id = instance
+        self._queues = queue_locks.mapped(self.instance_id)
+        self._map_name = config.map_name
+        self._lumps = frozenset[str]()  # names in the file; read when another map than the first is wanted
         self._variables = game.get_available_game_variables()
         self.screen = _map_screen(game, self.instance_id)
         engine_process.watch(self)
 
-    def new_episode(self, seed: int) -> "GameState":
+    def new_episode(self, seed: int, map_name: str | None = None) -> "GameState":
         """Starts an episode that depends on nothing but the map, `seed` in [0, 2^32) and the actions.
 
+        `map_name` is a map of the configured file; by default it is the map of the episode before.
+
         Raises:
-            EngineError: the engine died or did not answer, or the player is dead at once.
+            EngineError: the engine died or did not answer, or the player is dead at once; the file has no such map.
         """
         with self._answering("new_episode"):
             if self.log.stat().st_size > _LOG_BYTES:
                 os.truncate(self.log, 0)
-            self._game.set_seed(seed)
+            if map_name not in (None, self._map_name):
+                self._go_to(map_name)
+            self._game.set_seed(seed)  # last: it holds for one load of a map
             self._game.new_episode()
             state = _state(self._game)
         if state is None:
             raise EngineError(f"engine {self._name}: the episode of seed {seed} ended before it began")
         return state
+
+    def _go_to(self, map_name: str) -> None:
+        """Has the next episode begin on another map of the file.
+
+        ViZDoom's own way is `set_doom_map`. It holds Python's interpreter lock while the map loads, so the watchdog
+        could not end an engine that hangs there. So the engine is told once that its map is what a console variable
+        says; new episodes, which do not hold the lock, go there.
+        """
+        if not self._lumps:
+            self._lumps = frozenset(lump.name for lump in read_wad(self.config.wad.read_bytes()))
+            self._game.send_game_command(f"set {_MAP_VARIABLE} {self._map_name}")
+            self._game.set_doom_map(f"${_MAP_VARIABLE}")  # the map that it is on
+        if map_name not in self._lumps:  # ViZDoom would ask for it without end
+            raise EngineError(f"engine {self._name}: got the map {map_name}, want one of the file {self.config.wad}")
+        self._game.send_game_command(f"set {_MAP_VARIABLE} {map_name}")
+        self._map_name = map_name
 
     def step(self, buttons: Sequence[float], tics: int) -> "GameState | None":
         """`advance`, then `state`."""
@@ -133,20 +156,15 @@ class Engine:
         return self.state()
 
     def advance(self, buttons: Sequence[float], tics: int) -> bool:
-        """Holds the buttons for `tics` tics, or until the player dies.
+        """Holds the buttons, one number each, for `tics` game tics or until the player dies.
 
-        Args:
-            buttons: one number a button, in the order of the configuration.
-            tics: how long, in game tics.
-
-        Returns:
-            Whether the episode goes on.
+        Returns: whether the episode goes on.
 
         Raises:
             EngineError: the engine died or did not answer.
         """
-        # `_answering`, written out: this is the hot path, and a context manager costs a microsecond and a half
-        self.deadline = time.monotonic() + self.config.step_timeout_s
+        # the code of `_answering`: this is the hot path, and a context manager takes 1.5 microseconds
+        self.deadline = engine_process.deadline(self.config.step_timeout_s)
         try:
             self._game.make_action(buttons, tics)
             return not self._game.is_episode_finished()
@@ -156,7 +174,7 @@ class Engine:
             self.deadline = None
 
     def state(self) -> "GameState | None":
-        """A copy of everything there is to see, or None once the player is dead."""
+        """A copy of the game's state, or None once the player is dead."""
         return _state(self._game)
 
     def variables(self) -> list[float]:
@@ -199,9 +217,14 @@ class Engine:
                 os.kill(self.pid, signal.SIGKILL)
 
     def kill_overdue(self) -> None:
-        """The watchdog's: ends the engine because it has not answered in time; the blocked call raises."""
+        """For the watchdog: kills the engine because it has not answered in time; the waiting call raises."""
         self._overdue = True
         self.kill()
+
+    def free_waiting_call(self) -> None:
+        """For the watchdog: a call that waits for a lock of the dead engine gets it, and raises."""
+        if janitor.process_start(self.pid) != self._process_start:
+            queue_locks.free(self._queues)
 
     def close(self) -> None:
         """Ends process, shared memory and private directory; `screen` is a private copy then. May be called again."""
@@ -211,7 +234,7 @@ class Engine:
     @contextlib.contextmanager
     def _answering(self, what: str) -> Generator[None, None, None]:
         self._require_running(what)
-        self.deadline = time.monotonic() + self.config.step_timeout_s
+        self.deadline = engine_process.deadline(self.config.step_timeout_s)
         try:
             yield
         except _vizdoom_errors() as error:
@@ -254,22 +277,22 @@ def _make_game(config: EngineConfig) -> "DoomGame":
         sizes = ", ".join(f"{width}x{height}" for width, height in screen_resolutions())
         raise ConfigError(f"env.render_width, render_height: got {config.width}x{config.height}, want one of {sizes}")
     game = vizdoom.DoomGame()
-    # said, because else a doom2.wad in the working directory would be taken
+    # explicit: by default ViZDoom would load a doom2.wad from the working directory
     game.set_doom_game_path(str(Path(vizdoom.root_path, "freedoom2.wad")))
     game.set_doom_scenario_path(str(config.wad.resolve()))
     game.set_doom_map(config.map_name)
-    game.set_doom_skill(config.skill)
+    game.set_doom_skill(3)
     game.set_available_buttons([_member(vizdoom.Button, name) for name in config.buttons])
     game.set_available_game_variables([_member(vizdoom.GameVariable, name) for name in config.variables])
     game.set_screen_resolution(getattr(vizdoom.ScreenResolution, f"RES_{config.width}X{config.height}"))
-    game.set_screen_format(vizdoom.ScreenFormat.RGB24)  # [H W C] as it is: nobody transposes
+    game.set_screen_format(vizdoom.ScreenFormat.RGB24)  # already [H W C]
     game.set_depth_buffer_enabled(config.depth)
     game.set_labels_buffer_enabled(config.labels)
     game.set_automap_buffer_enabled(config.automap)
     if config.automap:  # the whole map, north up, as large as fits; by default it is cut off round the agent
         game.set_automap_mode(vizdoom.AutomapMode.WHOLE)
         game.add_game_args("+viz_am_center 1 +am_followplayer 0")
-    game.set_objects_info_enabled(config.objects)
+    game.set_objects_info_enabled(False)
     game.set_window_visible(False)
     game.set_render_hud(True)
     game.set_render_weapon(config.render_weapon)
@@ -279,7 +302,7 @@ def _make_game(config: EngineConfig) -> "DoomGame":
     game.set_console_enabled(True)  # the engine prints to its log; nothing of it is on the screen
     game.set_sound_enabled(False)
     game.set_mode(vizdoom.Mode.PLAYER)
-    game.set_seed(0)  # of the episode that an engine starts with, which nobody plays
+    game.set_seed(0)  # an engine starts with an episode of its own, which is not played
     game.set_episode_start_time(config.start_tic)
     game.set_episode_timeout(0)  # the environment's, not the engine's: at its time-out the engine has no state
     return game
@@ -293,7 +316,7 @@ def _start(config: EngineConfig) -> "tuple[DoomGame, Path, Path]":
     while True:
         attempt += 1
         game = _make_game(config)
-        directory = engine_process.make_directory()
+        directory = janitor.make_directory()
         log = config.log or directory / "engine.log"
         game.set_doom_config_path(str(directory / "vizdoom.ini"))
         try:

@@ -1,7 +1,6 @@
-"""Loads a scenario file in a sub-process, where an engine that cannot start does no harm.
+"""Loads a scenario file in a sub-process, because an engine that cannot start crashes its client.
 
-An engine that fails before its first frame takes its client with it. So a file is loaded here once before it is
-trusted. `python -m gvz.engine.probe` is the sub-process.
+A file is loaded here once before any other process loads it. `python -m gvz.engine.probe` is the sub-process.
 """
 
 import contextlib
@@ -26,7 +25,7 @@ from gvz.wad.stock import engine_directory
 _FAULTS = re.compile(
     r"unknown|tried to register|script error|runaway script|no map|not found|execution could not continue", re.I
 )
-"""what ZDoom prints, and then goes on as if nothing was wrong"""
+"""ZDoom prints such a line, and goes on"""
 _SCRIPT_ERROR = "Script error"
 _ALONE_S = 20.0
 _MEMORY_BYTES = 4 * 2**30
@@ -35,15 +34,7 @@ _NUM_PLACES = 8
 
 
 def probe_wad(wad: Path, map_name: str = "MAP01", timeout_s: float = 60.0) -> str:
-    """Starts an engine on a file, plays two seconds of its map, reads the log.
-
-    Args:
-        wad: scenario file.
-        map_name: the map that must be in it.
-        timeout_s: for the whole of it.
-
-    Returns:
-        The engine's log.
+    """Starts an engine on a scenario file, plays two seconds of its map and returns the engine's log.
 
     Raises:
         EngineError: it crashed, did not finish in time, or its log shows a fault; the message has the log's lines.
@@ -54,24 +45,16 @@ def probe_wad(wad: Path, map_name: str = "MAP01", timeout_s: float = 60.0) -> st
         raise EngineError(f"{wad}: not a scenario file: {error}") from error
     if map_name not in lumps:
         raise EngineError(f"{wad}: no map {map_name}, only {', '.join(lumps[:8])}; the engine would play another one")
-    with janitor.temporary_directory("probe") as directory:
+    with janitor.temporary_directory() as directory:
         log = directory / "engine.log"
-        command = [
-            sys.executable,
-            "-m",
-            "gvz.engine.probe",
-            str(os.getpid()),
-            str(wad),
-            map_name,
-            str(log),
-            str(timeout_s),
-        ]
+        arguments = (os.getpid(), wad, map_name, log, timeout_s)
+        command = [sys.executable, "-m", "gvz.engine.probe", *map(str, arguments)]
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
         except subprocess.TimeoutExpired as error:
             raise EngineError(f"{wad}: not loaded within {timeout_s:g} s{log_tail(log)}") from error
         finally:
-            janitor.clean_dead_instances()  # a crashed client cleans up nothing
+            janitor.clean_dead_instances()  # a crashed client removes nothing
         text = log.read_text(errors="replace") if log.exists() else ""
         faults = _faults(text)
         if done.returncode < 0 and not faults:

@@ -1,29 +1,28 @@
-"""Start and end of an engine's process: private directory, launch script, start-up limit, watchdog, removal.
+"""The start and the end of an engine's process: launch script, limits on starts, watchdog, removal.
 
 Knows processes and files, not vizdoom: the game it starts is any object with `init` and `close`.
 """
 
 import contextlib
 import ctypes
-import fcntl
 import os
-import secrets
 import shlex
 import shutil
 import sys
-import tempfile
 import threading
 import time
 import weakref
 from collections.abc import Generator, Sequence
 from pathlib import Path
-from typing import IO, Protocol
+from typing import Protocol
 
-from gvz.core import janitor
+from gvz.core import janitor, records
 from gvz.core.errors import EngineError, ResourceError
+from gvz.core.watchdog import AwakeClock
+from gvz.engine import queue_locks
 
 _START_LOCKS = tuple(f"start-{place}" for place in range(min(8, max(2, os.cpu_count() or 1))))
-"""at most this many engines of one user start at the same time, over all processes; many at once fail (ViZDoom #355)"""
+"""at most this many engines of a user start at the same time, in all processes; more may fail (ViZDoom #355)"""
 _SHM_BYTES = 16 * 2**20
 """free shared memory a start needs: the three files of one engine take 10.8 MB"""
 _LAUNCHER_MODE = 0o700
@@ -40,20 +39,11 @@ class Startable(Protocol):
     def close(self) -> None: ...
 
 
-def make_directory() -> Path:
-    """A new private directory for one engine, known to the janitor before it exists."""
-    directory = Path(tempfile.gettempdir()) / (janitor.ENGINE_DIR_PREFIX + secrets.token_hex(8))
-    janitor.record("engine", str(directory))
-    directory.mkdir(mode=0o700)
-    return directory
-
-
 def write_launcher(directory: Path, engine: Path, log: Path) -> Path:
     """Writes the script that the client library launches in place of the engine (see wrapper.py).
 
-    The client has made its message queues by then, so the script notes their id first of all. It is made again for
-    every engine, because an installed file might not be executable, and its first line might be too long or hold blanks
-    for a `#!` line.
+    The client has made its message queues by then, so the script first notes their id. Every engine has a script of its
+    own: an installed file might not be executable, and its path might be too long for a `#!` line or hold blanks.
 
     Raises:
         EngineError: programs in this directory may not be run.
@@ -73,11 +63,11 @@ def write_launcher(directory: Path, engine: Path, log: Path) -> Path:
 
 
 def start(game: Startable, directory: Path, engine: Path, log: Path, timeout_s: float) -> None:
-    """Has the game launch this engine, and runs `game.init()`, one of few at a time on this machine, with a deadline.
+    """Runs `game.init()`, which launches this engine, with a deadline and with few others at a time on this machine.
 
-    It runs in a thread of its own. Past the deadline that thread is left behind, engine and all: ending an engine
-    that is still starting would crash this process. Should it come up after all, it is closed at once. Whatever else
-    goes wrong, nothing is left, the private directory included.
+    It runs in a thread of its own. After the deadline thread and engine are left alone, because ending an engine that
+    still starts would crash this process; if it starts later, it is closed at once. After all other failures nothing is
+    left, not even the private directory.
 
     Raises:
         ResourceError: not enough free shared memory.
@@ -122,14 +112,14 @@ class _Attempt:
         self._given_up = False
 
     def run(self, timeout_s: float) -> bool:
-        """Returns whether it has come to an end in time."""
+        """Returns whether `init` has ended in time."""
         self._running = True
         self._thread.start()
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
     def give_up(self) -> None:
-        """Ends the engine and removes what it has; at once, or when it has come up."""
+        """Ends the engine and removes what it has: now, or when it has started."""
         with self._lock:
             self._given_up = True
             if not self._running:
@@ -148,37 +138,34 @@ class _Attempt:
 
 @contextlib.contextmanager
 def one_of(lock_names: Sequence[str], deadline: float) -> Generator[None, None, None]:
-    """Holds one of the named locks, which all processes of this user share; a SIGKILL gives it back too.
+    """Holds one of the named locks, which all processes of this user share. After a SIGKILL it is free again, too.
 
     Raises:
         EngineError: none became free before `deadline` (monotonic seconds).
     """
     with contextlib.ExitStack() as stack:
         files = [stack.enter_context((janitor.runtime_dir() / f"{name}.lock").open("w")) for name in lock_names]
-        while not any(_try_lock(file) for file in files):
+        while not any(records.lock(file) for file in files):
             if time.monotonic() > deadline:
                 raise EngineError(f"engine: other processes held {', '.join(lock_names)} for the whole time-out")
             time.sleep(0.005)
         yield
 
 
-def _try_lock(file: IO[str]) -> bool:
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
-
-
 def end(game: Startable, directory: Path) -> None:
-    """Ends an engine and removes what it had. The order matters: with its engine dead, `game.close` cannot hang."""
+    """Ends an engine and removes what it had. The order matters: dead and with free locks, `game.close` cannot hang."""
+    instance = janitor.read_instance(directory)
+    queues = [] if instance is None else queue_locks.mapped(instance[2])
     janitor.clean_engine(directory)
+    if instance is not None:
+        queue_locks.wait_for_death(*instance[:2])
+        queue_locks.free(queues)
     game.close()
-    janitor.forget("engine", str(directory))
+    janitor.forget(directory)
 
 
 def end_if_ours(game: Startable, directory: Path, owner_pid: int) -> None:
-    """`end`; but in a fork of the owner, which inherited the object and not the engine, nothing."""
+    """`end`; in a fork of the owner, which has the object but not the engine, nothing."""
     if os.getpid() == owner_pid:
         end(game, directory)
     else:
@@ -187,27 +174,28 @@ def end_if_ours(game: Startable, directory: Path, owner_pid: int) -> None:
 
 
 def log_tail(log: Path, num_lines: int = 8) -> str:
-    """The last lines of an engine's log, ready to be put behind an error message."""
-    text = ""
-    if log.exists():
-        with log.open("rb") as file:
-            file.seek(max(0, log.stat().st_size - 4096))
-            text = file.read().decode(errors="replace")
-    lines = [line for line in text.splitlines() if line.strip()]
+    """The last lines of an engine's log, to be added to an error message."""
+    lines = records.last_lines(log)
     return "; its last lines:\n  " + "\n  ".join(lines[-num_lines:]) if lines else "; it printed nothing"
 
 
 class Watched(Protocol):
-    """Something with a deadline (monotonic seconds; None: nothing to wait for) that can be killed."""
+    """What can be killed when its deadline, given by `deadline`, has passed (None: nothing to wait for). If it is dead,
+    `free_waiting_call` has a call that waits for it return.
+    """
 
     deadline: float | None
 
     def kill_overdue(self) -> None: ...
 
+    def free_waiting_call(self) -> None: ...
+
 
 _watched: weakref.WeakSet[Watched] = weakref.WeakSet()
 _watched_lock = threading.Lock()
 _watcher: threading.Thread | None = None
+_clock = AwakeClock(_WATCH_PERIOD_S)
+"""an engine is not overdue because this process was stopped and could not take its answer"""
 
 
 def watch(one: Watched) -> None:
@@ -220,18 +208,23 @@ def watch(one: Watched) -> None:
             _watcher.start()
 
 
+def deadline(timeout_s: float) -> float:
+    """For `Watched.deadline`: it is reached no earlier than in this time."""
+    return _clock.now_s + timeout_s + _WATCH_PERIOD_S  # the clock may be a period behind
+
+
 def _watch() -> None:
     while True:
-        before_s = time.monotonic()
         time.sleep(_WATCH_PERIOD_S)
-        if time.monotonic() - before_s > 4 * _WATCH_PERIOD_S:
-            continue  # this process was stopped, so nobody took the engine's answer: it may be there by the next look
-        _kill_overdue()
+        _kill_overdue(_clock.look())
 
 
-def _kill_overdue() -> None:  # a function of its own: asleep, the thread must hold no reference to an engine
+def _kill_overdue(now_s: float) -> None:
+    """A function of its own: asleep, the thread must hold no reference to an engine."""
     with _watched_lock:
         watched = list(_watched)
     for one in watched:
-        if one.deadline is not None and time.monotonic() > one.deadline:
-            one.kill_overdue()
+        if one.deadline is not None:
+            if now_s > one.deadline:
+                one.kill_overdue()
+            one.free_waiting_call()

@@ -1,4 +1,4 @@
-"""Who plays which episode, as the flags of `gvz watch` and `gvz record`."""
+"""The flags of `gvz watch` and `gvz record` that choose a player and an episode."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from gvz.core.env_config import EnvConfig, Profile, SimplePlayer
+from gvz.core.env_config import EnvConfig, Profile
 from gvz.core.errors import ConfigError
+from gvz.evaluation.simple import SimplePlayerName
 from gvz.scenarios.base import Task
 from gvz.tasks import parse_task
 
 if TYPE_CHECKING:
-    from gvz.evaluation.panel import Panel
     from gvz.evaluation.play import PlayerSpec
 
 
@@ -26,7 +26,7 @@ class EpisodeChoice:
         tyro.conf.arg(metavar="[RUN_DIR]", help_behavior_hint=""),
     ] = None
     """a run directory: its policy plays greedily, noise off"""
-    player: SimplePlayer | None = None
+    player: SimplePlayerName | None = None
     """instead: random, idle, or the scenario's simple script"""
     agent: Path | None = None
     """the Python file of the run's agent, if it is in a file of its own: playing executes it"""
@@ -35,7 +35,7 @@ class EpisodeChoice:
     task: str | None = None
     """id, for example seek_and_kill/blue+obstacles; default the run's first training task"""
     episode: int = 0
-    """number of the evaluation episode: the same that `gvz evaluate` plays under this number"""
+    """number of the evaluation episode, as `gvz evaluate` counts them"""
     seed: int = 0
     """base seed of the episode"""
     profile: Profile = "thesis"
@@ -61,24 +61,15 @@ class EpisodeChoice:
                 raise ConfigError("--task: want a task id, for example defend_the_center/gore (gvz tasks lists them)")
             return simple_player(self.player, EnvConfig(profile=self.profile)), parse_task(self.task)
         config = read_run_config(self.run_dir, self.agent)
-        task = config.resolved_tasks()[0] if self.task is None else parse_task(self.task)
+        task = config.table.tasks[0] if self.task is None else parse_task(self.task)
         check_tasks(config, [task])
         found = find_checkpoints(self.run_dir, [self.checkpoint])
         if len(found) > 1:
             raise ConfigError(f"--checkpoint: got {self.checkpoint}, want one of {', '.join(map(str, found))}")
-        if task.scenario != config.resolved_scenario():  # a run's weights are of its own scenario's components
+        if task.scenario not in config.table.scenarios:  # a run's weights are of its own scenario's components
             config = dataclasses.replace(config, env=dataclasses.replace(config.env, reward_weights=()))
         return trained_player(self.run_dir, config, found[0]), task
 
 
 ANY_EPISODE = EpisodeChoice()
-"""before any flag"""
-
-
-def make_panel(player_spec: "PlayerSpec", task: Task) -> "Panel":
-    """The panel that a performance of the player_spec in the task is drawn on."""
-    from gvz.actions import action_buttons
-    from gvz.evaluation.panel import Panel
-
-    buttons = action_buttons(task.scenario, player_spec.env.action_set)
-    return Panel(player_spec.identity["player"], task, player_spec.env.profile, buttons)
+"""the default of every flag"""

@@ -1,6 +1,6 @@
 """Evaluation records as one polars frame: `read_evaluations` is the public reader.
 
-Everything readable is read; what is not is told by name, and never makes the rest unreadable.
+Everything readable is read. What cannot be read is reported by file and line, and does not stop the rest.
 """
 
 import json
@@ -13,10 +13,10 @@ from typing import Any
 
 import polars as pl
 
-from gvz.core.env_config import Profile
+from gvz.core import records
 from gvz.core.errors import ConfigError, TaskError
 from gvz.evaluation.statistics import normalize
-from gvz.run.rundir import RECORD_FILES, START_RECORDS, read_records
+from gvz.run.rundir import RECORD_FILES, START_RECORDS
 from gvz.tasks import Task, parse_task
 
 SUFFIXES = (".jsonl", ".jsonl.gz")
@@ -69,7 +69,7 @@ _IDENTITY = ("run_dir", "player", "params", "profile", "action_set", "frame_skip
 """rows equal in these are one and the same episode"""
 
 _NOT_RECORDS = {"discarded", "work", "checkpoints", "policies", "tensorboard"}
-"""directories of a run that hold no records, or such as do not count"""
+"""directories of a run that hold no records, or only discarded ones"""
 
 _PYTHON_TYPES: dict[pl.DataType, tuple[type, ...]] = {
     pl.String(): (str,),
@@ -145,9 +145,9 @@ def _may_be_evaluation(file: Path) -> bool:
 
 
 def _read_file(file: Path) -> tuple[pl.DataFrame, list[str]]:
-    records, problems = read_records(file)
+    found, problems = records.read(file)
     rows = []
-    for number, row in enumerate(records, 1):
+    for number, row in enumerate(found, 1):
         if wrong := _what_is_wrong(row):
             problems.append(f"{file}, row {number}: {wrong}")
         else:
@@ -241,7 +241,7 @@ def _task_columns(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
             problems.append(f"{task}; its {num_rows} rows have no level")
             rows.append((task_id, profile, task_id.partition("/")[0], None, None, None, None))
             continue
-        bound = task.scenario.upper_bounds.get(_profile(profile))
+        bound = task.scenario.upper_bounds.get("levdoom" if profile == "levdoom" else "thesis")
         most_kills = bound if task.scenario.metric == "kills" else None
         rows.append((task_id, profile, task.scenario.id, task.level, list(task.attributes), bound, most_kills))
     schema = {
@@ -251,10 +251,6 @@ def _task_columns(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
     }
     bounds = {"bound": pl.Float64(), "most_kills": pl.Float64()}
     return pl.DataFrame(rows, schema | bounds, orient="row"), problems
-
-
-def _profile(name: str | None) -> Profile:
-    return "levdoom" if name == "levdoom" else "thesis"
 
 
 @cache

@@ -1,42 +1,34 @@
 """Evaluations on disk: episodes are played and appended to a record file. Those already there are not played again."""
 
-import fcntl
-import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gvz.core.env_config import EnvConfig, SimplePlayer
+from gvz.core import records
+from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError
+from gvz.core.stop import StopRequest
 from gvz.evaluation.play import Episode, PlayerSpec, Row, play
-from gvz.evaluation.players import SIMPLE_PLAYERS, Player, player_env
-from gvz.run.rundir import RECORDS_SCHEMA, read_records
+from gvz.evaluation.players import CLASSES, Player
+from gvz.evaluation.simple import SimplePlayerName, player_env
 from gvz.tasks import Task, parse_task
 
-_ROW_BEGINS = b'{"schema": '
 _ANOTHER_FILE = "move the file aside or give another with --out"
 
 
 def row_identity(player: Mapping[str, Any], env: EnvConfig) -> dict[str, Any]:
-    """What tells one evaluation's rows from another's in the same file: who played, and by which rules.
-
-    Args:
-        player: fields that name the player, `player` among them.
-        env: what it plays in. Sizes are left out: nobody's score depends on what it does not look at.
+    """The fields that distinguish the rows of one evaluation from others in the same file: the player's, `player` among
+    them, and the rules in `env`. Sizes are left out: they are part of the player.
     """
     rules = {name: getattr(env, name) for name in ("profile", "action_set", "frame_skip")}
     return {**player, **rules}
 
 
-def simple_player(kind: SimplePlayer, env: EnvConfig) -> PlayerSpec:
-    """A random, idle or scripted player under the rules of `env`."""
-    env = player_env(kind, env)
-    return PlayerSpec(
-        make_player=SIMPLE_PLAYERS[kind],
-        env=env,
-        identity=row_identity({"player": kind}, env),
-        recycle_episodes=0,
-    )
+def simple_player(name: SimplePlayerName, env: EnvConfig) -> PlayerSpec:
+    """A simple player under the rules of `env`."""
+    env = player_env(name, env)
+    identity = row_identity({"player": name}, env)
+    return PlayerSpec(make_player=CLASSES[name], env=env, identity=identity, recycle_episodes=0)
 
 
 def wanted_episodes(tasks: Sequence[Task], episodes: int, base_seeds: Sequence[int] = (0,)) -> list[Episode]:
@@ -58,14 +50,9 @@ def read_rows(file: Path) -> list[Row]:
     """
     if not file.exists():
         return []
-    data = file.read_bytes()
-    end = data.rfind(b"\n") + 1
-    half = data[end:]
-    if not half.startswith(_ROW_BEGINS[: len(half)]):  # somebody's text: not a byte of it is ours to cut
-        raise ConfigError(f"{file}, last line: got {half[:20]!r}, no row of an evaluation; {_ANOTHER_FILE}")
-    with file.open("r+b") as stream:
-        stream.truncate(end)
-    rows, problems = read_records(file)
+    if line := records.cut_half_row(file):  # somebody's text: not a byte of it is ours to cut
+        raise ConfigError(f"{file}, last line: got {line[:20]!r}, no row of an evaluation; {_ANOTHER_FILE}")
+    rows, problems = records.read(file)
     for number, row in enumerate(rows, 1):
         episode = row.get("task"), row.get("episode"), row.get("base_seed", 0)
         if tuple(map(type, episode)) != (str, int, int):
@@ -83,7 +70,7 @@ def _at_most_the_bound(row: Row) -> Row:
     return {**row, "score": 100 * score / percent, "normalized_score": 100.0}
 
 
-class RecordFile:
+class RecordFile(records.Writer):
     """A record file that this process alone appends to."""
 
     def __init__(self, path: Path):
@@ -92,30 +79,28 @@ class RecordFile:
         Raises:
             ConfigError: it cannot be opened, another process uses it, or it holds something else.
         """
+        super().__init__(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._stream = path.open("a")
-            fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            self._stream.close()
-            raise ConfigError(f"--out: {path} is being written by another process") from error
+            locked = self.lock()
         except OSError as error:
             raise ConfigError(f"--out: {path} cannot be written: {error.strerror}") from error
         try:
+            if not locked:
+                raise ConfigError(f"--out: {path} is being written by another process")
             self.rows = read_rows(path)
         except ConfigError:
             self.close()
             raise
 
     def append(self, row: Row) -> None:
-        """Writes a row and flushes it."""
-        self._stream.write(json.dumps({"schema": RECORDS_SCHEMA, **row}) + "\n")
-        self._stream.flush()
-        self.rows.append({"schema": RECORDS_SCHEMA, **row})
+        """Writes a row and flushes it.
 
-    def close(self) -> None:
-        """Closes the file and gives it free."""
-        self._stream.close()
+        Raises:
+            GvzError: the disk is full, and too many rows wait in memory.
+        """
+        super().append(row)
+        self.rows.append({"schema": records.SCHEMA, **row})
 
 
 def missing_jobs(
@@ -130,14 +115,19 @@ def missing_jobs(
 
 
 def play_and_record(
-    player_specs: Mapping[PlayerSpec, RecordFile], jobs: Iterable[tuple[PlayerSpec, Episode]], *, num_workers: int
+    player_specs: Mapping[PlayerSpec, RecordFile],
+    jobs: Iterable[tuple[PlayerSpec, Episode]],
+    *,
+    num_workers: int,
+    stop: StopRequest | None = None,
 ) -> Iterator[Row]:
     """Plays episodes; each row is on disk before it is yielded.
 
     Raises:
+        KeyboardInterrupt: `stop` was requested.
         GvzError: an episode could not be played.
     """
-    for player_spec, row in play(jobs, num_workers=num_workers):
+    for player_spec, row in play(jobs, num_workers=num_workers, stop=stop):
         player_specs[player_spec].append({**player_spec.identity, **row})
         yield player_specs[player_spec].rows[-1]
 
@@ -153,20 +143,20 @@ def evaluate_player(
     env: EnvConfig | None = None,
     num_workers: int = 0,
 ) -> list[Row]:
-    """Evaluates any player by the benchmark's protocol; called again, it goes on where it was stopped.
+    """Evaluates any player by the benchmark's protocol. A second call resumes what was stopped.
 
     Args:
         make_player: makes it, in each process that plays; picklable unless `num_workers` is 0.
         tasks: tasks or their ids.
         out: record file, JSON lines; may hold other players' rows too.
-        name: of the player; say in it what tells it from others in the same file (agent, seed, checkpoint).
+        name: of the player, unique in the file: with agent, seed and checkpoint.
         episodes: of each task.
-        base_seed: draws another set of episodes; 0 is the one that everybody is compared on.
+        base_seed: another one draws other episodes; comparisons use 0.
         env: what it plays in; default the thesis's.
         num_workers: processes that play; 0 plays in this one.
 
     Returns:
-        All rows asked for, by task and episode, those that the file held before too.
+        The rows of all these episodes, by task and episode, with those that the file held before.
 
     Raises:
         ConfigError, TaskError: an unknown task, or a file that cannot be written.

@@ -1,4 +1,4 @@
-"""A picture of a moment of an episode: the screen, and beside it what the player does and thinks."""
+"""A picture of a moment of an episode: the screen, the player's action and its estimates."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -6,7 +6,8 @@ from functools import cache
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from gvz.core.env_config import Profile
+from gvz.actions import action_buttons
+from gvz.core.env_config import EnvConfig
 from gvz.evaluation.playback import SCREEN_HEIGHT, SCREEN_WIDTH, Moment
 from gvz.evaluation.trained import Values
 from gvz.scenarios.base import Task
@@ -26,28 +27,22 @@ ACCENT: Colour = (255, 184, 77)
 BAR: Colour = (92, 124, 168)
 GOOD: Colour = (110, 200, 120)
 BAD: Colour = (236, 102, 92)
-LEVELS: Sequence[Colour] = ((235, 235, 235), (140, 220, 140), (230, 220, 110), (240, 165, 80), (240, 100, 90))
-"""of the task's level, 0..4; as in the gallery"""
+LEVEL_COLOURS: Sequence[Colour] = ((235, 235, 235), (140, 220, 140), (230, 220, 110), (240, 165, 80), (240, 100, 90))
+"""by the task's level"""
 
 MARGIN = 16
-_METRICS = {"frames_alive": "frames alive", "kills": "kills"}
 
 
 class Panel:
-    """Draws the moments of one episode, in their order.
+    """Draws the moments of one episode, in their order."""
 
-    Args:
-        player: its name.
-        task: that is played.
-        profile: whose time-out and upper bound.
-        action_meanings: buttons of each action.
-    """
-
-    def __init__(self, player: str, task: Task, profile: Profile, action_meanings: Sequence[Sequence[str]]):
+    def __init__(self, player: str, task: Task, env: EnvConfig):
+        """`player` is a name; `env` is what it plays in."""
         self._task = task
-        self._actions = ["+".join(_button(b) for b in held) or "nothing" for held in action_meanings]
-        self._bound = task.scenario.upper_bound(profile)
-        self._timeout = task.scenario.timeout_frames(profile)
+        held = action_buttons(task.scenario, env.action_set)
+        self._actions = ["+".join(buttons).replace("_", " ").lower() or "nothing" for buttons in held]
+        self._bound = task.scenario.upper_bound(env.profile)
+        self._timeout = task.scenario.timeout_frames(env.profile)
         self._value_range = (np.inf, -np.inf)
         self._timeline: list[tuple[int, float | None, float]] = []
         self._reward = 0.0
@@ -73,7 +68,7 @@ class Panel:
         task, middle = self._task, HEAD_HEIGHT / 2
         self._text((MARGIN, middle), task.scenario.title, 20, TEXT, "lm")
         x = MARGIN + _font(20).getlength(task.scenario.title) + 14
-        self._text((x, middle), f"level {task.level}", 16, LEVELS[task.level], "lm")
+        self._text((x, middle), f"level {task.level}", 16, LEVEL_COLOURS[task.level], "lm")
         x += _font(16).getlength(f"level {task.level}") + 14
         size = _fitting(task.name, 16, SCREEN_WIDTH - x)
         self._text((x, middle), task.name, size, FAINT, "lm")
@@ -86,7 +81,7 @@ class Panel:
         self._text((x, y), how, 26, ACCENT, "mm")
 
     def _draw_side(self, moment: Moment) -> None:
-        self._clear((SCREEN_WIDTH, HEAD_HEIGHT, WIDTH, HEIGHT))
+        self._draw.rectangle((SCREEN_WIDTH, HEAD_HEIGHT, WIDTH, HEIGHT), BACKGROUND)
         left, right = SCREEN_WIDTH + MARGIN, WIDTH - MARGIN
         y = self._draw_actions(moment, (left, HEAD_HEIGHT, right, 0))
         if moment.values is not None and moment.values.probabilities is not None and moment.action is not None:
@@ -120,7 +115,7 @@ class Panel:
         return y
 
     def _scale(self, values: np.ndarray | None) -> tuple[float, float]:
-        """Of the bars: what has been seen so far, widened a little, so that bars can be told apart and compared."""
+        """The range of the bars: a little wider than all values so far, so that moments can be compared."""
         if values is not None:
             low, high = self._value_range
             self._value_range = (min(low, float(values.min())), max(high, float(values.max())))
@@ -168,10 +163,10 @@ class Panel:
 
     def _draw_foot(self, moment: Moment) -> None:
         top = HEAD_HEIGHT + SCREEN_HEIGHT
-        self._clear((0, top, SCREEN_WIDTH, HEIGHT))
+        self._draw.rectangle((0, top, SCREEN_WIDTH, HEIGHT), BACKGROUND)
         self._text((MARGIN, top + 40), f"{moment.score:g}", 36, TEXT, "lm")
         x = MARGIN + _font(36).getlength(f"{moment.score:g}") + 10
-        self._text((x, top + 45), f"of {self._bound:g} {_METRICS[self._task.scenario.metric]}", 15, FAINT, "lm")
+        self._text((x, top + 45), f"of {self._bound:g} {self._task.scenario.metric.replace('_', ' ')}", 15, FAINT, "lm")
         percent = f"{100 * moment.score / self._bound:.1f} %    tic {moment.frames} of {self._timeout}"
         self._text((MARGIN, top + 84), percent, 15, FAINT, "lm")
         self._draw_timeline(moment, (330, top + 12, SCREEN_WIDTH - MARGIN, HEIGHT - 12))
@@ -210,9 +205,6 @@ class Panel:
     def _caption(self, at: tuple[float, float], text: str) -> None:
         self._text((at[0], at[1] + 10), text, 13, FAINT, "lm")
 
-    def _clear(self, box: Box) -> None:
-        self._draw.rectangle(box, BACKGROUND)
-
     def _text(self, at: tuple[float, float], text: str, size: float, colour: Colour, anchor: str) -> None:
         self._draw.text(at, text, colour, _font(size), anchor)
 
@@ -227,8 +219,3 @@ def _fitting(text: str, size: float, width: float) -> float:
     while size > 6 and _font(size).getlength(text) > width:
         size -= 1
     return size
-
-
-def _button(name: str) -> str:
-    """TURN_LEFT -> turn left."""
-    return name.replace("_", " ").lower()

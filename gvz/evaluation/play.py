@@ -7,6 +7,7 @@ One game a process. A policy that decides for 4 or 8 games at once would save CP
 not done: rows would depend on the size of the batch, and games that end at different times take some of it back.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import multiprocessing
@@ -23,6 +24,8 @@ from actors.process import one_core
 from gvz.core import janitor
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import EngineError, GvzError, WaitTimeoutError
+from gvz.core.stop import StopRequest
+from gvz.core.watchdog import AwakeClock
 from gvz.evaluation.players import Player
 
 if TYPE_CHECKING:
@@ -32,6 +35,7 @@ Row = dict[str, Any]
 
 EPISODE_TIMEOUT_S = 900.0
 """an episode takes seconds; if none ends within this time, a worker hangs"""
+_POLL_S = 0.2
 MAX_ATTEMPTS = 3
 """times an episode is played again when its engine died"""
 
@@ -46,16 +50,16 @@ class Episode(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class PlayerSpec:
-    """Who plays, and by which rules."""
+    """A player and the rules that it plays by."""
 
     make_player: Callable[[], Player]
     """makes the player in the process that plays; picklable for more than one"""
     env: EnvConfig
     """what it plays in; an evaluation counts rewards by the profile's weights, whatever its own are"""
     identity: Mapping[str, Any]
-    """what every row says of it, `player` (its name) among it; tells its rows from others' in one file"""
+    """fields of each of its rows, with `player` (its name); they distinguish its rows from others' in one file"""
     recycle_episodes: int | None = None
-    """of DoomEnv; 0 for players that do not look at fuzz, the only thing a fresh engine changes"""
+    """of DoomEnv; 0 for players that do not see fuzz, the only thing that a fresh engine changes"""
 
 
 def episode_seed(task: str, episode: int, base_seed: int = 0) -> int:
@@ -109,20 +113,24 @@ def play_episode(env: "DoomEnv", player: Player, episode: int, base_seed: int = 
     raise EngineError(f"{task}, evaluation episode {episode} (seed {seed}): the engine died {MAX_ATTEMPTS} times")
 
 
-def play(jobs: Iterable[tuple[PlayerSpec, Episode]], *, num_workers: int) -> Iterator[tuple[PlayerSpec, Row]]:
+def play(
+    jobs: Iterable[tuple[PlayerSpec, Episode]], *, num_workers: int, stop: StopRequest | None = None
+) -> Iterator[tuple[PlayerSpec, Row]]:
     """Plays episodes and yields their rows as they come, in no order.
 
     Args:
-        jobs: what to play; task after task, so that a game is started as seldom as can be.
+        jobs: what to play; it is sorted by task, so that few games are started.
         num_workers: processes; 0 plays here.
+        stop: where a signal is noted. Python drops an exception that a signal raises inside a destructor.
 
     Raises:
+        KeyboardInterrupt: `stop` was requested.
         GvzError: a worker died.
         WaitTimeoutError: no worker finished an episode for EPISODE_TIMEOUT_S; they are killed.
     """
     ordered = sorted(jobs, key=lambda job: (repr(job[0].env), job[1].task, id(job[0]), job[1][1:]))
     if num_workers == 0:
-        with _Worker() as worker:
+        with contextlib.closing(_Worker()) as worker:
             for player_spec, episode in ordered:
                 yield player_spec, worker.play(player_spec, id(player_spec), episode)
         return
@@ -140,7 +148,7 @@ def play(jobs: Iterable[tuple[PlayerSpec, Episode]], *, num_workers: int) -> Ite
     left = len(futures)
     try:
         while left:
-            future = finished.get(timeout=EPISODE_TIMEOUT_S)
+            future = _next(finished, stop)
             yield futures[future], future.result()
             left -= 1
     except BrokenProcessPool as error:
@@ -151,12 +159,23 @@ def play(jobs: Iterable[tuple[PlayerSpec, Episode]], *, num_workers: int) -> Ite
             "are left, and can be played by the same command"
         ) from None
     finally:
-        if left:  # nobody will take what they are at, and one may hang
+        if left:  # their episodes are not wanted any more, and one of them may hang
             for worker in set(multiprocessing.active_children()) - others:
                 worker.kill()
         executor.shutdown(wait=True, cancel_futures=True)
         if left:
             janitor.clean_dead_instances()
+
+
+def _next(finished: queue.SimpleQueue[Future[Row]], stop: StopRequest | None) -> Future[Row]:
+    """Raises queue.Empty after EPISODE_TIMEOUT_S; time in which this process was stopped does not count."""
+    clock = AwakeClock(2 * _POLL_S)
+    while clock.look() < EPISODE_TIMEOUT_S:
+        if stop is not None and stop.requested:
+            raise KeyboardInterrupt
+        with contextlib.suppress(queue.Empty):
+            return finished.get(timeout=_POLL_S)
+    raise queue.Empty
 
 
 class _Worker:
@@ -179,21 +198,16 @@ class _Worker:
         if self._env is None or (self._env.task.id, self._env.config, self._recycle_episodes) != wanted:
             from gvz.env import DoomEnv
 
-            self._close()
+            self.close()
             self._recycle_episodes = player_spec.recycle_episodes
             self._env = DoomEnv(task, env, recycle_episodes=player_spec.recycle_episodes)
         return self._env
 
-    def _close(self) -> None:
+    def close(self) -> None:
+        """Ends the game."""
         if self._env is not None:
             self._env.close()
         self._env = None
-
-    def __enter__(self) -> "_Worker":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._close()
 
 
 _worker = _Worker()

@@ -1,8 +1,8 @@
-"""An evaluation episode, moment by moment, to be shown or filmed.
+"""An evaluation episode, moment by moment, for a window or a video.
 
-What a player sees must not depend on how large the picture is: so the episode is played in two games side by side, the
-player's own, and one that draws large and takes the same actions, tic by tic. The engine is deterministic; should
-the two ever part, that is an error.
+What a player sees must not depend on the size of the picture. So the episode is played in two games: the player's own,
+and one that draws a large picture and takes the same actions, tic by tic. The engine is deterministic; if
+the two games differ at a tic, that is an error.
 """
 
 import dataclasses
@@ -24,32 +24,32 @@ SCREEN_WIDTH, SCREEN_HEIGHT = 800, 450
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Moment:
-    """What there is to be seen at a game tic."""
+    """What a picture of a game tic shows."""
 
     screen: np.ndarray
     """uint8[SCREEN_HEIGHT, SCREEN_WIDTH, 3]"""
     decided: bool
     """the player has just decided, or the episode has just begun: `action`, `values` are new"""
-    action: int | None
+    action: int | None = None
     """that is held; None before the first"""
-    values: Values | None
-    """what a policy thought of its actions when it decided"""
+    values: Values | None = None
+    """the policy's estimates of its actions when it decided"""
     reward: float
     """since the episode's start"""
     reward_components: dict[str, float]
-    """likewise"""
+    """by name, since the episode's start"""
     score: float
     frames: int
     """tics since the episode's start"""
-    terminated: bool
-    truncated: bool
+    terminated: bool = False
+    truncated: bool = False
 
 
 def perform(player_spec: PlayerSpec, episode: Episode) -> Generator[Moment, None, None]:
     """Plays an episode: the first moment is its start, then comes one a tic.
 
     Raises:
-        EngineError: an engine died, or the two games parted.
+        EngineError: an engine died, or the two games differ.
     """
     seed = episode_seed(*episode)
     player = player_spec.make_player()
@@ -96,14 +96,13 @@ def perform(player_spec: PlayerSpec, episode: Episode) -> Generator[Moment, None
 def _moment(stage: DoomEnv, info: dict[str, Any], rewards: dict[str, float], **fields: Any) -> Moment:
     screen = stage.render()
     assert screen is not None, "the stage renders"
-    defaults: dict[str, Any] = {"action": None, "values": None, "terminated": False, "truncated": False}
     return Moment(
         screen=screen,
         reward=sum(rewards.values()),
         reward_components=rewards,
         score=float(info["score"]),
         frames=int(info["episode_frames"]),
-        **{**defaults, **fields},
+        **fields,
     )
 
 
@@ -115,6 +114,6 @@ def _check_together(episode: Episode, info: dict[str, Any], stage_info: dict[str
     for name in ("episode_frames", "score", "variables"):
         if info[name] != stage_info[name]:
             raise EngineError(
-                f"{where}: the game that draws parted from the player's: {name}: got {stage_info[name]}, "
+                f"{where}: the game that draws differs from the player's: {name}: got {stage_info[name]}, "
                 f"want {info[name]}"
             )

@@ -1,16 +1,16 @@
-"""Who plays an evaluation episode: chance, nobody, a sweep, a script, or any function of frames. The policy of a
-training run is in gvz.evaluation.trained.
+"""Players of evaluation episodes that need no training run, and players made of a function of frames. The policies of
+training runs are in gvz.evaluation.trained.
+
+A new simple player is a class here, a line in CLASSES, and a line in gvz.evaluation.simple.
 """
 
-import dataclasses
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Protocol, assert_never
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from actors.preprocess import push_frame, start_stack
-from gvz.core.env_config import EnvConfig, SimplePlayer
-from gvz.evaluation.scripted import ScriptedPlayer, SweepPlayer
+from gvz.evaluation.scenarios.base import Sight, script_of, sweep
 
 if TYPE_CHECKING:
     from gvz.env import DoomEnv
@@ -33,7 +33,14 @@ class Player(Protocol):
         ...
 
 
-class RandomPlayer:
+class _Blind:
+    """A player that ignores observations."""
+
+    def observe(self, observation: "Observation", info: dict[str, Any]) -> None:
+        """Ignores it."""
+
+
+class RandomPlayer(_Blind):
     """Uniformly random actions."""
 
     def begin(self, env: "DoomEnv", observation: "Observation", info: dict[str, Any], seed: int) -> None:
@@ -43,11 +50,8 @@ class RandomPlayer:
     def act(self) -> int:
         return int(self._rng.integers(self._num_actions))
 
-    def observe(self, observation: "Observation", info: dict[str, Any]) -> None:
-        """Ignores observations."""
 
-
-class IdlePlayer:
+class IdlePlayer(_Blind):
     """Presses nothing: the action without a button, which `action_set="combinations"` has in every scenario."""
 
     def begin(self, env: "DoomEnv", observation: "Observation", info: dict[str, Any], seed: int) -> None:
@@ -56,8 +60,48 @@ class IdlePlayer:
     def act(self) -> int:
         return self._action
 
+
+class SweepPlayer(_Blind):
+    """Plays each scenario by a fixed sequence of buttons. Wants action_set="buttons"."""
+
+    def begin(self, env: "DoomEnv", observation: "Observation", info: dict[str, Any], seed: int) -> None:
+        self._actions = _action_of_button(env)
+        self._buttons = sweep(env.task.scenario.id)
+
+    def act(self) -> int:
+        return self._actions[next(self._buttons)]
+
+
+class ScriptedPlayer:
+    """Plays each scenario by its script. Wants an environment with buffers=("labels",) and action_set="buttons"."""
+
+    def begin(self, env: "DoomEnv", observation: "Observation", info: dict[str, Any], seed: int) -> None:
+        self._env, self._actions = env, _action_of_button(env)
+        self._sight = Sight(env.config.render_width, env.config.render_height, np.random.default_rng(seed))
+        self.observe(observation, info)
+        self._buttons = script_of(env.task.scenario.id)(self._sight)
+
+    def act(self) -> int:
+        return self._actions[next(self._buttons)]
+
     def observe(self, observation: "Observation", info: dict[str, Any]) -> None:
-        """Nobody is there to look."""
+        assert isinstance(observation, dict)
+        self._sight.screen = observation["screen"]
+        self._sight.labels = self._env.labels()
+        self._sight.variables = info["variables"]
+
+
+def _action_of_button(env: "DoomEnv") -> dict[str, int]:
+    return {held[0]: action for action, held in enumerate(env.action_meanings) if held}
+
+
+CLASSES: Mapping[str, Callable[[], Player]] = {
+    "random": RandomPlayer,
+    "idle": IdlePlayer,
+    "sweep": SweepPlayer,
+    "scripted": ScriptedPlayer,
+}
+"""of the simple players, by name"""
 
 
 class FramePlayer:
@@ -82,31 +126,3 @@ class FramePlayer:
     def observe(self, observation: "Observation", info: dict[str, Any]) -> None:
         assert isinstance(observation, np.ndarray)
         push_frame(self._stack, observation)
-
-
-SIMPLE_PLAYERS: Mapping[SimplePlayer, Callable[[], Player]] = {
-    "random": RandomPlayer,
-    "idle": IdlePlayer,
-    "sweep": SweepPlayer,
-    "scripted": ScriptedPlayer,
-}
-
-
-def player_env(kind: SimplePlayer, env: EnvConfig) -> EnvConfig:
-    """`env` as a player of this kind needs it.
-
-    All but the scripted one look at nothing: they get the smallest screen, which changes no score. The idle one needs
-    the action without a button, the scripted one labels on the default screen, by whose pixels it aims.
-    """
-    blind = dataclasses.replace(env, render_width=160, render_height=120)
-    match kind:
-        case "random":
-            return blind
-        case "idle":
-            return dataclasses.replace(blind, action_set="combinations")
-        case "sweep":
-            return dataclasses.replace(blind, action_set="buttons")
-        case "scripted":
-            return dataclasses.replace(env, action_set="buttons", buffers=("labels",))
-        case _:
-            assert_never(kind)

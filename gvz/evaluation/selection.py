@@ -1,22 +1,22 @@
-"""Which tasks a command is about, as flags."""
+"""The flags that choose tasks."""
 
 from dataclasses import dataclass
 
 from gvz.core.errors import ConfigError
-from gvz.scenarios.base import Split, Task
-from gvz.tasks import named_tasks, parse_task
+from gvz.scenarios.base import Task
+from gvz.tasks import TaskSet, named_tasks, parse_task
 
 
 @dataclass(frozen=True, kw_only=True)
 class TaskSelection:
-    """Which tasks: all 76 named ones, or these."""
+    """Which tasks: all named ones, or these."""
 
     tasks: tuple[str, ...] = ()
     """ids, for example defend_the_center/gore+mossy_bricks; not only named tasks"""
     scenario: str | None = None
     """the named tasks of this scenario"""
-    split: Split | None = None
-    """the named tasks of this training or test set"""
+    split: TaskSet | None = None
+    """the named tasks of this training or test set; gate: those of level 2 that are in none of them"""
     level: int | None = None
     """the named tasks of this level, 0..4"""
 
@@ -24,7 +24,7 @@ class TaskSelection:
         """The tasks.
 
         Raises:
-            TaskError: an unknown name. ConfigError: ids beside another choice, or a choice that no task fits.
+            TaskError: an unknown name. ConfigError: ids together with another choice, or no task fits the choice.
         """
         if not self.tasks:
             chosen = named_tasks(scenario=self.scenario, level=self.level, split=self.split)

@@ -3,7 +3,7 @@
 The unit of comparison between agents is the *run*: one training seed. Scores of several runs on several tasks are a
 matrix [S, T] (seeds, tasks) of means over evaluation episodes; the statistics are of such matrices, with any axes
 before, and of plain vectors, which are matrices of one run. An interval is a percentile bootstrap interval, and it
-says what was resampled: episodes (how well are these very agents known?) or runs (what would other seeds give?).
+says what was resampled: episodes (how precise are the scores of these agents?) or runs (what would other seeds give?).
 
 Source: thesis 3.1 (performance indicators, eq. 3.1 and 3.2) and 3.1.4 (solved); Agarwal et al. 2021, "Deep RL at the
 edge of the statistical precipice" (interquartile mean, probability of improvement, stratified bootstrap).
@@ -30,6 +30,9 @@ task has agents of its own (Agarwal et al.'s stratified bootstrap)."""
 
 SOLVED_EPISODES = 10
 """consecutive time-outs after which a survival task counts as solved"""
+
+CONFIDENCE = 0.95
+"""of all intervals"""
 
 _BLOCK_NUMBERS = 4_000_000
 """numbers that a bootstrap holds at once"""
@@ -97,7 +100,7 @@ def difference(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
 
 
 def generalization_gap(scores: np.ndarray, num_train: int) -> np.ndarray:
-    """How much of what was learned is lost on other tasks: mean over training tasks less mean over test tasks.
+    """How much lower the score is on other tasks: mean over training tasks minus mean over test tasks.
 
     Args:
         scores: [..., S, T] of the same runs on both, the training tasks first.
@@ -107,7 +110,7 @@ def generalization_gap(scores: np.ndarray, num_train: int) -> np.ndarray:
 
 
 def probability_of_improvement(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
-    """How probable it is that a run of ours beats one of theirs on a task, ties counting half; mean over tasks.
+    """The probability that a run of ours beats one of theirs on a task; ties count half; mean over tasks.
 
     Args:
         ours: [..., S, T].
@@ -140,36 +143,13 @@ def solved(timed_out: np.ndarray) -> bool:
 # ------------------------------------------------------------------------------------------------- intervals
 
 
-def bootstrap(
-    strata: Sequence[np.ndarray],
-    statistic: Statistic = mean,
-    *,
-    confidence: float = 0.95,
-    num_resamples: int = 2000,
-    seed: int = 0,
-) -> Estimate:
-    """A statistic of all scores together, with a percentile interval from a stratified bootstrap.
-
-    Args:
-        strata: scores of each stratum (task, or task and seed), float[E]; each is resampled within itself.
-        statistic: of the scores of all strata as one vector.
-        confidence: of the interval, 0..1.
-        num_resamples: bootstrap samples.
-        seed: of the resampling.
+def bootstrap(strata: Sequence[np.ndarray], *, num_resamples: int = 2000, seed: int = 0) -> Estimate:
+    """Mean over strata (tasks) with its 95% interval; the episodes of each, float[E], are resampled within it.
 
     Raises:
-        ValueError: no strata, an empty one, or a confidence outside 0..1.
+        ValueError: no strata, or an empty one.
     """
-    if not strata or any(len(s) == 0 for s in strata):
-        raise ValueError("bootstrap: got no scores in a stratum, want at least one in each")
-    rng = np.random.default_rng(seed)
-    arrays = [np.asarray(s, np.float64) for s in strata]
-    together = np.concatenate(arrays)
-    samples = []
-    for num in _blocks(num_resamples, len(together)):
-        drawn = np.concatenate([a[rng.integers(len(a), size=(num, len(a)))] for a in arrays], axis=1)
-        samples.append(statistic(drawn[:, None, :]))
-    return _percentile_interval(statistic(together), np.concatenate(samples), confidence)
+    return bootstrap_runs([[strata]], redraw=["episodes"], num_resamples=num_resamples, seed=seed)
 
 
 def bootstrap_runs(
@@ -177,7 +157,6 @@ def bootstrap_runs(
     statistic: Statistic = mean,
     *,
     redraw: Sequence[Redraw],
-    confidence: float = 0.95,
     num_resamples: int = 2000,
     seed: int = 0,
 ) -> Estimate:
@@ -187,13 +166,12 @@ def bootstrap_runs(
         groups: what the statistic takes, each resampled by itself: one scenario's runs each, or ours and theirs.
         statistic: f(scores [..., S, T] of each group) -> [...].
         redraw: what is resampled in each group. Of a single run only episodes can be.
-        confidence: of the interval, 0..1.
         num_resamples: bootstrap samples.
         seed: of the resampling.
 
     Raises:
-        ValueError: no groups, a cell without episodes, runs with different numbers of tasks, not as many `redraw` as
-            groups, or a confidence outside 0..1.
+        ValueError: no groups, a cell without episodes, runs with different numbers of tasks, or not as many `redraw` as
+            groups.
     """
     for cells in groups:
         if not cells or not cells[0] or any(len(run) != len(cells[0]) or not all(map(len, run)) for run in cells):
@@ -203,7 +181,8 @@ def bootstrap_runs(
     rng = np.random.default_rng(seed)
     means = [_means(cells) for cells in groups]
     drawn = [_redrawn(cells, how, num_resamples, rng) for cells, how in zip(groups, redraw, strict=True)]
-    return _percentile_interval(statistic(*means), statistic(*drawn), confidence)
+    low, high = np.quantile(statistic(*drawn), [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return Estimate(value=float(statistic(*means)), low=float(low), high=float(high))
 
 
 def _means(cells: Cells) -> np.ndarray:
@@ -229,19 +208,6 @@ def _redrawn(cells: Cells, redraw: Redraw, num_resamples: int, rng: np.random.Ge
 
 def _means_of_redrawn(scores: np.ndarray, num_resamples: int, rng: np.random.Generator) -> np.ndarray:
     scores = np.asarray(scores, np.float64)
-    blocks = _blocks(num_resamples, len(scores))
+    most = max(1, _BLOCK_NUMBERS // len(scores))
+    blocks = [min(most, num_resamples - done) for done in range(0, num_resamples, most)]
     return np.concatenate([scores[rng.integers(len(scores), size=(num, len(scores)))].mean(axis=1) for num in blocks])
-
-
-def _blocks(num_resamples: int, width: int) -> list[int]:
-    """`num_resamples` cut into blocks of at most _BLOCK_NUMBERS numbers."""
-    most = max(1, _BLOCK_NUMBERS // width)
-    whole, rest = divmod(num_resamples, most)
-    return [most] * whole + [rest] * (rest > 0)
-
-
-def _percentile_interval(value: np.ndarray, samples: np.ndarray, confidence: float) -> Estimate:
-    if not 0 < confidence < 1:
-        raise ValueError(f"bootstrap: got confidence {confidence}, want between 0 and 1")
-    low, high = np.quantile(samples, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return Estimate(value=float(value), low=float(low), high=float(high))

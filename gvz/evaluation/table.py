@@ -1,32 +1,18 @@
-"""What an evaluation ends with: the score of each task, for a person and for a program."""
+"""What an evaluation ends with: the score of each task, as rows for a program and as a table for a person."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from gvz.evaluation.play import Row
-from gvz.evaluation.statistics import Estimate, bootstrap, bootstrap_runs
+from gvz.evaluation.statistics import bootstrap
 from gvz.tasks import Task
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Score:
-    """A mean with its 95% bootstrap interval."""
-
-    task: Task | None
-    """None: the mean over tasks"""
-    episodes: int
-    score: Estimate | None
-    """in the task's metric; None of several tasks"""
-    percent: Estimate
-    """of the upper bound"""
-    own_kills: Estimate | None = None
-    """where the score is kills: those by the player itself"""
-
-
-def scores(rows: Sequence[Row], identity: Mapping[str, Any], tasks: Sequence[Task], episodes: int) -> list[Score]:
+def score_rows(
+    rows: Sequence[Row], identity: Mapping[str, Any], tasks: Sequence[Task], episodes: int
+) -> list[dict[str, Any]]:
     """The score of each task that was played; then, of more than one, the mean over tasks.
 
     Args:
@@ -34,69 +20,54 @@ def scores(rows: Sequence[Row], identity: Mapping[str, Any], tasks: Sequence[Tas
         identity: the rows that belong to the evaluation.
         tasks: in the order to list them.
         episodes: only episodes 0 .. episodes - 1.
+
+    Returns:
+        JSON types: task, level and score (None of several tasks), episodes, normalized_score, and player_kills (None
+        where the score is not kills); each estimate with the ends of its 95% interval, as score_low and score_high.
     """
     chosen = [row for row in rows if identity.items() <= row.items() and row["episode"] < episodes]
-    found, percents, own = [], [], []
-    for task in tasks:
-        mine = [row for row in chosen if row["task"] == task.id]
-        if mine:
-            percents.append(np.array([row["normalized_score"] for row in mine]))
-            if task.scenario.metric == "kills":
-                own.append(np.array([row["player_kills"] for row in mine]))
-            found.append(
-                Score(
-                    task=task,
-                    episodes=len(mine),
-                    score=bootstrap([np.array([row["score"] for row in mine])]),
-                    percent=bootstrap(percents[-1:]),
-                    own_kills=bootstrap(own[-1:]) if task.scenario.metric == "kills" else None,
-                )
-            )
-    if len(found) > 1:
-        found.append(
-            Score(
-                task=None,
-                episodes=sum(map(len, percents)),
-                score=None,
-                percent=bootstrap_runs([[percents]], redraw=["episodes"]),
-                own_kills=bootstrap_runs([[own]], redraw=["episodes"]) if len(own) == len(percents) else None,
-            )
-        )
-    return found
+    by_task = {task: [row for row in chosen if row["task"] == task.id] for task in tasks}
+    played = {task: mine for task, mine in by_task.items() if mine}
+    found = [_score_row({task: mine}) for task, mine in played.items()]
+    return [*found, _score_row(played)] if len(played) > 1 else found
 
 
-def score_lines(found: Sequence[Score]) -> list[str]:
-    """A table of scores, the head first; the names, which can be long, come last.
+def _score_row(played: Mapping[Task, Sequence[Row]]) -> dict[str, Any]:
+    [task, *others] = played
+    row: dict[str, Any] = {
+        "task": None if others else task.id,
+        "level": None if others else task.level,
+        "episodes": sum(map(len, played.values())),
+    }
+    known = {
+        "score": not others,
+        "normalized_score": True,
+        "player_kills": all(task.scenario.metric == "kills" for task in played),
+    }
+    for name, is_known in known.items():
+        columns = [np.array([one[name] for one in mine]) for mine in played.values()] if is_known else []
+        e = bootstrap(columns) if is_known else None
+        row |= {name: e and e.value, f"{name}_low": e and e.low, f"{name}_high": e and e.high}
+    return row
+
+
+def score_lines(found: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A table of `score_rows`, the head first; the names, which can be long, come last.
 
     Where the score of a task is kills, a column has those by the player itself.
     """
-    kills = any(one.own_kills is not None for one in found)
+
+    def text(row: Mapping[str, Any], name: str) -> str:
+        value, low, high = row[name], row[f"{name}_low"], row[f"{name}_high"]
+        return "" if value is None else f"{value:.1f} [{low:.1f}, {high:.1f}]"
+
+    kills = any(row["player_kills"] is not None for row in found)
     own = f"{'own kills [95%]':20}  " if kills else ""
     lines = [f"{'mean score [95%]':23}  {'% of the bound [95%]':20}  {own}episodes  level  task"]
-    for one in found:
-        name = f"mean of {len(found) - 1} tasks" if one.task is None else one.task.id
-        level = "" if one.task is None else one.task.level
-        score = "" if one.score is None else one.score
-        own = f"{'' if one.own_kills is None else one.own_kills!s:20}  " if kills else ""
-        lines.append(f"{score!s:23}  {one.percent!s:20}  {own}{one.episodes:8}  {level!s:>5}  {name}")
+    for row in found:
+        name = row["task"] or f"mean of {len(found) - 1} tasks"
+        level = "" if row["level"] is None else row["level"]
+        own = f"{text(row, 'player_kills'):20}  " if kills else ""
+        means = f"{text(row, 'score'):23}  {text(row, 'normalized_score'):20}"
+        lines.append(f"{means}  {own}{row['episodes']:8}  {level!s:>5}  {name}")
     return lines
-
-
-def score_row(one: Score) -> dict[str, Any]:
-    """A score as JSON types: task and level (None of several tasks), episodes, and score, normalized_score and
-    player_kills (None where the score is not kills) with the ends of their intervals.
-    """
-    return {
-        "task": None if one.task is None else one.task.id,
-        "level": None if one.task is None else one.task.level,
-        "episodes": one.episodes,
-        **_with_ends("score", one.score),
-        **_with_ends("normalized_score", one.percent),
-        **_with_ends("player_kills", one.own_kills),
-    }
-
-
-def _with_ends(name: str, estimate: Estimate | None) -> dict[str, float | None]:
-    e = estimate
-    values = (None,) * 3 if e is None else (e.value, e.low, e.high)
-    return dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))

@@ -1,10 +1,9 @@
 """The policies of a training run as players, read from its run directory.
 
-Nothing that a run directory holds or names is executed or unpickled; an agent in a file of its own is asked for by
-name.
+Nothing that a run directory holds or names is executed or unpickled. Who wants to play an agent that is in a file of
+its own names that file.
 """
 
-import dataclasses
 import hashlib
 import json
 import os
@@ -17,11 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from actors.preprocess import push_frame, start_stack
+from actors.preprocess import ObservationBatch
 from gvz.core.errors import CheckpointError, ConfigError
 from gvz.evaluation.episode_log import row_identity
 from gvz.evaluation.play import PlayerSpec
-from gvz.run.config import RunConfig, config_from_dict
+from gvz.run.config import RunConfig
+from gvz.run.config_files import config_from_dict
 from gvz.tasks import Task
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Values:
-    """What a policy thinks its actions are worth: discounted reward to come."""
+    """A policy's estimates of its actions: discounted reward to come."""
 
     q_values: np.ndarray
     """f32[A]"""
@@ -45,52 +45,40 @@ class Values:
 def read_run_config(run_dir: Path, agent_file: Path | None = None) -> RunConfig:
     """The configuration a run was trained with.
 
-    Args:
-        run_dir: of the run.
-        agent_file: the Python file of its agent, if that is none of learner/agents; playing executes it.
+    `agent_file` is the Python file of its agent, if that is none of learner/agents; playing executes it.
 
     Raises:
         ConfigError: not a run directory, its config.json is damaged, or its agent is in a file that is not given.
     """
     file = run_dir / "config.json"
     try:
-        config = config_from_dict(json.loads(file.read_text()))
+        return config_from_dict(json.loads(file.read_text()), agent_file)
     except OSError as error:
         raise ConfigError(f"{run_dir} is not a run directory ({file.name}: {error.strerror})") from error
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{file} cannot be read: {error}") from error
-    if not config.agent.name.endswith(".py"):
-        return config
-    if agent_file is None:
-        raise ConfigError(
-            f"{run_dir}: its agent is a Python file ({config.agent.name}), which a run directory alone never gets "
-            f"executed; if you trust that file, name it: --agent {config.agent.name}"
-        )
-    return dataclasses.replace(config, agent=dataclasses.replace(config.agent, name=str(agent_file)))
 
 
 def check_tasks(config: RunConfig, tasks: Sequence[Task]) -> None:
     """Raises ConfigError for tasks that the run's policy cannot play."""
-    trained = [task.id for task in config.resolved_tasks()]
+    trained, scenarios = config.table.ids, config.table.scenarios
     for task in tasks:
-        if task.scenario != config.resolved_scenario() and config.env.action_set != "unified":
+        if task.scenario not in scenarios and config.env.action_set != "unified":
             raise ConfigError(
-                f"{task.id}: the run was trained on {config.resolved_scenario().id}, whose buttons are others; "
+                f"{task.id}: the run was trained on {', '.join(s.id for s in scenarios)}, which has other buttons; "
                 "only a run with env.action_set=unified can play another scenario"
             )
         if config.agent.task_conditioned and task.id not in trained:
             raise ConfigError(
-                f"{task.id}: the policy is told which of its {len(trained)} training tasks it plays, and this is "
-                f"none of them; want some of {', '.join(trained)}"
+                f"{task.id}: the policy takes the index of one of its {len(trained)} training tasks as input, and this "
+                f"is none of them; want some of {', '.join(trained)}"
             )
 
 
 def find_checkpoints(run_dir: Path, wanted: Sequence[str]) -> list[int]:
-    """The policies of a run that are asked for, as gradient steps, oldest first.
+    """The chosen policies of a run, as gradient steps, oldest first.
 
-    Args:
-        run_dir: of the run.
-        wanted: any of "newest", "all", "last5" (or another number), and numbers of gradient steps.
+    `wanted` has any of "newest", "all", "last5" (or another number), and numbers of gradient steps.
 
     Raises:
         ConfigError: none of those, or there is no such policy; lists those there are.
@@ -119,12 +107,8 @@ def find_checkpoints(run_dir: Path, wanted: Sequence[str]) -> list[int]:
 
 
 def trained_player(run_dir: Path, config: RunConfig, num_updates: int) -> PlayerSpec:
-    """A policy of a run; its parameters are read, so that damage shows now.
-
-    Args:
-        run_dir: of the run.
-        config: as `read_run_config` gives it.
-        num_updates: gradient steps of one in `policies/`.
+    """The policy of a run after `num_updates` gradient steps. Its parameters are read here, so that damage is reported
+    before anything is played.
 
     Raises:
         CheckpointError: it is damaged, or belongs to another configuration.
@@ -135,7 +119,6 @@ def trained_player(run_dir: Path, config: RunConfig, num_updates: int) -> Player
     digest = hashlib.blake2b(digest_size=8)
     for leaf in jax.tree.leaves(params):
         digest.update(np.asarray(leaf, np.float32).tobytes())
-    agent_file = Path(config.agent.name) if config.agent.name.endswith(".py") else None
     name = f"{config.name}/seed_{config.seed}"
     player = {
         "player": f"{name}@{num_updates}",
@@ -145,19 +128,14 @@ def trained_player(run_dir: Path, config: RunConfig, num_updates: int) -> Player
         "params": digest.hexdigest(),
     }
     return PlayerSpec(
-        make_player=partial(TrainedPlayer, run_dir, num_updates, agent_file),
+        make_player=partial(TrainedPlayer, run_dir, num_updates, config.agent_file),
         env=config.env,
         identity=row_identity(player, config.env),
     )
 
 
 class TrainedPlayer:
-    """A policy of a run, greedy and with its noise off.
-
-    Args:
-        run_dir: of the run.
-        num_updates: gradient steps of one in `policies/`.
-        agent_file: as of `read_run_config`.
+    """The policy of a run after `num_updates` gradient steps, greedy and with its noise off.
 
     Raises:
         ConfigError, CheckpointError: it cannot be read.
@@ -171,14 +149,20 @@ class TrainedPlayer:
         self._params = jax.device_put(params)
         self._evaluate = _jitted(agent)
         self._evaluation: Evaluation | None = None
-        self._obs = np.zeros((1, *agent.spec.obs_shape), np.uint8)
-        self._task = np.zeros(1, np.int32)
-        conditioned = config.agent.task_conditioned
-        self._task_ids = [task.id for task in config.resolved_tasks()] if conditioned else None
+        self._table, spec = config.table, agent.spec
+        self._obs = ObservationBatch(
+            1,
+            config.env.frame_shape,
+            config.agent.stack_size,
+            past_actions=spec.num_past_actions,
+            variables=config.table.variables if config.agent.game_variables else (),
+            action_masks=config.table.action_masks,
+        )
+        self._action = 0
 
     @property
     def values(self) -> Values | None:
-        """What it thought when it chose the last action."""
+        """Its estimates when it chose the last action."""
         if self._evaluation is None:
             return None
         _, q_values, probabilities, atoms = self._evaluation
@@ -189,20 +173,25 @@ class TrainedPlayer:
         )
 
     def begin(self, env: "DoomEnv", observation: "Observation", info: dict[str, Any], seed: int) -> None:
-        if self._task_ids is not None:
-            self._task[0] = self._task_ids.index(env.task.id)
         assert isinstance(observation, np.ndarray)
-        start_stack(self._obs[0], observation)
+        self._obs.begin(0, self._task(env), observation, info["variables"])
+        if "mask" in self._obs.arrays:
+            self._obs.arrays["mask"][0] = [bool(buttons) for buttons in env.action_meanings]
         self._evaluation = None
 
     def act(self) -> int:
-        evaluation: Evaluation = self._evaluate(self._params, self._obs, self._task)
+        evaluation: Evaluation = self._evaluate(self._params, self._obs.arrays)
         self._evaluation = evaluation
-        return int(evaluation.action[0])
+        self._action = int(evaluation.action[0])
+        return self._action
 
     def observe(self, observation: "Observation", info: dict[str, Any]) -> None:
         assert isinstance(observation, np.ndarray)
-        push_frame(self._obs[0], observation)
+        self._obs.push(0, self._action, observation, info["variables"])
+
+    def _task(self, env: "DoomEnv") -> int:
+        """Index of the task that is played; 0 for one that the policy was not trained on, and is not told."""
+        return self._table.ids.index(env.task.id) if env.task.id in self._table.ids else 0
 
 
 @cache
@@ -210,7 +199,9 @@ def _jitted(agent: "Agent") -> Any:
     """Compiled once for all checkpoints of a run."""
     import jax
 
-    return jax.jit(agent.evaluate)
+    from learner.observation import Observation
+
+    return jax.jit(lambda params, arrays: agent.evaluate(params, Observation(**arrays)))
 
 
 def _read_params(run_dir: Path, config: RunConfig, num_updates: int) -> "tuple[Agent, Any]":

@@ -19,7 +19,7 @@ END_S = 1.5
 
 
 def check_video_file(file: Path) -> None:
-    """Says beforehand whether `write_video` can write there.
+    """Checks that `write_video` can write this file.
 
     Raises:
         ConfigError: another kind of file, PyAV is missing for an MP4, or no such directory can be made.
@@ -39,7 +39,7 @@ def write_video(file: Path, pictures: Iterable[Image.Image], rate: Fraction) -> 
 
     Args:
         file: where to; its suffix, one of SUFFIXES, says which kind.
-        pictures: at least one, all of one size, both sides even. May be drawn over once the next is asked for.
+        pictures: at least one, all of one size, both sides even. Each is read before the next one is taken.
         rate: pictures a second.
     """
     writing = file.with_name(f".writing-{file.name}")
@@ -54,13 +54,9 @@ def write_video(file: Path, pictures: Iterable[Image.Image], rate: Fraction) -> 
 
 
 def add_to_tensorboard(gif: Path, directory: Path, tag: str, step: int) -> None:
-    """Adds a .gif to the events of a directory as an image; TensorBoard shows it moving.
+    """Adds a .gif as the image `tag` of a gradient step; TensorBoard shows it moving.
 
-    Args:
-        gif: that was written.
-        directory: of events of its own: TensorBoard reads no further in a file once there is a newer one beside it.
-        tag: names the image.
-        step: gradient step.
+    `directory` is for these events alone: TensorBoard stops reading a file when the directory holds a newer one.
     """
     from tensorboardX.event_file_writer import EventsWriter
     from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]  # made at run time

@@ -2,5 +2,5 @@
 one.
 
 `base` says what an experiment is, `scale` shrinks it, `plan` is the grid that was asked for, `inventory` what of it
-stands on the disk, `jobs` and `schedule` run it, `rates` measures how long it will take.
+stands on the disk, `jobs` and `schedule` run it, `costs` says what it takes.
 """

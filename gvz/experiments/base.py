@@ -3,27 +3,33 @@
 Source: thesis 5.1.1 (seeds, checkpoints, episodes) and 5.2 (the four experiments).
 """
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from types import MappingProxyType
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
-from gvz.core.env_config import SimplePlayer
-from gvz.core.errors import ConfigError
+from gvz.core.errors import ConfigError, nearest
 from gvz.core.registry import discover
-from gvz.run.config import load_config
-from gvz.scenarios.base import Split, nearest
-from gvz.tasks import Task, named_tasks, scenario_named
-
-SCENARIOS = ("defend_the_center", "health_gathering", "seek_and_kill", "dodge_projectiles")
-"""in the thesis's order"""
+from gvz.evaluation.simple import SIMPLE_PLAYERS
+from gvz.experiments.settings import with_settings
+from gvz.run.config import RunConfig
+from gvz.run.config_files import load_config
+from gvz.scenarios.base import VARIED, Split
+from gvz.tasks import LEVELS, Task, named_tasks, parse_task, scenario_named, scenarios
 
 EACH_TASK = "each"
 """as a training: every named task of the scenario, alone"""
 
-EvaluateOn = Literal["own", "test", "all"]
+EvaluateOn = Literal["own", "test", "all", "gate"]
 Columns = Literal["level", "training", "config"]
+
+SET_BY_EXPERIMENT = (
+    *("name", "scenario", "training_set", "tasks", "seed", "run_dir", "max_processor_s"),
+    *("learner.total_updates", "checkpoint.period_updates"),
+)
+"""fields of RunConfig that a variant does not set: they follow from the experiment"""
 
 Published = Mapping[str, Mapping[str, tuple[float, ...]]]
 """who published -> scenario id -> percent of the upper bound, by column of the table"""
@@ -38,7 +44,7 @@ RECIPE_NOTE = (
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TrainingRun:
-    """One cell of the grid. Equal ones are trained once, however many experiments have them."""
+    """One cell of the grid. A run that several experiments have is trained once."""
 
     config: str
     """file in configs/"""
@@ -51,11 +57,27 @@ class TrainingRun:
     total_updates: int
     num_checkpoints: int
     """saved at equal distances, the last one at the end"""
+    variant: str | None = None
+    """of the config"""
+    settings: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    """of the variant: dotted field of RunConfig -> value"""
+    max_processor_s: float | None = None
+    """processor time at which the run ends, seconds; then only its last checkpoint is evaluated"""
+
+    @property
+    def agent(self) -> str:
+        """The config and its variant: "rainbow_4task", "rainbow_4task+large_batch"."""
+        return _agent(self.config, self.variant)
 
     @property
     def id(self) -> str:
         """Where the run is kept: "rainbow_4task/defend_the_center/train4/seed_1111"."""
-        return f"{self.config}/{self.scenario}/{self.training}/seed_{self.seed}"
+        return f"{self.agent}/{self.scenario}/{self.training}/seed_{self.seed}"
+
+    @property
+    def run_config(self) -> RunConfig:
+        """Its config file with the settings of its variant, at full size."""
+        return with_settings(load_config(self.config), self.settings)
 
     @property
     def checkpoint_period_updates(self) -> int:
@@ -81,75 +103,118 @@ class Experiment:
     """one sentence"""
     configs: tuple[str, ...]
     """files in configs/"""
-    scenarios: tuple[str, ...] = SCENARIOS
+    variants: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: MappingProxyType({}))
+    """name -> settings (dotted field of RunConfig -> value): every config is trained with each of them. Without
+    variants every config is trained as it is; a variant without settings is the config as it is, too."""
+    scenarios: tuple[str, ...] = ()
+    """default: those that numbers were published of, or else all"""
     trainings: tuple[str, ...]
-    """train1, train4, train8: a training set; each: every named task alone"""
+    """train1, train4, train8: a training set; varied, varied-100: such a task; each: every named task alone"""
     seeds: tuple[int, ...] = (1111, 2222, 3333)
     total_updates: int = 200_000
     """gradient steps of a run"""
+    max_processor_s: float | None = None
+    """a run ends after this processor time (learner, actors and games together), seconds, or after `total_updates` if
+    these are done before; num_checkpoints is then 1"""
     num_checkpoints: int = 20
     """each of them is evaluated"""
     episodes: int = 100
     """evaluation episodes of a task"""
     evaluate_on: EvaluateOn
-    """own: the task trained on; test: the scenario's test set; all: its named tasks"""
+    """own: the task trained on; test: the scenario's test set; all: its named tasks; gate: its gate set and the tasks
+    trained on, with a table over each"""
     tasks_per_level: int | None = None
-    """this many tasks of a level are trained alone and evaluated on, in the thesis's order; None: all (see `scale`)"""
+    """only this many tasks of a level are used, in the thesis's order; None: all (see `scale`)"""
     table_checkpoints: int = 5
-    """the table is over the last checkpoints, this many"""
+    """the table uses this many of the last checkpoints"""
     columns: Columns
     """of the table"""
-    players: tuple[SimplePlayer, ...] = ("random",)
-    """who else plays the evaluation episodes"""
+    players: tuple[str, ...] = ("random",)
+    """simple players that play the evaluation episodes, too"""
     published: Published = field(default_factory=lambda: MappingProxyType({}))
-    """to stand beside the table, never in it"""
+    """shown in rows of their own; no mean of ours includes them"""
     notes: tuple[str, ...] = ()
-    """what a reader of the table must know"""
+    """shown with the table"""
 
     def __post_init__(self) -> None:
+        if not self.scenarios:
+            object.__setattr__(self, "scenarios", tuple(next(iter(self.published.values()), scenarios())))
+        if (problem := next(self._problems(), None)) is not None:
+            raise ConfigError(f"experiment {self.name}: {problem}")
+
+    def _problems(self) -> Iterator[str]:
+        """Why the experiment cannot be; each reason may depend on the absence of those before it."""
         for name in ("configs", "scenarios", "trainings", "seeds"):
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
-                raise ConfigError(f"experiment {self.name}: {name}: got {values}, want at least one, each once")
+                yield f"{name}: got {values}, want at least one, each once"
         for name in ("total_updates", "num_checkpoints", "episodes", "table_checkpoints"):
             if getattr(self, name) < 1:
-                raise ConfigError(f"experiment {self.name}: {name}: got {getattr(self, name)}, want at least 1")
+                yield f"{name}: got {getattr(self, name)}, want at least 1"
         if not self.table_checkpoints <= self.num_checkpoints <= self.total_updates:
-            raise ConfigError(
-                f"experiment {self.name}: got table_checkpoints {self.table_checkpoints}, num_checkpoints "
-                f"{self.num_checkpoints}, total_updates {self.total_updates}, want each at most the next"
+            yield (
+                f"got table_checkpoints {self.table_checkpoints}, num_checkpoints {self.num_checkpoints}, "
+                f"total_updates {self.total_updates}, want each at most the next"
             )
         for training in self.trainings:
-            if training != EACH_TASK and (training not in get_args(Split) or training == "test"):
-                raise ConfigError(
-                    f"experiment {self.name}: trainings: got {training!r}, want train1, train4, train8 or {EACH_TASK}"
+            known = training == EACH_TASK or training.partition("-")[0] == VARIED
+            if not known and (training not in get_args(Split) or training == "test"):
+                yield (
+                    f"trainings: got {training!r}, want train1, train4, train8, {VARIED}, {VARIED}-<number of maps> or "
+                    f"{EACH_TASK}"
                 )
+        for name, settings in self.variants.items():
+            if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
+                yield f"variants: got {name!r}, want letters, digits and . _ - (it names a directory)"
+            if taken := [field for field in settings if field in SET_BY_EXPERIMENT]:
+                yield f"variant {name} sets {', '.join(taken)}, which the experiment sets itself"
+        if self.max_processor_s is not None and (self.max_processor_s <= 0 or self.num_checkpoints != 1):
+            yield (
+                f"got max_processor_s {self.max_processor_s:g} and num_checkpoints {self.num_checkpoints}, want more "
+                "than 0 and exactly 1: a run that ends by its processor time is evaluated at its end"
+            )
+        if self.evaluate_on == "gate" and self.columns == "level":
+            yield "evaluate_on 'gate' wants columns 'config' or 'training'"
         if self.evaluate_on == "own" and self.trainings != (EACH_TASK,):
-            raise ConfigError(f"experiment {self.name}: evaluate_on 'own' wants trainings ('{EACH_TASK}',)")
+            yield f"evaluate_on 'own' wants trainings ('{EACH_TASK}',)"
         for scenario in self.scenarios:
             scenario_named(scenario)
+        if unknown := set(self.players) - set(SIMPLE_PLAYERS):
+            yield f"players: got {', '.join(sorted(unknown))}, want some of {', '.join(SIMPLE_PLAYERS)}"
         width = len(self.column_names)
         for who, rows in self.published.items():
             for scenario, values in rows.items():
                 if len(values) != width:
-                    raise ConfigError(
-                        f"experiment {self.name}: published by {who}, {scenario}: got {len(values)} numbers, want "
-                        f"{width}, one for each column ({', '.join(self.column_names)})"
+                    yield (
+                        f"published by {who}, {scenario}: got {len(values)} numbers, want {width}, one for each "
+                        f"column ({', '.join(self.column_names)})"
                     )
+
+    @property
+    def budget(self) -> str:
+        """Of a run, in words."""
+        if self.max_processor_s is None:
+            return f"{self.total_updates:,} gradient steps"
+        return f"{self.max_processor_s:,.4g} seconds of processor time, at most {self.total_updates:,} gradient steps"
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """The configs, each with each of the variants."""
+        return tuple(_agent(config, variant) for config in self.configs for variant in self.variants or (None,))
 
     @property
     def column_names(self) -> tuple[str, ...]:
         """What the columns of the table stand for."""
         match self.columns:
             case "level":
-                return ("0", "1", "2", "3", "4")
+                return tuple(map(str, LEVELS))
             case "training":
                 return self.trainings
             case "config":
-                return self.configs
+                return self.agents
 
     def runs(self) -> tuple[TrainingRun, ...]:
-        """The grid: by scenario, training, config, seed."""
+        """The grid: by scenario, training, config, variant, seed."""
         return tuple(
             TrainingRun(
                 config=config,
@@ -159,10 +224,14 @@ class Experiment:
                 seed=seed,
                 total_updates=self.total_updates,
                 num_checkpoints=self.num_checkpoints,
+                variant=variant,
+                settings={} if variant is None else self.variants[variant],
+                max_processor_s=self.max_processor_s,
             )
             for scenario in self.scenarios
             for training, tasks in self._training_sets(scenario).items()
             for config in self.configs
+            for variant in self.variants or (None,)
             for seed in self.seeds
         )
 
@@ -175,20 +244,25 @@ class Experiment:
                 return self._thinned(named_tasks(run.scenario, split="test"))
             case "all":
                 return self._thinned(named_tasks(run.scenario))
+            case "gate":
+                return tuple(dict.fromkeys((*self._thinned(named_tasks(run.scenario, split="gate")), *run.tasks)))
 
     def table_tasks(self, run: TrainingRun) -> tuple[str, ...]:
-        """Ids of the tasks the table is over: those of its levels, or else the test tasks among the evaluated."""
+        """Ids of the tasks the table is over: those of its levels, the gate tasks of a gate, else the test tasks."""
         tasks = self.evaluation_tasks(run)
         if self.columns == "level":
             return tasks
-        test = {task.id for task in named_tasks(run.scenario, split="test")}
-        return tuple(task for task in tasks if task in test)
+        split = "gate" if self.evaluate_on == "gate" else "test"
+        counted = {task.id for task in named_tasks(run.scenario, split=split)}
+        return tuple(task for task in tasks if task in counted)
 
     def _training_sets(self, scenario: str) -> dict[str, tuple[str, ...]]:
         sets: dict[str, tuple[str, ...]] = {}
         for training in self.trainings:
             if training == EACH_TASK:
                 sets |= {id.partition("/")[2]: (id,) for id in self._thinned(named_tasks(scenario))}
+            elif training.partition("-")[0] == VARIED:
+                sets[training] = (parse_task(f"{scenario}/{training}").id,)
             else:
                 split: Split = training  # pyright: ignore[reportAssignmentType]  # checked in __post_init__
                 sets[training] = tuple(task.id for task in named_tasks(scenario, split=split))
@@ -205,17 +279,27 @@ class Experiment:
         return tuple(ids)
 
 
+def _agent(config: str, variant: str | None) -> str:
+    return config if variant is None else f"{config}+{variant}"
+
+
 @cache
 def experiments() -> dict[str, Experiment]:
     """Every experiment there is, by name: the modules of gvz.experiments that have an EXPERIMENT.
 
     Raises:
-        ConfigError: one names a config that is not there.
+        ConfigError: one names a config that is not there, or has a variant that its config refuses.
     """
     found = {n: m.EXPERIMENT for n, m in discover("gvz.experiments").items() if hasattr(m, "EXPERIMENT")}
     assert all(name == experiment.name for name, experiment in found.items()), "an experiment's name is its file's"
-    for config in {config for experiment in found.values() for config in experiment.configs}:
-        load_config(config)
+    for experiment in found.values():
+        for config in map(load_config, experiment.configs):
+            for variant, settings in experiment.variants.items():
+                try:
+                    with_settings(config, settings)
+                except ConfigError as error:
+                    where = f"experiment {experiment.name}: variant {variant} of {config.name}"
+                    raise ConfigError(f"{where}: {error}") from error
     return found
 
 

@@ -1,25 +1,28 @@
-"""What stands on the disk of a results directory: checkpoints, episodes, logs. Reads only.
+"""What a results directory holds: checkpoints, episodes, logs. Reads only.
 
 RESULTS/runs/<run id>/  players/<player>.jsonl  logs/<job id>.log  plan.json
 """
 
-import fcntl
-import gzip
 import json
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
+from gvz.core import records
 from gvz.experiments.base import TrainingRun
 from gvz.experiments.plan import Evaluation
 
-LOG_TAIL_BYTES = 4_000
 END_MARK = "# ended with exit code "
 """begins the line that closes a command's part of a log"""
 STOPPED_CODES = (130, 143)
-"""exit codes of a job that saved itself and stopped, as it was told to"""
+"""exit codes of a job that saved its run and stopped after a signal"""
 
+PROCESSOR_S = "run/processor_s"
+"""the scalar of the processor time, in metrics.jsonl"""
+
+Number = TypeVar("Number", int, float)
 State = Literal["done", "running", "failed", "stopped", "waiting"]
 
 
@@ -29,15 +32,11 @@ class RunProgress:
 
     num_updates: int
     """gradient steps in its records"""
-    checkpoints: tuple[int, ...]
-    """gradient steps of the checkpoints that stand for those wanted; as many as are there"""
+    processor_s: float
+    """processor time in its records"""
     trained: bool
     missing: dict[int, int]
     """checkpoint -> evaluation episodes that are still to be played"""
-
-    @property
-    def done(self) -> bool:
-        return self.trained and not self.missing
 
 
 def run_directory(results: Path, run: TrainingRun) -> Path:
@@ -58,14 +57,19 @@ def log_file(results: Path, job: str) -> Path:
 def run_progress(results: Path, run: TrainingRun, evaluation: Evaluation) -> RunProgress:
     """Reads how far a run is, from its policies and records alone."""
     directory = run_directory(results, run)
-    checkpoints = standing_checkpoints(run, policies(directory))
     held = _held_episodes(directory / "evaluation.jsonl")
+    saved = sorted({*policies(directory), *held})  # the policies of a finished run may have been removed
+    num_updates, processor_s = last_update(directory), last_processor_s(directory)
+    checkpoints = standing_checkpoints(run, saved)
+    trained = run.total_updates in checkpoints
+    if run.max_processor_s is not None:
+        trained = trained or (processor_s >= run.max_processor_s and num_updates in saved)
     wanted = {(task, n) for task in evaluation.tasks for n in range(evaluation.episodes)}
     missing = {c: len(wanted - held.get(c, set())) for c in checkpoints}
     return RunProgress(
-        num_updates=last_update(directory),
-        checkpoints=checkpoints,
-        trained=run.total_updates in checkpoints,
+        num_updates=num_updates,
+        processor_s=processor_s,
+        trained=trained,
         missing={c: n for c, n in missing.items() if n},
     )
 
@@ -83,11 +87,14 @@ def policies(directory: Path) -> list[int]:
 
 
 def standing_checkpoints(run: TrainingRun, saved: Sequence[int]) -> tuple[int, ...]:
-    """For each checkpoint wanted the first one saved at or after it, before the next is wanted.
+    """For each planned checkpoint the first one saved at or after it, and before the next planned one.
 
-    A save falls a little later than wanted if a jitted call has several gradient steps or the one before is still
-    being written; and a run that was stopped has others besides.
+    A checkpoint is saved a little late if a jitted call has several gradient steps, or if the one before is still being
+    written. A run that was stopped has more checkpoints than planned. Of a run that ends by its processor time only the
+    newest stands.
     """
+    if run.max_processor_s is not None:
+        return tuple(saved[-1:])
     wanted = run.checkpoints
     until = (*wanted[1:], run.total_updates + 1)
     first = (next((s for s in saved if low <= s < high), None) for low, high in zip(wanted, until, strict=True))
@@ -96,23 +103,33 @@ def standing_checkpoints(run: TrainingRun, saved: Sequence[int]) -> tuple[int, .
 
 def last_update(directory: Path) -> int:
     """Gradient steps by the newest whole row of metrics.jsonl; 0 without one."""
-    for line in reversed(tail(directory / "metrics.jsonl").splitlines()):
+    return _last_number(directory, "num_updates", int)
+
+
+def last_processor_s(directory: Path) -> float:
+    """Processor time by the newest whole row of metrics.jsonl, seconds; 0 without one."""
+    return _last_number(directory, PROCESSOR_S, float)
+
+
+def _last_number(directory: Path, field: str, kind: type[Number]) -> Number:
+    for line in reversed(records.last_lines(directory / "metrics.jsonl")):
         try:
-            return int(json.loads(line)["num_updates"])
+            return kind(json.loads(line)[field])
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError):  # half-written, or no row of ours
             continue
-    return 0
+    return kind()
 
 
 def count_rows(file: Path) -> int:
-    """Lines of a record file; 0 if there is none."""
-    return sum(1 for _ in _lines(file))
+    """Lines of a record file, compressed or not; 0 if there is none."""
+    stored = records.stored(file)
+    return 0 if stored is None else sum(1 for _ in records.lines(stored))
 
 
 def job_state(results: Path, job: str, *, done: bool, begun: bool) -> State:
-    """What a job is at: by its lock, its results and the end of its log, in this order."""
+    """The state of a job: by its lock, its results and the end of its log, in this order."""
     log = log_file(results, job)
-    if is_locked(log):
+    if records.is_locked(log):
         return "running"
     if done:
         return "done"
@@ -124,58 +141,35 @@ def job_state(results: Path, job: str, *, done: bool, begun: bool) -> State:
 
 def exit_code(log: Path) -> int | None:
     """Of the last command in a log; None if it has not ended, or was killed before it could be noted."""
-    lines = tail(log).splitlines()
+    lines = records.last_lines(log)
     if not lines or not lines[-1].startswith(END_MARK):
         return None
     return int(lines[-1].removeprefix(END_MARK).split()[0])
 
 
-def tail(file: Path, num_bytes: int = LOG_TAIL_BYTES) -> str:
-    """The end of a file; empty if there is none."""
-    try:
-        with file.open("rb") as stream:
-            stream.seek(max(0, file.stat().st_size - num_bytes))
-            return stream.read().decode(errors="replace")
-    except FileNotFoundError:
-        return ""
+def seconds_of(log: Path, step: str) -> float:
+    """How long the commands of a step (train, evaluate) took, by a job's log; without those that were killed."""
+    found, current = 0.0, ""
+    for line in log.read_text(errors="replace").splitlines() if log.exists() else ():
+        if command := re.fullmatch(r"# \S+ \S+ python -m gvz\.(launch|cli evaluate)\b.*", line):
+            current = "train" if command[1] == "launch" else "evaluate"
+        elif (ended := re.fullmatch(rf"{END_MARK}\d+ after (\d+) s", line)) and current == step:
+            found += float(ended[1])
+    return found
 
 
 def last_words(log: Path, num_lines: int = 3) -> list[str]:
     """The last lines that a failed job wrote itself."""
-    return [line for line in tail(log).splitlines() if line.strip() and not line.startswith("#")][-num_lines:]
-
-
-def is_locked(log: Path) -> bool:
-    """A job is at work: it and its runner hold its log."""
-    if not log.exists():
-        return False
-    with log.open("a") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-    return False
-
-
-def _lines(file: Path) -> Iterator[str]:
-    """Of a record file, compressed or not; none if there is no file."""
-    packed = file.with_name(f"{file.name}.gz")
-    if file.exists():
-        with file.open(errors="replace") as stream:
-            yield from stream
-    elif packed.exists():
-        with gzip.open(packed, "rt", errors="replace") as stream:
-            yield from stream
+    return [line for line in records.last_lines(log) if not line.startswith("#")][-num_lines:]
 
 
 def _held_episodes(file: Path) -> dict[int, set[tuple[str, int]]]:
-    """Checkpoint (0 for a player without one) -> the (task, episode) a record file holds; damaged lines count not."""
+    """Checkpoint (0 for a player without one) -> the (task, episode) a record file holds, damaged lines left out."""
     held: dict[int, set[tuple[str, int]]] = {}
-    for line in _lines(file):
+    for row in records.read_stored(file)[0]:
         try:
-            row = json.loads(line)
             if row.get("base_seed", 0) == 0:  # the episodes that everybody meets
                 held.setdefault(row.get("num_updates", 0), set()).add((row["task"], row["episode"]))
-        except (ValueError, KeyError, AttributeError, TypeError, RecursionError):  # half-written, or no row of ours
+        except (KeyError, TypeError):  # no row of an evaluation
             continue
     return held

@@ -1,27 +1,24 @@
-"""A job: what is to be done for one run (train, then evaluate) or one player, and the process that does it now.
+"""Jobs: what to do for one run (train, then evaluate) or one simple player, and the process that does it.
 
-The next command follows from what stands on the disk, so a job that was cut goes on.
+The next command follows from the files on the disk, so an interrupted job goes on.
 """
 
-import fcntl
 import os
 import shlex
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import IO, Any
 
-from gvz.core import janitor
-from gvz.core.env_config import SimplePlayer
-from gvz.experiments import inventory as progress
+from gvz.core import janitor, records
+from gvz.evaluation.simple import SimplePlayerName
+from gvz.experiments import inventory
 from gvz.experiments.base import TrainingRun
 from gvz.experiments.plan import Evaluation
 from gvz.experiments.scale import scaled_settings
-from gvz.run.config import load_config
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -32,7 +29,9 @@ class Command:
     """train or evaluate"""
     arguments: tuple[str, ...]
     total: int
-    """what it will have done at its end: gradient steps, or evaluation episodes of the job"""
+    """of the job when it is done"""
+    unit: str = "updates"
+    """what `total` counts"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -40,33 +39,11 @@ class Outlook:
     """What is left of a job."""
 
     next: Command | None
-    """None: it is done"""
+    """None: the job is done"""
     begun: bool
-    """something of it stands on the disk"""
+    """there are files of it on the disk"""
     text: str
     """how far it is, for a person"""
-
-
-class Job(Protocol):
-    """What is to be done, in commands that follow from what stands on the disk."""
-
-    @property
-    def id(self) -> str:
-        """Unique in the results directory; names the log."""
-        ...
-
-    @property
-    def results(self) -> Path:
-        """The results directory."""
-        ...
-
-    def outlook(self) -> Outlook:
-        """What is left, read from the disk."""
-        ...
-
-    def done_count(self, step: str) -> int:
-        """Of `Command.total`, how much is done; of a job at work."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -74,45 +51,44 @@ class RunJob:
     """Trains a run and evaluates its checkpoints."""
 
     results: Path
+    """the results directory"""
     run: TrainingRun
     evaluation: Evaluation
     scale: float
 
     @property
     def id(self) -> str:
+        """Unique in the results directory; names the log."""
         return self.run.id
 
     def outlook(self) -> Outlook:
-        """Reads the run's directory."""
-        now = progress.run_progress(self.results, self.run, self.evaluation)
+        """What is left, by the run's directory."""
+        now = inventory.run_progress(self.results, self.run, self.evaluation)
         total = len(self.evaluation.tasks) * self.evaluation.episodes * self.run.num_checkpoints
         played = total - sum(now.missing.values()) if now.trained else 0
-        text = f"{now.num_updates:,}/{self.run.total_updates:,} updates, {played:,}/{total:,} episodes"
+        goal, unit, limit_s = self.run.total_updates, "updates", self.run.max_processor_s
+        trained = f"{now.num_updates:,}/{goal:,} updates"
+        if limit_s is not None:
+            goal, unit = round(limit_s), "processor seconds"
+            trained = f"{now.num_updates:,} updates in {now.processor_s:,.0f}/{limit_s:,.0f} {unit}"
+        text = f"{trained}, {played:,}/{total:,} episodes"
+        directory, following = str(inventory.run_directory(self.results, self.run)), None
         if not now.trained:
-            following = Command(step="train", arguments=self.train_arguments(), total=self.run.total_updates)
+            arguments = ("-m", "gvz.launch", *training_flags(self.run, self.scale), "--run-dir", directory)
+            following = Command(step="train", arguments=arguments, total=goal, unit=unit)
         elif now.missing:
-            following = Command(step="evaluate", arguments=self.evaluate_arguments(tuple(now.missing)), total=total)
-        else:
-            following = None
+            which = (directory, "--checkpoints", *map(str, now.missing))
+            arguments = ("-m", "gvz.cli", "evaluate", *which, *_episodes(self.evaluation))
+            following = Command(step="evaluate", arguments=arguments, total=total, unit="episodes")
         return Outlook(next=following, begun=now.num_updates > 0, text=text)
 
     def done_count(self, step: str) -> int:
-        """Gradient steps or episodes done, of a job at work."""
-        directory = progress.run_directory(self.results, self.run)
+        """How much of `Command.total` is done: gradient steps, processor seconds or episodes of a job at work."""
+        directory = inventory.run_directory(self.results, self.run)
         if step == "train":
-            return progress.last_update(directory)
-        return progress.count_rows(directory / "evaluation.jsonl")
-
-    def train_arguments(self) -> tuple[str, ...]:
-        """Trains the run, or goes on with it."""
-        directory = progress.run_directory(self.results, self.run)
-        return ("-m", "gvz.launch", *training_flags(self.run, self.scale), "--run-dir", str(directory))
-
-    def evaluate_arguments(self, checkpoints: Sequence[int]) -> tuple[str, ...]:
-        """Plays what is missing of the evaluation of these checkpoints."""
-        directory = progress.run_directory(self.results, self.run)
-        which = ("--checkpoints", *map(str, checkpoints))
-        return ("-m", "gvz.cli", "evaluate", str(directory), *which, *_episodes(self.evaluation))
+            by_time = self.run.max_processor_s is not None
+            return int(inventory.last_processor_s(directory)) if by_time else inventory.last_update(directory)
+        return inventory.count_rows(directory / "evaluation.jsonl")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -120,7 +96,7 @@ class PlayerJob:
     """Plays the evaluation episodes as a player that needs no training."""
 
     results: Path
-    player: SimplePlayer
+    player: SimplePlayerName
     evaluation: Evaluation
 
     @property
@@ -128,32 +104,42 @@ class PlayerJob:
         return f"players/{self.player}"
 
     def outlook(self) -> Outlook:
-        """Reads the player's record file."""
-        missing = progress.missing_player_episodes(self._file, self.evaluation)
+        """What is left, by the player's record file."""
+        missing = inventory.missing_player_episodes(self._file, self.evaluation)
         total = len(self.evaluation.tasks) * self.evaluation.episodes
         arguments = ("-m", "gvz.cli", "evaluate", "--player", self.player, "--out", str(self._file))
-        following = Command(step="evaluate", arguments=(*arguments, *_episodes(self.evaluation)), total=total)
+        arguments = (*arguments, *_episodes(self.evaluation))
+        following = Command(step="evaluate", arguments=arguments, total=total, unit="episodes")
         text = f"{total - missing:,}/{total:,} episodes"
         return Outlook(next=following if missing else None, begun=missing < total, text=text)
 
     def done_count(self, step: str) -> int:
         """Episodes played, of a job at work."""
-        return progress.count_rows(self._file)
+        return inventory.count_rows(self._file)
 
     @property
     def _file(self) -> Path:
-        return progress.player_file(self.results, self.player)
+        return inventory.player_file(self.results, self.player)
+
+
+Job = RunJob | PlayerJob
 
 
 def training_flags(run: TrainingRun, scale: float) -> tuple[str, ...]:
-    """The flags of gvz.launch that make this run, but for where it is kept."""
+    """The flags of gvz.launch for this run, without --run-dir."""
     settings: dict[str, Any] = {
         "tasks": run.tasks,
         "seed": run.seed,
         "learner.total_updates": run.total_updates,
-        "checkpoint.period_updates": run.checkpoint_period_updates,
-        **scaled_settings(load_config(run.config), run.total_updates, scale),
+        **run.settings,
+        **scaled_settings(run.run_config, run.total_updates, scale),
     }
+    if run.variant is not None:
+        settings["name"] = run.agent
+    if run.max_processor_s is None:
+        settings["checkpoint.period_updates"] = run.checkpoint_period_updates
+    else:
+        settings["max_processor_s"] = run.max_processor_s
     return ("--config", run.config, *(text for name, value in settings.items() for text in _flag(name, value)))
 
 
@@ -162,7 +148,11 @@ def _flag(name: str, value: Any) -> tuple[str, ...]:
     if isinstance(value, bool):
         group, _, field = flag.removeprefix("--").rpartition(".")
         return (flag if value else f"--{group}.no-{field}",)
-    return (flag, *map(str, value)) if isinstance(value, tuple) else (flag, str(value))
+    return (flag, *_words(value))
+
+
+def _words(value: Any) -> tuple[str, ...]:
+    return tuple(word for item in value for word in _words(item)) if isinstance(value, tuple) else (str(value),)
 
 
 def _episodes(evaluation: Evaluation) -> tuple[str, ...]:
@@ -175,14 +165,14 @@ class Slot:
 
     cores: tuple[int, ...]
     environment: dict[str, str]
-    """what its jobs have besides ours: which GPU, how much of its memory"""
+    """added to ours: which GPU, how much of its memory"""
 
 
 class RunningJob:
     """A command of a job at work in a slot.
 
-    The job's log is locked meanwhile. The process holds the lock too, so one that outlives us for as long as it saves
-    keeps others away.
+    The job's log is locked as long as the command runs. Its process holds the lock, too: if it saves its run after our
+    death, no other process starts the job before that is done.
     """
 
     def __init__(self, job: Job, command: Command, slot: Slot, log: IO[bytes]):
@@ -203,13 +193,11 @@ class RunningJob:
 
     @classmethod
     def start(cls, job: Job, command: Command, slot: Slot) -> "RunningJob | None":
-        """Starts a command; None if another process is at the job."""
-        file = progress.log_file(job.results, job.id)
+        """Starts a command; None if another process runs the job."""
+        file = inventory.log_file(job.results, job.id)
         file.parent.mkdir(parents=True, exist_ok=True)
         log = file.open("ab", buffering=0)
-        try:
-            fcntl.flock(log, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if not records.lock(log):
             log.close()
             return None
         return cls(job, command, slot, log)
@@ -219,7 +207,7 @@ class RunningJob:
         code = self._process.poll()
         if code is not None and self._code is None:
             self._code = 128 - code if code < 0 else code
-            self._note(f"{progress.END_MARK}{self._code} after {time.monotonic() - self._started_s:.0f} s")
+            self._note(f"{inventory.END_MARK}{self._code} after {time.monotonic() - self._started_s:.0f} s")
             self._log.close()
         return self._code
 

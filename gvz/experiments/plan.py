@@ -1,4 +1,4 @@
-"""What was asked for: experiments, scale, scenarios; the grid of runs that follows, and plan.json, which keeps it."""
+"""The plan of a results directory: experiments, scale and scenarios, and the runs that follow; plan.json keeps it."""
 
 import dataclasses
 import json
@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from gvz.core.env_config import SimplePlayer
 from gvz.core.errors import ConfigError
+from gvz.evaluation.simple import SimplePlayerName
 from gvz.experiments.base import Experiment, TrainingRun, experiment_named
 from gvz.experiments.scale import scaled
 from gvz.tasks import scenario_named
@@ -34,7 +34,7 @@ class Evaluation:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Plan:
-    """What was asked for of one results directory."""
+    """The experiments of one results directory."""
 
     names: tuple[str, ...]
     """of the experiments"""
@@ -83,13 +83,13 @@ class Plan:
                     raise ConfigError(
                         f"experiment {experiment.name}: run {run.id} is to have {run.total_updates} gradient steps and "
                         f"{run.num_checkpoints} checkpoints, another experiment gives it "
-                        f"{runs[run.id].total_updates} and {runs[run.id].num_checkpoints}; "
-                        "run them in results directories of their own"
+                        f"{runs[run.id].total_updates} and {runs[run.id].num_checkpoints}, or they differ in the "
+                        "settings of a variant or in max_processor_s; run them in results directories of their own"
                     )
         return tuple(runs.values())
 
     def evaluations(self) -> dict[str, Evaluation]:
-        """Run id -> what any of the experiments evaluates it on."""
+        """Run id -> the evaluation episodes of all its experiments."""
         found: dict[str, Evaluation] = {}
         for experiment in self.experiments():
             for run in experiment.runs():
@@ -97,9 +97,9 @@ class Plan:
                 found[run.id] = before.joined(experiment.evaluation_tasks(run), experiment.episodes)
         return found
 
-    def players(self) -> dict[SimplePlayer, Evaluation]:
-        """Player -> the episodes that stand beside its experiments' runs."""
-        found: dict[SimplePlayer, Evaluation] = {}
+    def players(self) -> dict[SimplePlayerName, Evaluation]:
+        """Simple player -> the episodes that it plays: those of all runs of its experiments."""
+        found: dict[SimplePlayerName, Evaluation] = {}
         for experiment in self.experiments():
             for run in experiment.runs():
                 for player in experiment.players:
@@ -108,7 +108,7 @@ class Plan:
         return found
 
     def joined(self, other: "Plan") -> "Plan":
-        """What both ask for.
+        """Both plans as one.
 
         Raises:
             ConfigError: they differ in scale.
@@ -125,7 +125,7 @@ class Plan:
 
 
 def read_plan(results: Path) -> Plan | None:
-    """What was asked for of a results directory; None if nothing was.
+    """The plan of a results directory; None if there is none.
 
     Raises:
         ConfigError: plan.json is damaged or of another schema.
@@ -146,13 +146,13 @@ def read_plan(results: Path) -> Plan | None:
     except (ValueError, KeyError, TypeError, OSError, RecursionError) as error:
         if isinstance(error, ConfigError):
             raise
-        raise ConfigError(f"{file} cannot be read: {error!r}; move it aside to plan anew") from error
+        raise ConfigError(f"{file} cannot be read: {error!r}; move it aside to make a new plan") from error
 
 
 def write_plan(results: Path, plan: Plan) -> Plan:
-    """Adds what `plan` asks for to what was asked of the directory before.
+    """Adds a plan to the one that the directory has.
 
-    Returns: both together.
+    Returns: both as one.
 
     Raises:
         ConfigError: the scales differ, or the directory cannot be written.
@@ -188,5 +188,5 @@ def parse_shard(text: str) -> tuple[int, int]:
 
 
 def shard(items: Sequence[Item], index: int, count: int) -> tuple[Item, ...]:
-    """Part `index` (1 .. count) of the items: every count-th, so that the parts are alike."""
+    """Part `index` (1 .. count) of the items: every count-th, so that the parts are of about one size."""
     return tuple(items[index - 1 :: count])

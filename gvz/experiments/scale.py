@@ -1,15 +1,17 @@
-"""Experiments made small: what `--scale` does, all of it.
+"""What `--scale` does.
 
-Budgets shrink in proportion, with floors below which nothing runs. Where budgets alone leave an experiment too large
-(starting and compiling a run takes some 20 s, however few its updates), the grid is thinned as well.
+Budgets shrink in proportion, down to the smallest with which runs work. At small scales the grid has fewer runs, too,
+because each takes some 20 s to start and compile.
 """
 
 import dataclasses
-from typing import Any
 
 from gvz.core.errors import ConfigError
 from gvz.experiments.base import Experiment
-from gvz.run.config import RunConfig
+from gvz.experiments.settings import Settings
+from gvz.run.config import RunConfig, off_policy
+from learner.agents.configs.pqn import PQNConfig
+from learner.config import ValueConfig
 
 ONE_SEED_BELOW = 0.1
 """a smaller scale has one seed"""
@@ -19,15 +21,12 @@ CHECK_BELOW = 0.01
 MIN_UPDATES = 20
 MIN_EPISODES = 2
 MIN_CHECKPOINT_PERIOD_UPDATES = 1_000
-"""nearer checkpoints are not worth their evaluation; but two there are always"""
+"""checkpoints are at least this far apart; but there are always two"""
 MIN_WARMUP_STEPS = 2_048
 """three decisions in each of 682 games; a warm-up that depended on the machine could not be resumed on another"""
 MIN_TARGET_PERIOD_UPDATES = 10
 MIN_REPLAY_CAPACITY = 16_384
 """room for the games of some 500 actors; a capacity that depended on the machine could not be resumed on another"""
-
-Settings = dict[str, Any]
-"""field of RunConfig, dotted -> value"""
 
 CHECK_SETTINGS: Settings = {
     "env.frame_height": 36,
@@ -41,12 +40,9 @@ CHECK_SETTINGS: Settings = {
 
 
 def scaled(experiment: Experiment, scale: float) -> Experiment:
-    """The experiment at a scale.
+    """The experiment at a scale: 1 leaves it as it is, 0.1 has a tenth of the gradient steps and episodes.
 
-    Args:
-        experiment: at full size.
-        scale: 1 leaves it as it is; 0.1 has a tenth of the gradient steps and episodes; see ONE_SEED_BELOW and
-            CHECK_BELOW for what else changes.
+    ONE_SEED_BELOW and CHECK_BELOW say what else changes.
 
     Raises:
         ConfigError: a scale that is not in (0, 1].
@@ -61,6 +57,7 @@ def scaled(experiment: Experiment, scale: float) -> Experiment:
     return dataclasses.replace(
         experiment,
         total_updates=updates,
+        max_processor_s=None if experiment.max_processor_s is None else scale * experiment.max_processor_s,
         num_checkpoints=num_checkpoints,
         table_checkpoints=max(1, round(table_share * num_checkpoints)),
         episodes=max(MIN_EPISODES, round(scale * experiment.episodes)),
@@ -71,22 +68,19 @@ def scaled(experiment: Experiment, scale: float) -> Experiment:
 
 
 def scaled_settings(config: RunConfig, total_updates: int, scale: float) -> Settings:
-    """What a run at a scale has different from its config, beside its budget of updates.
-
-    Args:
-        config: the run's, at full size.
-        total_updates: of the run, at this scale.
-        scale: see `scaled`.
-    """
+    """The settings in which a run of so many gradient steps at a scale differs from its config, without that number."""
     if scale == 1:
         return {}
-    learner = config.learner
-    warmup = max(MIN_WARMUP_STEPS, learner.batch_size, round(scale * learner.warmup_steps))
-    settings: Settings = {
-        "learner.warmup_steps": min(learner.warmup_steps, warmup),
-        "learner.target_period_updates": max(MIN_TARGET_PERIOD_UPDATES, round(scale * learner.target_period_updates)),
-        "agent.epsilon_decay_steps": max(1, round(scale * config.agent.epsilon_decay_steps)),
-        "replay.capacity": min(config.replay.capacity, max(MIN_REPLAY_CAPACITY, round(scale * config.replay.capacity))),
-        "log.period_updates": min(config.log.period_updates, max(1, total_updates // 20)),
-    }
+    settings: Settings = {"log.period_updates": min(config.log.period_updates, max(1, total_updates // 20))}
+    if not config.agent.on_policy:
+        learner, replay = off_policy(config)
+        warmup = max(MIN_WARMUP_STEPS, learner.batch_size, round(scale * learner.warmup_steps))
+        target_period = round(scale * learner.target_period_updates)
+        settings |= {
+            "learner.warmup_steps": min(learner.warmup_steps, warmup),
+            "learner.target_period_updates": max(MIN_TARGET_PERIOD_UPDATES, target_period),
+            "replay.capacity": min(replay.capacity, max(MIN_REPLAY_CAPACITY, round(scale * replay.capacity))),
+        }
+    if isinstance(config.agent, ValueConfig | PQNConfig):
+        settings["agent.epsilon_decay_steps"] = max(1, round(scale * config.agent.epsilon_decay_steps))
     return settings | CHECK_SETTINGS if scale < CHECK_BELOW else settings

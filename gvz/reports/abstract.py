@@ -1,4 +1,4 @@
-"""What stands at the head of a report: what was run, with which budget, what beats what, and how far to believe it."""
+"""The head of a report: what was run, with which budget, which agent beats which, and what the numbers cannot show."""
 
 import itertools
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from gvz.reports.scores import Scores, agent_scores, estimate_groups
 from gvz.tasks import named_tasks, scenario_named, scenarios
 
 ENOUGH_SEEDS = 3
-"""training seeds of the thesis's protocol; fewer are said in the report's head"""
+"""training seeds of the thesis's protocol; with fewer, the report begins with a warning"""
 
 
 def what_was_run(results: Results) -> list[str]:
@@ -23,12 +23,14 @@ def what_was_run(results: Results) -> list[str]:
     for asked in results.asked:
         e = asked.experiment
         sentences.append(
-            f"Experiment “{e.title}”: {count(len(e.runs()), 'run')} of {e.total_updates:,} gradient steps asked for"
+            f"Experiment “{e.title}”: {count(len(e.runs()), 'run')} of {e.budget} asked for"
             + (f", at scale {asked.scale:g} of the full experiment." if asked.scale < 1 else ".")
         )
     if results.runs:
         steps = sorted({run.total_updates for run in results.runs})
         budget = f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}"
+        if any(run.config.get("max_processor_s") is not None for run in results.runs):
+            budget = f"at most {budget}"
         seeds = {run.seed for run in results.runs}
         agents = sorted(set(results.agents.values()))
         sentences.append(
@@ -43,8 +45,8 @@ def what_was_run(results: Results) -> list[str]:
 
 
 def what_beats_what(results: Results) -> list[str]:
-    """For each scenario the trained agents in order, each compared with the next on the tasks that all have; then the
-    best of them with the players that do not learn.
+    """For each scenario the trained agents in order, each compared with the next on the tasks that all of them played;
+    then the best of them with the players that do not learn.
     """
     sentences = []
     for name in scenarios():
@@ -77,7 +79,7 @@ def _common_tasks(scenario: str, episodes: pl.DataFrame, scores: dict[str, Score
 
 def _described(scenario: str, tasks: Sequence[str]) -> str:
     if set(tasks) == {task.id for task in named_tasks(scenario, split="test")}:
-        return "mean of the 7 test tasks"
+        return f"mean of the {len(tasks)} test tasks"
     if len(tasks) == 1:
         return tasks[0].partition("/")[2]
     return f"mean of the {len(tasks)} tasks that all played"
@@ -87,12 +89,12 @@ def _comparison(scores: dict[str, Scores], one: str, other: str, tasks: Sequence
     gain = estimate_groups([(scores[one], tasks), (scores[other], tasks)], difference).estimate
     assert gain is not None, "all have these tasks"
     if gain.low <= 0 <= gain.high:
-        return f"{one} and {other} are not told apart (difference {gain} points)"
+        return f"no difference shown between {one} and {other} ({gain} points)"
     return f"{one} {'beats' if gain.value > 0 else 'is behind'} {other} by {gain} points"
 
 
 def caveats(results: Results) -> list[str]:
-    """What keeps the numbers from reaching far."""
+    """What the numbers cannot show."""
     found = []
     if small := sorted({asked.scale for asked in results.asked if asked.scale < 1}):
         found.append(
@@ -109,7 +111,7 @@ def caveats(results: Results) -> list[str]:
             f"Fewer than {ENOUGH_SEEDS} training seeds of {', '.join(few)}: differences between agents may be "
             "differences between seeds."
         )
-    unfinished = [r.id for r in results.runs if r.metrics.is_empty() or r.metrics["num_updates"][-1] < r.total_updates]
+    unfinished = [run.id for run in results.runs if not run.ended]
     if unfinished:
         found.append(f"Not trained to the end (or without metrics): {', '.join(unfinished)}.")
     there = {str(run.path) for run in results.runs}

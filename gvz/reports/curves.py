@@ -9,6 +9,7 @@ import polars as pl
 from gvz.evaluation.statistics import bootstrap_runs
 from gvz.reports.results import Run
 from gvz.reports.scores import Scores, pick, redraw
+from gvz.tasks import LEVELS, parse_task
 
 WINDOW_EPISODES = 30
 """training episodes in a running mean, as in the trainer's own KPI"""
@@ -43,9 +44,8 @@ def learning_curve(label: str, runs: Sequence[Run], tasks: Sequence[str]) -> Cur
     """Running mean of the scores of training episodes, mean over the tasks and then over the training seeds.
 
     Args:
-        label: of the line.
         runs: of one agent; several of one seed if every task has a run of its own.
-        tasks: only episodes of these; a seed that has none of one of them is left out.
+        tasks: only episodes of these; a seed without an episode of one of them is left out.
 
     Returns: the curve with the band of redrawn seeds, or None without any episodes.
     """
@@ -81,14 +81,12 @@ def _held(series: tuple[np.ndarray, np.ndarray], grid: np.ndarray) -> np.ndarray
     return running_mean(scores, WINDOW_EPISODES)[np.searchsorted(updates, grid, side="right") - 1]
 
 
-def evaluation_curve(label: str, episodes: pl.DataFrame, tasks: Sequence[str], agents_of_tasks: bool) -> Curve | None:
+def evaluation_curve(label: str, episodes: pl.DataFrame, tasks: Sequence[str]) -> Curve | None:
     """Mean evaluation score of each checkpoint over tasks and training seeds, with its interval.
 
     Args:
-        label: of the line.
         episodes: rows of one agent; the n-th checkpoints of its runs are taken together.
         tasks: only these; a seed that lacks one of them at a checkpoint is left out there.
-        agents_of_tasks: every task has agents of its own.
 
     Returns: the curve, or None if no checkpoint has all tasks.
     """
@@ -98,7 +96,7 @@ def evaluation_curve(label: str, episodes: pl.DataFrame, tasks: Sequence[str], a
     updates, estimates = [], []
     for (_,), checkpoint in sorted(rows.drop_nulls("num_updates").group_by("nth")):
         runs = pick(checkpoint)
-        scores = Scores(runs=runs, wanted_seeds=tuple(runs), agents_of_tasks=agents_of_tasks)
+        scores = Scores(runs=runs, wanted_seeds=tuple(runs))
         if cells := scores.cells(tasks):
             estimates.append(bootstrap_runs([cells], redraw=[redraw(scores, tasks)], num_resamples=300))
             updates.append(float(checkpoint["num_updates"].median()))  # pyright: ignore[reportArgumentType]  # not empty
@@ -111,3 +109,9 @@ def evaluation_curve(label: str, episodes: pl.DataFrame, tasks: Sequence[str], a
         low=np.array([e.low for e in estimates]),
         high=np.array([e.high for e in estimates]),
     )
+
+
+def level_curves(episodes: pl.DataFrame, tasks: Sequence[str]) -> list[Curve | None]:
+    """`evaluation_curve` of the tasks of each level."""
+    by_level = [[task for task in tasks if parse_task(task).level == level] for level in LEVELS]
+    return [evaluation_curve(f"level {level}", episodes, of_level) for level, of_level in enumerate(by_level)]

@@ -3,7 +3,7 @@
 `gvz.reports.write` writes a document as HTML, Markdown, CSV and LaTeX.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -21,7 +21,7 @@ class Cell:
     estimate: Estimate | None = None
     """the numbers behind the text"""
     note: str = ""
-    """small print: how much of what was wanted is there"""
+    """small print: how many of the required seeds there are"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -85,13 +85,14 @@ class Document:
 
     title: str
     abstract: tuple[str, ...]
-    """what was run, with which budget, what beats what"""
+    """what was run, with which budget, which agent beats which"""
     warnings: tuple[str, ...]
-    """what keeps the numbers from being believed further than they reach"""
+    """what the numbers cannot show"""
     sections: tuple[Section, ...]
     out: Path
     """the directory it is written to"""
-    made_with: str = field(default="")
+    made_with: str
+    """the versions of what made it"""
 
 
 def count(number: int, what: str) -> str:
@@ -105,12 +106,12 @@ def words(text: str) -> Cell:
 
 
 def theirs(value: float, digits: int = 1) -> Cell:
-    """A published number of somebody else's."""
+    """A number that others published."""
     return Cell(kind="theirs", text=f"{value:.{digits}f}", estimate=Estimate(value=value, low=value, high=value))
 
 
 def missing(note: str = "") -> Cell:
-    """What was wanted and is not there."""
+    """A number that is not there."""
     return Cell(kind="missing", text="-", note=note)
 
 

@@ -1,6 +1,6 @@
 """Figures of a report.
 
-A figure is one panel about as wide as a telephone, so that a page can set as many side by side as it has room for.
+A figure is one panel about as wide as a telephone, so that a page can show several in a row.
 Each is written as SVG, PDF and PNG; the page holds the SVG.
 """
 
@@ -13,17 +13,20 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Picture
+from matplotlib.rcsetup import cycler
 from matplotlib.ticker import FuncFormatter
 
 from gvz.reports.curves import Curve
 from gvz.reports.document import Figure
+from gvz.scenarios.base import Task
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
-"""Okabe and Ito's, which can be told apart without seeing all colours; brown in place of yellow"""
+"""Okabe and Ito's, for readers with any colour vision; brown in place of yellow"""
 GREY = "#777777"
 PANEL_INCHES = (4.2, 3.0)
 STYLE: dict[Any, Any] = {
     "font.size": 9,
+    "axes.prop_cycle": cycler(color=COLOURS),
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.titlesize": 10,
@@ -35,11 +38,6 @@ STYLE: dict[Any, Any] = {
     "svg.hashsalt": "gvz",  # the same numbers give the same bytes
     "figure.constrained_layout.use": True,
 }
-
-
-def colour(number: int) -> str:
-    """Of the n-th line of a panel."""
-    return COLOURS[number % len(COLOURS)]
 
 
 def draw_curves(
@@ -65,7 +63,7 @@ def draw_curves(
         for number, curve in enumerate(curves):
             if curve is None:
                 continue
-            line = colour(number)
+            line = f"C{number}"
             if curve.points is not None:
                 axes.plot(*curve.points, ".", markersize=1.5, alpha=0.2, color=line, rasterized=True)
             mark = "o" if len(curve.updates) <= 20 else ""
@@ -79,23 +77,20 @@ def draw_curves(
         return _written(picture, out, id, caption)
 
 
-def draw_histogram(
-    out: Path, id: str, title: str, scores: Mapping[str, np.ndarray], caption: str, top: float = 100.0
-) -> Figure:
-    """How an agent's episodes spread over the scores, an outline each.
+def draw_histogram(out: Path, id: str, title: str, scores: Mapping[str, np.ndarray], caption: str) -> Figure:
+    """How agents' episodes spread over the scores, an outline each.
 
     Args:
         out, id, title, caption: as of `draw_curves`.
         scores: agent -> percent of the upper bound of single episodes; an agent without any keeps its colour.
-        top: the highest score shown.
     """
     with mpl.rc_context(STYLE):
         picture, axes = _panel(title, "score, % of the bound", "share of episodes, %")
-        edges = np.linspace(0, max(top, *(values.max() for values in scores.values() if len(values))), 26)
+        edges = np.linspace(0, max(100.0, *(values.max() for values in scores.values() if len(values))), 26)
         for number, (agent, values) in enumerate(scores.items()):
             if len(values):
                 share = 100 * np.histogram(values, edges)[0] / len(values)
-                axes.stairs(share, edges, color=colour(number), label=agent, linewidth=1.4)
+                axes.stairs(share, edges, color=f"C{number}", label=agent, linewidth=1.4)
         axes.set_ylim(0, None)
         _legend(picture, axes)
         return _written(picture, out, id, caption)
@@ -105,8 +100,7 @@ def draw_heat_map(
     out: Path,
     id: str,
     title: str,
-    tasks: Sequence[tuple[str, int, Sequence[str]]],
-    attributes: Sequence[str],
+    tasks: Sequence[Task],
     scores: Mapping[str, Sequence[float | None]],
     caption: str,
 ) -> Figure:
@@ -114,10 +108,11 @@ def draw_heat_map(
 
     Args:
         out, id, title, caption: as of `draw_curves`.
-        tasks: name, level, attributes.
-        attributes: all there are, in the order of their columns.
+        tasks: of one scenario, at least one.
         scores: agent -> mean score in percent of the bound by task, None where there is none.
     """
+    names = [attribute.name for attribute in tasks[0].scenario.attributes]
+    attributes = [name for name in names if any(name in task.attributes for task in tasks)]
     num_marks, num_agents = len(attributes), len(scores)
     mark_inches, agent_inches = 0.25, 0.55
     width = 2.4 + mark_inches * num_marks + agent_inches * num_agents
@@ -132,42 +127,40 @@ def draw_heat_map(
             shade = "white" if value < 60 else "black"
             heat.text(column, row, text, ha="center", va="center", fontsize=8, color=GREY if np.isnan(value) else shade)
         heat.set_xticks(range(num_agents), list(scores), rotation=90)
-        for row, (_, _, having) in enumerate(tasks):
+        for row, task in enumerate(tasks):
             marks.plot(range(num_marks), [row] * num_marks, ".", color="#dddddd", markersize=5)
-            columns = [attributes.index(name) for name in having]
+            columns = [attributes.index(name) for name in task.attributes]
             marks.plot(columns, [row] * len(columns), "-", color="black", linewidth=1)
             marks.plot(columns, [row] * len(columns), "o", color="black", markersize=4.5)
-        marks.set_xticks(range(num_marks), list(attributes), rotation=90)
+        marks.set_xticks(range(num_marks), attributes, rotation=90)
         marks.set_xlim(-0.7, num_marks - 0.3)
-        marks.set_yticks(range(len(tasks)), [f"{level}  {name}" for name, level, _ in tasks])
+        marks.set_yticks(range(len(tasks)), [f"{task.level}  {task.name}" for task in tasks])
         for axes in (marks, heat):
             axes.xaxis.tick_top()
             axes.tick_params(length=0, labelsize=8)
             axes.spines[:].set_visible(False)
-            for row in (n for n in range(1, len(tasks)) if tasks[n][1] != tasks[n - 1][1]):
+            for row in (n for n in range(1, len(tasks)) if tasks[n].level != tasks[n - 1].level):
                 axes.axhline(row - 0.5, color="#999999", linewidth=0.8)
         return _written(picture, out, id, caption, wide=True)
 
 
-def draw_bars(
-    out: Path, id: str, title: str, values: Mapping[str, Mapping[str, float]], xlabel: str, caption: str
-) -> Figure:
-    """Grouped horizontal bars.
+def draw_rewards(out: Path, id: str, values: Mapping[str, Mapping[str, float]], caption: str) -> Figure:
+    """Horizontal bars, grouped by reward component.
 
     Args:
-        out, id, title, caption: as of `draw_curves`.
-        values: agent -> bar -> length; a bar that an agent lacks is left out, and so is an agent without any.
-        xlabel: what the length is.
+        out, id, caption: as of `draw_curves`.
+        values: agent -> component -> reward per episode; an agent without any keeps its colour.
     """
     bars = list(dict.fromkeys(bar for lengths in values.values() for bar in lengths))
     with mpl.rc_context(STYLE):
-        picture, axes = _panel(title, xlabel, "", inches=(PANEL_INCHES[0], 0.9 + 0.16 * len(bars) * (len(values) + 1)))
+        inches = (PANEL_INCHES[0], 0.9 + 0.16 * len(bars) * (len(values) + 1))
+        picture, axes = _panel("reward components", "reward per episode", "", inches)
         thick = 0.84 / len(values)
         for number, (agent, lengths) in enumerate(values.items()):
             if not lengths:
                 continue
             at = np.array([bars.index(bar) for bar in lengths]) + (number - (len(values) - 1) / 2) * thick
-            axes.barh(at, list(lengths.values()), height=thick, color=colour(number), label=agent)
+            axes.barh(at, list(lengths.values()), height=thick, color=f"C{number}", label=agent)
         axes.set_yticks(range(len(bars)), bars)
         axes.invert_yaxis()
         axes.axvline(0, color="black", linewidth=0.8)

@@ -1,7 +1,7 @@
 """The section of an experiment: its table as in the thesis, aggregates, comparisons, curves."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,64 +18,59 @@ from gvz.evaluation.statistics import (
 )
 from gvz.experiments.base import Experiment, TrainingRun
 from gvz.experiments.inventory import run_directory
-from gvz.reports.curves import evaluation_curve, learning_curve
+from gvz.reports.curves import evaluation_curve, learning_curve, level_curves
 from gvz.reports.document import Block, Cell, Figure, Section, Table, count, missing, theirs, words
 from gvz.reports.draw import draw_curves
-from gvz.reports.results import PlannedExperiment, Results
+from gvz.reports.results import TRAINING_SETS, PlannedExperiment, Results
 from gvz.reports.scores import Scores, estimate, estimate_groups, pick
-from gvz.tasks import parse_task, scenario_named
-
-_COLUMN_TITLES = {"train1": "1 task", "train4": "4 tasks", "train8": "8 tasks"}
+from gvz.tasks import LEVELS, parse_task, scenario_named
 
 
 def experiment_section(results: Results, asked: PlannedExperiment, out: Path) -> Section:
-    """Everything the report says of an experiment."""
+    """All that the report says about an experiment."""
     experiment = asked.experiment
     budget = (
-        f"{count(len(experiment.seeds), 'training seed')}, {experiment.total_updates:,} gradient steps, "
+        f"{count(len(experiment.seeds), 'training seed')}, {experiment.budget}, "
         f"{count(experiment.num_checkpoints, 'checkpoint')}, {count(experiment.episodes, 'evaluation episode')} a task "
         f"and checkpoint; tables are over the last {count(experiment.table_checkpoints, 'checkpoint')}."
     )
     tables = [result_table(results, asked), aggregate_table(results, asked)]
+    if experiment.evaluate_on == "gate":
+        tables.insert(1, result_table(results, asked, trained=True))
     if experiment.columns != "level":
         tables.append(comparison_table(results, asked))
     text = (f"**{experiment.question}** Source: {experiment.source}.", budget, *experiment.notes)
-    curves = Block(heading="Curves", figures=tuple(_figures(results, asked, out)))
-    if not curves.figures:
+    if experiment.max_processor_s is not None:
+        curves = Block(text=("Runs that end by their processor time are evaluated once: there are no curves.",))
+    elif figures := _figures(results, asked, out):
+        curves = Block(heading="Curves", figures=tuple(figures))
+    else:
         curves = Block(text=("No run of this experiment has been evaluated yet: there are no curves.",))
-    return Section(
-        id=experiment.name.replace("_", "-"),
-        title=experiment.title,
-        blocks=(Block(text=text, tables=tuple(tables)), curves),
-    )
+    blocks = (Block(text=text, tables=tuple(tables)), curves)
+    return Section(id=experiment.name.replace("_", "-"), title=experiment.title, blocks=blocks)
 
 
 def column_title(experiment: Experiment, column: str) -> str:
     """What stands above a column of the experiment's table."""
-    return f"level {column}" if experiment.columns == "level" else _COLUMN_TITLES.get(column, column)
+    titles: dict[str, str] = {**TRAINING_SETS}
+    return f"level {column}" if experiment.columns == "level" else titles.get(column, column)
 
 
 def column_scores(
-    results: Results, asked: PlannedExperiment, scenario: str, column: str, *, last_checkpoints: int | None = None
+    results: Results, asked: PlannedExperiment, scenario: str, column: str, *, trained: bool = False
 ) -> tuple[Scores, tuple[str, ...]]:
-    """Scores of the runs of one column in one scenario, and the ids of the tasks they are over.
-
-    Args:
-        results: what was read.
-        asked: the experiment.
-        scenario: id.
-        column: one of the experiment's `column_names`.
-        last_checkpoints: so many of each run; default the experiment's `table_checkpoints`.
+    """Scores of the runs of one column in one scenario, and the ids of the tasks they are over: the table's, or those
+    that each run was trained on.
     """
     experiment = asked.experiment
-    last = experiment.table_checkpoints if last_checkpoints is None else last_checkpoints
     runs: dict[int | None, dict[str, np.ndarray]] = {}
     tasks: dict[str, None] = {}
     for run in column_runs(experiment, scenario, column):
-        wanted = _column_tasks(experiment, run, column)
+        wanted = run.tasks if trained else _column_tasks(experiment, run, column)
         tasks |= dict.fromkeys(wanted)
-        rows = run_episodes(results, asked, run).filter(
-            pl.col("num_updates").rank("dense", descending=True) <= last, pl.col("task").is_in(wanted)
+        rows = _episodes_of(results, asked, [run]).filter(
+            pl.col("num_updates").rank("dense", descending=True) <= experiment.table_checkpoints,
+            pl.col("task").is_in(wanted),
         )
         for by_task in pick(rows).values():
             runs.setdefault(run.seed, {}).update(by_task)
@@ -92,12 +87,7 @@ def column_runs(experiment: Experiment, scenario: str, column: str) -> list[Trai
         case "training":
             return [run for run in runs if run.training == column]
         case "config":
-            return [run for run in runs if run.config == column]
-
-
-def run_episodes(results: Results, asked: PlannedExperiment, run: TrainingRun) -> pl.DataFrame:
-    """The evaluation episodes of one run of the experiment."""
-    return results.episodes.filter(run_dir=str(run_directory(asked.results, run)))
+            return [run for run in runs if run.agent == column]
 
 
 def _column_tasks(experiment: Experiment, run: TrainingRun, column: str) -> tuple[str, ...]:
@@ -105,55 +95,58 @@ def _column_tasks(experiment: Experiment, run: TrainingRun, column: str) -> tupl
     return tuple(t for t in tasks if parse_task(t).level == int(column)) if experiment.columns == "level" else tasks
 
 
-def result_table(results: Results, asked: PlannedExperiment) -> Table:
-    """Rows: for every scenario ours and, below, what others published; then the mean over scenarios."""
+def result_table(results: Results, asked: PlannedExperiment, *, trained: bool = False) -> Table:
+    """For every scenario a row of ours, then rows of published numbers; at the end the means over scenarios.
+
+    With `trained`, the table is over the tasks that each run was trained on, and has no published numbers.
+    """
     experiment, columns = asked.experiment, asked.experiment.column_names
+    published = {} if trained else experiment.published
+    groups = {
+        column: [column_scores(results, asked, scenario, column, trained=trained) for scenario in experiment.scenarios]
+        for column in columns
+    }
     rows = []
-    for scenario in experiment.scenarios:
-        title = scenario_named(scenario).title
-        cells = [estimate(*column_scores(results, asked, scenario, column)) for column in columns]
-        rows.append((words(title), words("ours"), *cells))
-        for who, published in experiment.published.items():
-            if scenario in published:
-                numbers = [theirs(value, 2) for value in published[scenario]]
-                rows.append((words(title), Cell(kind="theirs", text=who), *numbers))
+    for number, scenario in enumerate(experiment.scenarios):
+        cells = [estimate(*groups[column][number]) for column in columns]
+        numbers = {who: found[scenario] for who, found in published.items() if scenario in found}
+        rows += _rows(scenario_named(scenario).title, cells, numbers)
     if len(experiment.scenarios) > 1:
-        groups = [[column_scores(results, asked, s, column) for s in experiment.scenarios] for column in columns]
-        averages = [estimate_groups(group, mean_over_scenarios) for group in groups]
-        rows.append((words("P_norm: mean over scenarios"), words("ours"), *averages))
-        for who, published in experiment.published.items():
-            if published.keys() >= set(experiment.scenarios):
-                numbers = np.mean([published[s] for s in experiment.scenarios], axis=0)
-                rows.append(
-                    (
-                        words("P_norm: mean over scenarios"),
-                        Cell(kind="theirs", text=who),
-                        *[theirs(v, 2) for v in numbers],
-                    )
-                )
+        averages = [estimate_groups(group, mean_over_scenarios) for group in groups.values()]
+        numbers = {
+            who: np.mean([found[scenario] for scenario in experiment.scenarios], axis=0).tolist()
+            for who, found in published.items()
+            if found.keys() >= set(experiment.scenarios)
+        }
+        rows += _rows("P_norm: mean over scenarios", averages, numbers)
+    others = " Rows in italics are published numbers; no number of ours uses them." if published else ""
+    over = " on the tasks of training" if trained else " on the gate tasks" * (experiment.evaluate_on == "gate")
     return Table(
-        id=experiment.name,
-        caption=f"{experiment.title}: percent of the upper bound ({experiment.source})."
-        + (
-            " Rows in italics are others' published numbers; nothing of ours is made of them."
-            * bool(experiment.published)
-        ),
+        id=f"{experiment.name}_training" if trained else experiment.name,
+        caption=f"{experiment.title}: percent of the upper bound{over} ({experiment.source}).{others}",
         columns=("scenario", "numbers", *(column_title(experiment, column) for column in columns)),
         rows=tuple(rows),
         notes=(interval_note(experiment),),
     )
 
 
+def _rows(title: str, ours: Sequence[Cell], published: Mapping[str, Sequence[float]]) -> list[tuple[Cell, ...]]:
+    """A row of our cells, then one for each who published numbers."""
+    others = [
+        (words(title), Cell(kind="theirs", text=who), *(theirs(number, 2) for number in numbers))
+        for who, numbers in published.items()
+    ]
+    return [(words(title), words("ours"), *ours), *others]
+
+
 def interval_note(experiment: Experiment) -> str:
     """What the intervals of an experiment's tables are."""
     if len(experiment.seeds) < 2:
-        return (
-            "Mean [95% bootstrap interval over evaluation episodes]: one training seed, so nothing is said of others."
-        )
-    what = "runs drawn anew within each task" if experiment.evaluate_on == "own" else "training seeds drawn anew, whole"
+        return "Mean [95% bootstrap interval over evaluation episodes] of one training seed; others may differ."
+    what = "runs resampled within each task" if experiment.evaluate_on == "own" else "whole training seeds resampled"
     return (
         f"Mean [95% bootstrap interval, {what}]. With {len(experiment.seeds)} seeds it is about the range of their "
-        "means. Where seeds are missing the cell says so."
+        "means. A cell with missing seeds says so."
     )
 
 
@@ -184,7 +177,7 @@ def aggregate_table(results: Results, asked: PlannedExperiment) -> Table:
 
 
 def comparison_table(results: Results, asked: PlannedExperiment) -> Table:
-    """Each two columns: difference of the means, and how probable it is that the first is better."""
+    """For each two columns the difference of the means, and the probability that the first is better."""
     experiment = asked.experiment
     rows = []
     for worse, better in itertools.combinations(experiment.column_names, 2):
@@ -231,7 +224,7 @@ def _learning_curves(results: Results, asked: PlannedExperiment, scenario: str, 
     paths = {str(run_directory(asked.results, run)) for run in runs}
     trained = [run for run in results.runs if str(run.path) in paths]
     tasks = list(dict.fromkeys(task for run in runs for task in run.tasks))
-    by_level = {f"level {level}": [task for task in tasks if parse_task(task).level == level] for level in range(5)}
+    by_level = {f"level {level}": [task for task in tasks if parse_task(task).level == level] for level in LEVELS}
     of_level_1 = {task.partition("/")[2]: [task] for task in by_level["level 1"]}
     figures = []
     for id, lines, what in (("levels", by_level, "by level"), ("level_1", of_level_1, "on each task of level 1")):
@@ -251,10 +244,7 @@ def _curves_by_level(results: Results, asked: PlannedExperiment, scenario: str, 
     """Evaluation scores of checkpoints by level (thesis Figure 5.6)."""
     experiment, title = asked.experiment, scenario_named(scenario).title
     runs = column_runs(experiment, scenario, "0")
-    rows = _episodes_of(results, asked, runs)
-    tasks = experiment.table_tasks(runs[0])
-    by_level = [[task for task in tasks if parse_task(task).level == level] for level in range(5)]
-    curves = [evaluation_curve(f"level {n}", rows, chosen, agents_of_tasks=False) for n, chosen in enumerate(by_level)]
+    curves = level_curves(_episodes_of(results, asked, runs), experiment.table_tasks(runs[0]))
     if not any(curves):
         return []
     caption = f"{title}: evaluation of every checkpoint by level, mean over tasks and seeds with 95% interval."
@@ -266,16 +256,10 @@ def _curves_by_task(results: Results, asked: PlannedExperiment, scenario: str, o
     experiment, title = asked.experiment, scenario_named(scenario).title
     figures = []
     by_column = {c: column_runs(experiment, scenario, c) for c in experiment.column_names}
-    tasks = experiment.table_tasks(next(iter(by_column.values()))[0])
     rows = {c: _episodes_of(results, asked, runs) for c, runs in by_column.items()}
-    for task in tasks:
-        curves = [
-            curve
-            for column in experiment.column_names
-            if (
-                curve := evaluation_curve(column_title(experiment, column), rows[column], [task], agents_of_tasks=False)
-            )
-        ]
+    for task in experiment.table_tasks(next(iter(by_column.values()))[0]):
+        found = [evaluation_curve(column_title(experiment, c), rows[c], [task]) for c in experiment.column_names]
+        curves = [curve for curve in found if curve is not None]
         if curves:
             name = task.partition("/")[2]
             caption = f"{title}, {name} (level {parse_task(task).level}): evaluation of every checkpoint."
@@ -292,4 +276,5 @@ def _players(results: Results, task: str) -> dict[str, float]:
 
 
 def _episodes_of(results: Results, asked: PlannedExperiment, runs: Sequence[TrainingRun]) -> pl.DataFrame:
+    """The evaluation episodes of some runs of the experiment."""
     return results.episodes.filter(pl.col("run_dir").is_in([str(run_directory(asked.results, run)) for run in runs]))

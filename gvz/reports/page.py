@@ -9,7 +9,7 @@ from gvz.core.errors import ConfigError
 from gvz.reports.abstract import caveats, what_beats_what, what_was_run
 from gvz.reports.document import Block, Document, Section
 from gvz.reports.experiment_section import experiment_section
-from gvz.reports.results import Results, read_results
+from gvz.reports.results import read_results
 from gvz.reports.run_section import run_sections
 from gvz.reports.scenario_section import scenario_sections
 from gvz.reports.write import write_document
@@ -50,23 +50,15 @@ def make_report(paths: Sequence[Path], out: Path, title: str | None = None) -> t
     sections = [experiment_section(results, asked, out) for asked in results.asked]
     sections += [*scenario_sections(results, out), *run_sections(results, out)]
     if results.problems:
-        sections.append(_problems(results))
+        text = ("What could not be read or is not there. Everything else was.", *results.problems)
+        sections.append(Section(id="problems", title="Problems", blocks=(Block(text=text),)))
+    versions = ", ".join(f"{name} {version(name)}" for name in _PACKAGES)
     document = Document(
         title=title or "Report on " + ", ".join(path.resolve().name for path in paths),
         abstract=(*what_was_run(results), *what_beats_what(results)),
         warnings=tuple(caveats(results)),
         sections=tuple(sections),
         out=out,
-        made_with=_made_with(),
+        made_with=f"This report was made with Python {platform.python_version()}, {versions}.",
     )
     return write_document(document), results.problems
-
-
-def _problems(results: Results) -> Section:
-    text = ("What could not be read or is not there. Everything else was.", *results.problems)
-    return Section(id="problems", title="Problems", blocks=(Block(text=text),))
-
-
-def _made_with() -> str:
-    versions = ", ".join(f"{name} {version(name)}" for name in _PACKAGES)
-    return f"This report was made with Python {platform.python_version()}, {versions}."

@@ -12,18 +12,23 @@ from typing import Any, get_args
 
 import polars as pl
 
+from gvz.core import records
 from gvz.core.errors import ConfigError
 from gvz.evaluation.dataset import collect_evaluations, fits
 from gvz.experiments.base import Experiment
+from gvz.experiments.inventory import PROCESSOR_S
 from gvz.experiments.plan import read_plan
-from gvz.run.rundir import read_records
+from gvz.reports.document import count
 from gvz.scenarios.base import Split
 from gvz.tasks import named_tasks, scenarios
 
 EACH = "each task alone"
-"""training of the agents of which every one was trained on a task of its own"""
+"""training of agents each of which was trained on one task"""
 
-_TRAININGS = {"train1": "1 task", "train4": "4 tasks", "train8": "8 tasks"}
+TRAINING_SETS: dict[Split, str] = {
+    split: count(int(split.removeprefix("train")), "task") for split in get_args(Split) if split != "test"
+}
+"""what to call a training set: "4 tasks" for train4"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -57,14 +62,28 @@ class Run:
         return int(self.config["learner"]["total_updates"])
 
     @property
+    def processor_s(self) -> float | None:
+        """Processor time of the run, seconds; None in records of older versions."""
+        return None if self.metrics.is_empty() else self.metrics[PROCESSOR_S][-1]
+
+    @property
+    def ended(self) -> bool:
+        """It has had all its gradient steps, or all its processor time."""
+        if self.metrics.is_empty():
+            return False
+        limit_s, used_s = self.config.get("max_processor_s"), self.processor_s
+        used_up = isinstance(limit_s, int | float) and used_s is not None and used_s >= limit_s
+        return used_up or self.metrics["num_updates"][-1] >= self.total_updates
+
+    @property
     def scenario(self) -> str:
         return self.tasks[0].partition("/")[0]
 
     @property
     def training(self) -> str:
         """ "4 tasks", "gore alone": what it was trained on, in words."""
-        for split, words in _TRAININGS.items():
-            if set(self.tasks) == _split(self.scenario, split):
+        for split, words in TRAINING_SETS.items():
+            if set(self.tasks) == _task_ids(self.scenario, split):
                 return words
         one = self.tasks[0].partition("/")[2]
         return f"{one} alone" if len(self.tasks) == 1 else f"{len(self.tasks)} chosen tasks"
@@ -136,10 +155,10 @@ def read_results(paths: Sequence[Path]) -> Results:
 
 
 def _read_run(file: Path, results: Path) -> tuple[Run | None, list[str]]:
-    """The run, if it can be told, and what is wrong with it."""
-    metrics, problems = _read_columns(file.parent, "metrics", _METRICS)
-    episodes, more = _read_columns(file.parent, "episodes", _TRAINING_EPISODES)
-    starts, unread = _read_starts(file.parent)
+    """The run, if it can be read, and what is wrong with it."""
+    metrics, problems = _read_columns(file.parent / "metrics.jsonl", _METRICS)
+    episodes, more = _read_columns(file.parent / "episodes.jsonl", _TRAINING_EPISODES)
+    starts, unread = _read_starts(file.parent / "starts.jsonl")
     try:
         saved = json.loads(file.read_text())
         json.dumps(saved, ensure_ascii=False).encode()  # text that no file can hold has no place in a report
@@ -169,9 +188,8 @@ def _run_id(directory: Path, results: Path) -> str:
 
 
 @cache
-def _split(scenario: str, split: str) -> set[str]:
-    name: Split = next(one for one in get_args(Split) if one == split)
-    return {task.id for task in named_tasks(scenario, split=name)} if scenario in scenarios() else set()
+def _task_ids(scenario: str, split: Split) -> set[str]:
+    return {task.id for task in named_tasks(scenario, split=split)} if scenario in scenarios() else set()
 
 
 def _agents(runs: Sequence[Run]) -> dict[str, str]:
@@ -210,6 +228,7 @@ _METRICS = {
     "actors/frames_per_s": pl.Float64(),
     "actors/env_steps": pl.Int64(),
     "actors/restarts": pl.Int64(),
+    PROCESSOR_S: pl.Float64(),
 }
 _TRAINING_EPISODES = {
     "num_updates": pl.Int64(),
@@ -220,9 +239,9 @@ _TRAINING_EPISODES = {
 }
 
 
-def _read_columns(directory: Path, name: str, columns: Mapping[str, pl.DataType]) -> tuple[pl.DataFrame, list[str]]:
+def _read_columns(file: Path, columns: Mapping[str, pl.DataType]) -> tuple[pl.DataFrame, list[str]]:
     """These columns of a run's record file; rows without `num_updates` are left out, and values of other types."""
-    rows, problems = _read_rows(directory, name)
+    rows, problems = records.read_stored(file)
     values = {c: [v if fits(v := row.get(c), dtype) else None for row in rows] for c, dtype in columns.items()}
     return pl.DataFrame(values, columns).drop_nulls("num_updates"), problems
 
@@ -238,9 +257,9 @@ _START_TYPES = {
 }
 
 
-def _read_starts(directory: Path) -> tuple[list[dict[str, Any]], list[str]]:
+def _read_starts(file: Path) -> tuple[list[dict[str, Any]], list[str]]:
     """What a run was started on, and what is wrong with it."""
-    rows, problems = _read_rows(directory, "starts")
+    rows, problems = records.read_stored(file)
     good = []
     for number, row in enumerate(rows, 1):
         try:
@@ -250,18 +269,10 @@ def _read_starts(directory: Path) -> tuple[list[dict[str, Any]], list[str]]:
                 if not isinstance(value, kind | None) or (isinstance(value, int) and not fits(value, pl.Int64())):
                     raise TypeError(f"{name} is {value!r:.80}")
         except (ValueError, TypeError, RecursionError) as error:
-            problems.append(f"{directory / 'starts.jsonl'}, row {number}: not the start of a run ({error})")
+            problems.append(f"{file}, row {number}: not the start of a run ({error})")
         else:
             good.append(row)
     return good, problems
-
-
-def _read_rows(directory: Path, name: str) -> tuple[list[dict[str, Any]], list[str]]:
-    """The rows of a run's record file, compressed or not, and what is wrong with it; none if there is no such file."""
-    for file in (directory / f"{name}.jsonl", directory / f"{name}.jsonl.gz"):
-        if file.exists():
-            return read_records(file)
-    return [], []
 
 
 def training_time_s(metrics: pl.DataFrame) -> float:

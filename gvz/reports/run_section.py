@@ -33,7 +33,7 @@ def _rates(runs: Sequence[Run]) -> Table:
     rows = []
     for run in runs:
         if run.metrics.is_empty():
-            rows.append((words(run.id), *[missing("no metrics")] * 6))
+            rows.append((words(run.id), *[missing("no metrics")] * 7))
             continue
         last = run.metrics.tail(1).row(0, named=True)
         medians = run.metrics.select(
@@ -45,14 +45,16 @@ def _rates(runs: Sequence[Run]) -> Table:
                 words(f"{last['num_updates']:,} of {run.total_updates:,}"),
                 words("-" if last["actors/env_steps"] is None else f"{last['actors/env_steps']:,}"),
                 words(_hours(training_time_s(run.metrics))),
+                words("-" if run.processor_s is None else f"{run.processor_s:,.0f}"),
                 *(words("-" if rate is None else f"{rate:,.0f}") for rate in medians),
             )
         )
     return Table(
         id="throughput",
-        caption="Wall-clock time of training (pauses between a stop and the next start do not count) and median rates.",
+        caption="Wall-clock time of training (pauses between a stop and the next start do not count), processor time "
+        "of learner, actors and games together, and median rates.",
         columns=(
-            *("run", "gradient steps", "env steps", "hours:minutes:seconds"),
+            *("run", "gradient steps", "env steps", "hours:minutes:seconds", "processor seconds"),
             *("updates/s", "decisions/s", "frames/s"),
         ),
         rows=tuple(rows),
@@ -97,7 +99,7 @@ def _hours(seconds: float) -> str:
 
 
 def _configurations(results: Results) -> Table:
-    """Every field as a row, every agent as a column; seeds and directories left out, equal values said once."""
+    """Every field as a row, every agent as a column; without seeds and directories; rows that differ come first."""
     configs: dict[str, dict[str, Any]] = {}
     for run in results.runs:
         flat = _flat(run.config)
@@ -105,10 +107,7 @@ def _configurations(results: Results) -> Table:
             flat.pop(name, None)
         configs.setdefault(run.name, flat)
     fields = list(dict.fromkeys(field for config in configs.values() for field in config))
-    rows = []
-    for field in fields:
-        values = [str(config.get(field, "-")) for config in configs.values()]
-        rows.append((words(field), *(words(value) for value in values)))
+    rows = [(words(field), *(words(str(config.get(field, "-"))) for config in configs.values())) for field in fields]
     differ = [row for row in rows if len({cell.text for cell in row[1:]}) > 1]
     return Table(
         id="configurations",
@@ -129,12 +128,12 @@ def _flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _links(results: Results, out: Path) -> Block:
-    """Every file the report was made from, and what videos lie beside them."""
+    """Every file that the report was made from, and the videos in the same directories."""
     files = evaluation_files(results.paths)
     for run in results.runs:
         files += [file for name in ("config.json", "metrics", "episodes") for file in sorted(run.path.glob(f"{name}*"))]
     for path in results.paths:
         files += [file for file in sorted(path.rglob("*")) if file.suffix in _VIDEOS] if path.is_dir() else []
     links = [Link(text=str(file), target=os.path.relpath(file.resolve(), out.resolve())) for file in files]
-    text = "Every number above can be computed anew from these files (docs/REPORTS.md says how)."
+    text = "Every number above can be computed again from these files (see docs/REPORTS.md)."
     return Block(text=(text,), links=tuple(links))

@@ -1,6 +1,7 @@
 """The section of a scenario: every agent and player on every task, by level and by attribute."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -8,15 +9,15 @@ import numpy as np
 import polars as pl
 
 from gvz.evaluation.dataset import REWARD_PREFIX
-from gvz.evaluation.statistics import generalization_gap, interquartile_mean, mean, median, solved
-from gvz.reports.curves import evaluation_curve, learning_curve
-from gvz.reports.document import Block, Cell, Figure, Section, Table, missing, words
-from gvz.reports.draw import draw_bars, draw_curves, draw_heat_map, draw_histogram
+from gvz.evaluation.statistics import Statistic, generalization_gap, interquartile_mean, mean, median, solved
+from gvz.reports.curves import learning_curve, level_curves
+from gvz.reports.document import Block, Cell, Figure, Section, Table, count, missing, words
+from gvz.reports.draw import draw_curves, draw_heat_map, draw_histogram, draw_rewards
 from gvz.reports.experiment_section import what_id
 from gvz.reports.results import Results, Run
 from gvz.reports.scores import Scores, agent_scores, estimate, pick
 from gvz.scenarios.base import Scenario, Task
-from gvz.tasks import named_tasks, parse_task, scenario_named, scenarios
+from gvz.tasks import LEVELS, named_tasks, parse_task, scenario_named, scenarios
 
 
 def scenario_sections(results: Results, out: Path) -> list[Section]:
@@ -55,7 +56,7 @@ def _section(results: Results, scenario: Scenario, out: Path) -> Section:
         pictures += _histograms(scenario, final, agents, out)
         pictures += _rewards(scenario, final, agents, out)
         text = (
-            f"Score: {'kills' if scenario.metric == 'kills' else 'frames alive'}; percent of the upper bound "
+            f"Score: {scenario.metric.replace('_', ' ')}; percent of the upper bound "
             f"({scenario.upper_bound():g} in profile thesis). A trained agent's numbers are of the last quarter of its "
             "evaluated checkpoints.",
         )
@@ -74,26 +75,31 @@ def _interval_note(scores: Mapping[str, Scores]) -> str:
     if not several:
         return "Mean [95% bootstrap interval over evaluation episodes]. It says nothing about other training seeds."
     return (
-        f"Mean [95% bootstrap interval]: training seeds drawn anew for {', '.join(several)}; evaluation episodes for "
-        "the others."
+        f"Mean [95% bootstrap interval]: training seeds resampled for {', '.join(several)}; evaluation "
+        "episodes for the others."
     )
 
 
+def _cell(scores: Scores, tasks: Sequence[str], statistic: Statistic = mean, note: str = "") -> Cell:
+    """An estimate with its notes; missing if none of the tasks was played."""
+    cell = estimate(scores, tasks, statistic) if scores.played(tasks) else missing()
+    return replace(cell, note="; ".join(filter(None, (cell.note, note))))
+
+
 def level_table(scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task]) -> Table:
-    """Agents as rows, levels as columns, then all test tasks together."""
+    """Agents as rows; levels as columns, then statistics of the test tasks."""
     test = [task.id for task in named_tasks(scenario.id, split="test")]
     played = {task.id for task in tasks}
-    levels = [(f"level {n}", [t.id for t in tasks if t.level == n]) for n in range(5)]
+    levels = [(f"level {n}", [t.id for t in tasks if t.level == n]) for n in LEVELS]
     levels = [(title, ids) for title, ids in levels if ids]
     rows = []
     for agent, one in scores.items():
-        cells = [estimate(one, ids) if one.played(ids) else missing() for _, ids in levels]
+        cells = [_cell(one, ids) for _, ids in levels]
         if set(test) <= played:
-            statistics = (mean, interquartile_mean, median)
-            cells += [estimate(one, test, s) if one.played(test) else missing() for s in statistics]
+            cells += [_cell(one, test, statistic) for statistic in (mean, interquartile_mean, median)]
         rows.append((words(agent), *cells))
-    columns = ["agent", *(f"{title} ({len(ids)} task{'s' * (len(ids) > 1)})" for title, ids in levels)]
-    columns += ["P: mean of the 7 test tasks", "their IQM", "their median"] if set(test) <= played else []
+    columns = ["agent", *(f"{title} ({count(len(ids), 'task')})" for title, ids in levels)]
+    columns += [f"P: mean of the {len(test)} test tasks", "their IQM", "their median"] if set(test) <= played else []
     return Table(
         id=f"{scenario.id}_levels",
         caption=f"{scenario.title} by level, percent of the upper bound.",
@@ -110,11 +116,8 @@ def task_table(
     who_solved = _solved(scenario, episodes.filter("final"))
     rows = []
     for task in tasks:
-        cells = []
-        for agent, one in scores.items():
-            cell = estimate(one, [task.id]) if one.played([task.id]) else missing()
-            note = "; ".join(filter(None, (cell.note, "solved" if (agent, task.id) in who_solved else "")))
-            cells.append(Cell(kind=cell.kind, text=cell.text, estimate=cell.estimate, note=note))
+        solved_by = {agent for agent, solved_task in who_solved if solved_task == task.id}
+        cells = [_cell(one, [task.id], note="solved" * (agent in solved_by)) for agent, one in scores.items()]
         rows.append((words(task.name), words(str(task.level)), *cells))
     notes = (_interval_note(scores),)
     if scenario.metric == "frames_alive":
@@ -131,7 +134,7 @@ def task_table(
 def own_kills_table(scenario: Scenario, own: Mapping[str, Scores], tasks: Sequence[Task]) -> Table:
     """Tasks and then levels as rows, agents as columns: the enemies that the agent killed itself."""
     groups = [(task.name, task.level, [task.id]) for task in tasks]
-    by_level = [(level, [task.id for task in tasks if task.level == level]) for level in range(5)]
+    by_level = [(level, [task.id for task in tasks if task.level == level]) for level in LEVELS]
     groups += [(f"mean of {len(ids)} tasks", level, ids) for level, ids in by_level if len(ids) > 1]
     return Table(
         id=f"{scenario.id}_own_kills",
@@ -139,12 +142,7 @@ def own_kills_table(scenario: Scenario, own: Mapping[str, Scores], tasks: Sequen
         "The score also counts enemies that other enemies killed, and is at most the upper bound.",
         columns=("task", "level", *own),
         rows=tuple(
-            (
-                words(name),
-                words(str(level)),
-                *(estimate(one, ids) if one.played(ids) else missing() for one in own.values()),
-            )
-            for name, level, ids in groups
+            (words(name), words(str(level)), *(_cell(one, ids) for one in own.values())) for name, level, ids in groups
         ),
         notes=(_interval_note(own),),
     )
@@ -167,7 +165,7 @@ def _solved(scenario: Scenario, final: pl.DataFrame) -> set[tuple[str, str]]:
 def gap_table(
     results: Results, scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task]
 ) -> Table | None:
-    """How much agents lose from the tasks trained on to others, and from levels 0 and 1 to levels 2 to 4."""
+    """How much lower agents score on other tasks than on their training tasks, and on levels 2 to 4 than on 0 and 1."""
     trained_on = {results.agents[str(r.path)]: r.tasks for r in results.runs if r.scenario == scenario.id}
     test = [task.id for task in named_tasks(scenario.id, split="test")]
     low, high = [t.id for t in tasks if t.level <= 1], [t.id for t in tasks if t.level >= 2]
@@ -180,8 +178,8 @@ def gap_table(
         return None
     return Table(
         id=f"{scenario.id}_gap",
-        caption=f"{scenario.title}, generalization gap in points of the upper bound: what is lost on tasks never "
-        "trained on. The smaller the better, given equal scores.",
+        caption=f"{scenario.title}, generalization gap in points of the upper bound: what is lost on tasks "
+        "that were not trained on. At equal scores a smaller gap is better.",
         columns=("agent", "training tasks less test tasks", "levels 0 and 1 less levels 2 to 4"),
         rows=tuple(rows),
     )
@@ -197,22 +195,15 @@ def _gap(scores: Scores, easier: Sequence[str], harder: Sequence[str]) -> Cell:
 
 
 def _heat_map(scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task], out: Path) -> Figure:
-    attributes = [attribute.name for attribute in scenario.attributes]
     means = {agent: [estimate(one, [task.id]).estimate for task in tasks] for agent, one in scores.items()}
-    return draw_heat_map(
-        out,
-        f"{scenario.id}_heat_map",
-        scenario.title,
-        [(task.name, task.level, task.attributes) for task in tasks],
-        [name for name in attributes if any(name in task.attributes for task in tasks)],
-        {agent: [None if e is None else e.value for e in row] for agent, row in means.items()},
-        f"{scenario.title}: level, task, its attributes, and the mean score in percent of the upper bound.",
-    )
+    values = {agent: [None if e is None else e.value for e in row] for agent, row in means.items()}
+    caption = f"{scenario.title}: level, task, its attributes, and the mean score in percent of the upper bound."
+    return draw_heat_map(out, f"{scenario.id}_heat_map", scenario.title, tasks, values, caption)
 
 
 def _histograms(scenario: Scenario, final: pl.DataFrame, agents: Sequence[str], out: Path) -> list[Figure]:
     figures = []
-    for level in range(5):
+    for level in LEVELS:
         rows = final.filter(level=level).drop_nulls("normalized_score")
         if rows.is_empty():
             continue
@@ -226,13 +217,12 @@ def _rewards(scenario: Scenario, final: pl.DataFrame, agents: Sequence[str], out
     means = final.group_by("agent").agg(pl.col(f"^{REWARD_PREFIX}.*$").mean())
     values: dict[str, dict[str, float]] = {agent: {} for agent in agents}
     for row in means.iter_rows(named=True):
-        components = {n.removeprefix(REWARD_PREFIX): v for n, v in row.items() if n != "agent" and v is not None}
-        values[row["agent"]] = components
+        agent = row.pop("agent")
+        values[agent] = {n.removeprefix(REWARD_PREFIX): v for n, v in row.items() if v is not None}
     if not any(values.values()):
         return []
     caption = f"{scenario.title}: mean sum of each reward component over an evaluation episode, all tasks together."
-    title = "reward components"
-    return [draw_bars(out, f"{scenario.id}_rewards", title, values, "reward per episode", caption)]
+    return [draw_rewards(out, f"{scenario.id}_rewards", values, caption)]
 
 
 def _learning(results: Results, scenario: Scenario, out: Path) -> list[Figure]:
@@ -274,10 +264,7 @@ def _evaluation(
         rows = episodes.filter(agent=agent)
         if rows["num_updates"].n_unique() < 2:
             continue
-        by_level = [rows.filter(level=n)["task"].unique(maintain_order=True).to_list() for n in range(5)]
-        curves = [
-            evaluation_curve(f"level {n}", rows, tasks, agents_of_tasks=False) for n, tasks in enumerate(by_level)
-        ]
         caption = f"{scenario.title}, {agent}: evaluation of every checkpoint by level, with 95% interval."
+        curves = level_curves(rows, rows["task"].unique(maintain_order=True).to_list())
         figures.append(draw_curves(out, f"evaluation_{scenario.id}_{what_id(agent)}", agent, curves, caption))
     return figures

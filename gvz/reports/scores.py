@@ -21,9 +21,9 @@ class Scores:
 
     runs: dict[Seed, dict[str, np.ndarray]]
     wanted_seeds: tuple[Seed, ...]
-    """all that there should be; the rest is missing"""
+    """the required ones; those that are not in `runs` are missing"""
     agents_of_tasks: bool = False
-    """every task has agents of its own, so that a seed says nothing about two tasks together"""
+    """every task has agents of its own: a seed stands for different agents on different tasks"""
 
     def complete_seeds(self, tasks: Sequence[str]) -> tuple[Seed, ...]:
         """Seeds with an episode at least of each task."""
@@ -44,12 +44,7 @@ class Scores:
 
 
 def pick(episodes: pl.DataFrame, *, column: str = "normalized_score") -> dict[Seed, dict[str, np.ndarray]]:
-    """Scores by training seed and task, in the order of the episodes.
-
-    Args:
-        episodes: rows of one agent.
-        column: what is picked; rows without it are left out.
-    """
+    """One agent's scores, or another column, by training seed and task; rows without the column are left out."""
     found: dict[Seed, dict[str, np.ndarray]] = {}
     grouped = episodes.drop_nulls(column).group_by("run_seed", "task", maintain_order=True).agg(column)
     for seed, task, values in grouped.iter_rows():

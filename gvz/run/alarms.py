@@ -41,13 +41,7 @@ class Expected:
 
 
 def alarms(row: Mapping[str, float], tasks: Sequence[TaskStatus], expected: Expected) -> dict[str, str]:
-    """The conditions that hold, each with what to say about it.
-
-    Args:
-        row: scalars of a log period, as in metrics.jsonl.
-        tasks: recent play of each task.
-        expected: of the run.
-    """
+    """The conditions that hold, each with what to say about it. `row` is a log period's row of metrics.jsonl."""
     return {
         **_crowded(row, expected),
         **_extreme_values(row, expected),

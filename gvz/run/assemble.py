@@ -1,25 +1,31 @@
-"""Builds the parts of a run from its configuration: sizes, agent, jitted functions, pool. No loop, no lifetime."""
+"""Builds the parts of a run from its configuration: sizes, agent, learner, pool. No loop, no lifetime."""
 
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from actors.inline import InlinePool
-from actors.pool import ActorPool, PoolConfig
-from gvz.actions import num_actions
-from gvz.run.config import RunConfig
+from actors.pool import Pool, PoolConfig
+from actors.process_pool import ProcessPool
+from gvz.core.errors import ConfigError
+from gvz.run.config import RunConfig, off_policy
 from gvz.run.footprint import Footprint
 from gvz.scenarios.compiler import compile_task
-from learner import replay
-from learner.agents.base import Agent, AgentSpec, make_agent
+from gvz.task_table import TaskTable
+from learner.agents.base import Agent, AgentSpec, OffPolicyAgent, OnPolicyAgent, make_agent
+from learner.config import OnPolicyConfig, ValueConfig
 from learner.export import export_policy, layout_hash
+from learner.learner import LearnerParts
 from learner.off_policy import OffPolicyParts
+from learner.on_policy import OnPolicyParts
 from learner.replay import ReplaySpec
+from learner.rollouts import RolloutSpec
+from learner.store import StoreSpec
 from learner.train_step import default_num_updates
-
-Pool = ActorPool | InlinePool
 
 ENV_ENTRY_POINT = "gvz.env:make_env"
 
@@ -28,9 +34,14 @@ ENV_ENTRY_POINT = "gvz.env:make_env"
 class RunParts:
     """What a run is made of, before anything is started."""
 
-    learner: OffPolicyParts
+    table: TaskTable
+    learner: LearnerParts
     pool_config: PoolConfig
     footprint: Footprint
+
+    def make_pool(self, config: RunConfig, state: dict[str, Any] | None) -> Pool:
+        """Starts the games: new ones, or from what `Pool.state()` gave."""
+        return (InlinePool if config.mode == "sync" else ProcessPool)(self.pool_config, state)
 
 
 def run_agent(config: RunConfig) -> Agent:
@@ -39,52 +50,39 @@ def run_agent(config: RunConfig) -> Agent:
     Raises:
         ConfigError: values that do not fit together.
     """
-    scenario = config.resolved_scenario()
-    v_min, v_max = config.value_range()
+    table, observed = config.table, config.agent
     height, width, channels = config.env.frame_shape
+    v_min, v_max = table.return_range
     return make_agent(
         config.agent,
         AgentSpec(
-            obs_shape=(height, width, channels * config.agent.stack_size),
-            num_actions=num_actions(scenario, config.env.action_set),
-            num_tasks=len(config.resolved_tasks()),
+            obs_shape=(height, width, channels * observed.stack_size),
+            num_actions=table.num_actions,
+            num_tasks=len(table),
             v_min=v_min,
             v_max=v_max,
+            num_variables=len(table.variables) if observed.game_variables else 0,
+            num_past_actions=observed.past_actions,
+            masked=table.action_masks is not None,
         ),
     )
 
 
 def assemble(config: RunConfig, work_dir: Path) -> RunParts:
-    """Compiles the maps and works out every size.
-
-    Args:
-        config: of the run.
-        work_dir: private directory for the actors' logs.
+    """Compiles the maps and works out every size; the actors' logs are to go to `work_dir`, a private directory.
 
     Raises:
         ConfigError: values that do not fit together.
     """
-    tasks = config.resolved_tasks()
-    for task in tasks:
+    table = config.table
+    for task in table.tasks:
         compile_task(task, config.env.profile)  # once, here: the actors find it in the cache
     agent = run_agent(config)
-    replay_spec = ReplaySpec(
-        num_lanes=config.num_lanes,
-        capacity=config.replay.capacity,
-        frame_shape=config.env.frame_shape,
-        num_tasks=len(tasks),
-        stack_size=config.agent.stack_size,
-        n_steps=config.agent.n_steps,
-        discount=config.agent.discount,
-        priority_exponent=config.replay.priority_exponent,
-        min_priority=config.replay.min_priority,
-        prioritized=config.replay.prioritized,
-        num_newest=config.replay.num_newest,
-    )
-    params = jax.eval_shape(agent.init, jax.random.key(0))
+    spec, params = agent.spec, jax.eval_shape(agent.init, jax.random.key(0))
     num_params = sum(leaf.size for leaf in jax.tree.leaves(params))
+    _, extras = jax.eval_shape(agent.act, params, jax.random.key(0), spec.zeros(), jnp.float32(0))
     pool_config = PoolConfig(
-        tasks=tuple(task.id for task in tasks),
+        tasks=table.ids,
         num_actors=config.num_actors,
         games_per_actor=config.games_per_actor,
         seed=config.seed,
@@ -92,25 +90,24 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
         env_config=dataclasses.asdict(config.env),
         frame_shape=config.env.frame_shape,
         stack_size=config.agent.stack_size,
-        num_actions=agent.spec.num_actions,
+        past_actions=spec.num_past_actions,
+        variables=table.variables if config.agent.game_variables else (),
+        num_extras=extras.shape[1],
+        action_masks=table.action_masks,
+        num_actions=spec.num_actions,
         policy=export_policy(agent, params, config.games_per_actor),
         num_params=num_params,
         layout_hash=layout_hash(params),
         actors=config.actors,
         work_dir=work_dir,
     )
+    learner = (_on_policy if config.agent.on_policy else _off_policy)(config, agent, pool_config)
     return RunParts(
-        learner=OffPolicyParts(
-            agent=agent,
-            agent_config=config.agent,
-            config=config.learner,
-            replay_config=config.replay,
-            replay_spec=replay_spec,
-            num_updates_per_call=default_num_updates(config.learner),
-        ),
+        table=table,
+        learner=learner,
         pool_config=pool_config,
         footprint=Footprint(
-            replay_bytes=replay.memory_bytes(replay_spec),
+            replay_bytes=learner.memory_bytes(),
             replay_on_host=jax.default_backend() == "cpu",
             params_bytes=4 * num_params,
             num_actors=0 if config.mode == "sync" else config.num_actors,
@@ -118,3 +115,53 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
             transport_bytes=0 if config.mode == "sync" else pool_config.shared_memory_bytes(),
         ),
     )
+
+
+def _off_policy(config: RunConfig, agent: Agent, pool: PoolConfig) -> OffPolicyParts:
+    """A learner of n-step transitions from a replay."""
+    if not isinstance(agent, OffPolicyAgent):
+        raise ConfigError(f"agent.name: {config.agent.name!r} has no `loss` of transitions; want on_policy = True")
+    learner, replay = off_policy(config)
+    spec = ReplaySpec(
+        **_store_sizes(config, pool),
+        capacity=replay.capacity,
+        n_steps=config.agent.n_steps if isinstance(config.agent, ValueConfig) else 1,
+        discount=config.agent.discount,
+        priority_exponent=replay.priority_exponent,
+        min_priority=replay.min_priority,
+        prioritized=replay.prioritized,
+        num_newest=replay.num_newest,
+    )
+    return OffPolicyParts(
+        agent=agent,
+        config=learner,
+        replay_config=replay,
+        replay_spec=spec,
+        num_updates_per_call=default_num_updates(learner),
+    )
+
+
+def _on_policy(config: RunConfig, agent: Agent, pool: PoolConfig) -> OnPolicyParts:
+    """A learner of rollouts."""
+    if not isinstance(agent, OnPolicyAgent):
+        raise ConfigError(f"agent.name: {config.agent.name!r} has no `targets` and `losses`; want on_policy = False")
+    assert isinstance(config.learner, OnPolicyConfig)
+    sizes = _store_sizes(config, pool)
+    window = StoreSpec(**sizes, capacity=0).history + config.learner.rollout_steps
+    return OnPolicyParts(
+        agent=agent, config=config.learner, spec=RolloutSpec(**sizes, capacity=config.num_lanes * window)
+    )
+
+
+def _store_sizes(config: RunConfig, pool: PoolConfig) -> dict[str, Any]:
+    """Fields of `StoreSpec`, but for its capacity."""
+    return {
+        "num_lanes": config.num_lanes,
+        "frame_shape": pool.frame_shape,
+        "num_tasks": len(pool.tasks),
+        "stack_size": pool.stack_size,
+        "num_past_actions": pool.past_actions,
+        "num_variables": len(pool.variables),
+        "num_extras": pool.num_extras,
+        "action_masks": pool.action_masks,
+    }

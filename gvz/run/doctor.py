@@ -1,6 +1,6 @@
-"""What a machine must have for a run, checked one by one: `gvz doctor`.
+"""The checks of `gvz doctor`: what a machine must have for a run.
 
-The engine and jax are tried in sub-processes, since a broken one can end the process that tries it.
+The engine and jax are tried in sub-processes, because a broken one can end its process.
 """
 
 import dataclasses
@@ -22,10 +22,10 @@ import psutil
 from gvz.core import janitor
 from gvz.core.cache import cache_directory
 from gvz.run.footprint import ACTOR_MEMORY_BYTES, ENGINE_SHM_BYTES, LEARNER_MEMORY_BYTES, format_bytes
-from gvz.run.machine import instruction_set
+from gvz.run.machine import instruction_set, versions
 
 State = Literal["ok", "note", "bad"]
-"""bad: runs will fail; note: they work, less well"""
+"""bad: runs will fail; note: runs work, but not as well as they could"""
 
 TESTED_PYTHONS = ((3, 11), (3, 12), (3, 13))
 _TRY_TIMEOUT_S = 280
@@ -53,7 +53,7 @@ selfcheck.main([])
 """
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Finding:
     """One check's outcome."""
 
@@ -68,18 +68,16 @@ def check_python() -> Finding:
     """The interpreter."""
     found = f"{platform.python_version()} at {sys.executable}"
     if sys.version_info[:2] not in TESTED_PYTHONS:
-        remedy = "tests run on 3.11 to 3.13; if something fails, try one of these"
-        return Finding(name="python", state="note", found=found, remedy=remedy)
-    return Finding(name="python", state="ok", found=found)
+        return Finding("python", "note", found, "tests run on 3.11 to 3.13; if something fails, try one of these")
+    return Finding("python", "ok", found)
 
 
 def check_system() -> Finding:
     """The operating system: /dev/shm, /proc and parent-death signals are Linux's."""
     found = f"{platform.system()} {platform.release()} {platform.machine()}"
     if platform.system() != "Linux":
-        remedy = "the trainer needs Linux (/dev/shm, prctl); use a container or WSL 2"
-        return Finding(name="system", state="bad", found=found, remedy=remedy)
-    return Finding(name="system", state="ok", found=found)
+        return Finding("system", "bad", found, "the trainer needs Linux (/dev/shm, prctl); use a container or WSL 2")
+    return Finding("system", "ok", found)
 
 
 def check_packages() -> Finding:
@@ -88,18 +86,12 @@ def check_packages() -> Finding:
         wanted = [re.split(r"[ ;<>=!~\[]", line)[0] for line in requires("gvizdoom") or () if "extra ==" not in line]
     except PackageNotFoundError:
         remedy = "run `make install`, or `pip install .` in the checkout"
-        return Finding(name="packages", state="bad", found="gvizdoom is not installed", remedy=remedy)
-    missing = []
-    for name in wanted:
-        try:
-            version(name)
-        except PackageNotFoundError:
-            missing.append(name)
-    if missing:
+        return Finding("packages", "bad", "gvizdoom is not installed", remedy)
+    if missing := sorted(set(wanted) - versions(wanted).keys()):
         remedy = f"pip install {' '.join(missing)}"
-        return Finding(name="packages", state="bad", found=f"missing: {', '.join(missing)}", remedy=remedy)
+        return Finding("packages", "bad", f"missing: {', '.join(missing)}", remedy)
     shown = ", ".join(f"{name} {version(name)}" for name in ("gvizdoom", "vizdoom", "gymnasium", "jax"))
-    return Finding(name="packages", state="ok", found=f"{shown} and {len(wanted) - 3} more")
+    return Finding("packages", "ok", f"{shown} and {len(wanted) - 3} more")
 
 
 def check_cores() -> Finding:
@@ -108,11 +100,10 @@ def check_cores() -> Finding:
     load = os.getloadavg()[0]
     found = f"{cores} of {os.cpu_count()}, load {load:.1f}"
     if cores < 2:
-        remedy = "learner and actors will share one core; give the process more"
-        return Finding(name="cores", state="note", found=found, remedy=remedy)
+        return Finding("cores", "note", found, "learner and actors will share one core; give the process more")
     if load > cores:
-        return Finding(name="cores", state="note", found=found, remedy="other work is running; rates will be lower")
-    return Finding(name="cores", state="ok", found=found)
+        return Finding("cores", "note", found, "other work is running; rates will be lower")
+    return Finding("cores", "ok", found)
 
 
 def check_memory() -> Finding:
@@ -122,8 +113,8 @@ def check_memory() -> Finding:
     found = f"{format_bytes(free)} available; a small run takes {format_bytes(need)}"
     if free < need:
         remedy = "end other programs, or train with --actors.num-actors 1 and a smaller --replay.capacity"
-        return Finding(name="memory", state="bad", found=found, remedy=remedy)
-    return Finding(name="memory", state="ok", found=found)
+        return Finding("memory", "bad", found, remedy)
+    return Finding("memory", "ok", found)
 
 
 def check_shared_memory() -> Finding:
@@ -135,8 +126,8 @@ def check_shared_memory() -> Finding:
     if free < need:
         size = -(-need // 2**20)
         remedy = f"docker run --shm-size={size}m ..., or as root: mount -o remount,size={size}m /dev/shm"
-        return Finding(name="/dev/shm", state="bad", found=found, remedy=remedy)
-    return Finding(name="/dev/shm", state="ok", found=found)
+        return Finding("/dev/shm", "bad", found, remedy)
+    return Finding("/dev/shm", "ok", found)
 
 
 def check_temporary_directory() -> Finding:
@@ -150,8 +141,8 @@ def check_temporary_directory() -> Finding:
             subprocess.run([script], check=True, timeout=10)
         except (OSError, subprocess.SubprocessError) as error:
             remedy = "it may be mounted noexec: set TMPDIR to a directory that may hold programs"
-            return Finding(name="tmp", state="bad", found=f"{directory}: {error}", remedy=remedy)
-    return Finding(name="tmp", state="ok", found=f"{directory}, {format_bytes(shutil.disk_usage(directory).free)} free")
+            return Finding("tmp", "bad", f"{directory}: {error}", remedy)
+    return Finding("tmp", "ok", f"{directory}, {format_bytes(shutil.disk_usage(directory).free)} free")
 
 
 def check_cache() -> Finding:
@@ -163,8 +154,8 @@ def check_cache() -> Finding:
             pass
     except OSError as error:
         remedy = "set GVZ_CACHE_DIR to a directory you can write to"
-        return Finding(name="cache", state="bad", found=f"{directory}: {error.strerror}", remedy=remedy)
-    return Finding(name="cache", state="ok", found=str(directory))
+        return Finding("cache", "bad", f"{directory}: {error.strerror}", remedy)
+    return Finding("cache", "ok", str(directory))
 
 
 def check_engine() -> Finding:
@@ -178,7 +169,7 @@ def check_devices() -> Finding:
     finding = _try("jax", _DEVICES, "reinstall jax; for a GPU: `make install-cuda` and a driver that CUDA 12 accepts")
     if finding.state == "ok" and finding.found.startswith("cpu") and shutil.which("nvidia-smi"):
         remedy = "there is an NVIDIA driver but JAX does not use it: `make install-cuda`"
-        return Finding(name="jax", state="note", found=finding.found, remedy=remedy)
+        return Finding("jax", "note", finding.found, remedy)
     return finding
 
 
@@ -201,9 +192,8 @@ def check_leftovers() -> Finding:
     dead = janitor.dead_instances()
     if dead:
         shown = ", ".join(dead[:3]) + (f" and {len(dead) - 3} more" if len(dead) > 3 else "")
-        remedy = "gvz doctor --clean (the next run does it, too)"
-        return Finding(name="leftovers", state="note", found=f"{len(dead)}: {shown}", remedy=remedy)
-    return Finding(name="leftovers", state="ok", found="none")
+        return Finding("leftovers", "note", f"{len(dead)}: {shown}", "gvz doctor --clean (the next run does it, too)")
+    return Finding("leftovers", "ok", "none")
 
 
 CHECKS: tuple[Callable[[], Finding], ...] = (
@@ -211,19 +201,19 @@ CHECKS: tuple[Callable[[], Finding], ...] = (
     *(check_temporary_directory, check_cache, check_leftovers, check_engine, check_devices, check_learner),
     check_video,
 )
-"""in the order of what depends on what"""
+"""each after those that it depends on"""
 
 
 def _try(name: str, code: str, remedy: str) -> Finding:
-    """Runs code in a process of its own; its last line is what was found."""
+    """Runs code in a process of its own, whose last line is the finding."""
     command = [sys.executable, "-c", code]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_TRY_TIMEOUT_S, check=False)
     except subprocess.TimeoutExpired:
-        return Finding(name=name, state="bad", found=f"no answer within {_TRY_TIMEOUT_S} s", remedy=remedy)
+        return Finding(name, "bad", f"no answer within {_TRY_TIMEOUT_S} s", remedy)
     finally:
         janitor.clean_dead_instances()  # a crashed process cleans up nothing
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        return Finding(name=name, state="bad", found=f"exit code {done.returncode}: {last}", remedy=remedy)
-    return Finding(name=name, state="ok", found=done.stdout.strip().splitlines()[-1])
+        return Finding(name, "bad", f"exit code {done.returncode}: {last}", remedy)
+    return Finding(name, "ok", done.stdout.strip().splitlines()[-1])

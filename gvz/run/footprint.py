@@ -66,12 +66,7 @@ class Footprint:
 
 
 def check(footprint: Footprint, *, shm_free: int | None = None, memory_free: int | None = None) -> None:
-    """Refuses what does not fit.
-
-    Args:
-        footprint: of the run.
-        shm_free: bytes free in /dev/shm; default: read now.
-        memory_free: bytes of memory available; default: read now.
+    """Refuses what does not fit. By default the free bytes of /dev/shm and of memory are read now.
 
     Raises:
         ResourceError: says what is too small, by how much, and how to get it.

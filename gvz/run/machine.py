@@ -1,5 +1,6 @@
-"""What something was computed on and with, for records: hardware, versions, commit."""
+"""Hardware, versions and commit, for records."""
 
+import contextlib
 import os
 import platform
 import subprocess
@@ -29,28 +30,29 @@ _INSTRUCTION_SETS = {
 
 
 def cpu_model() -> str:
-    """As the processor calls itself."""
-    file = Path("/proc/cpuinfo")
-    lines = file.read_text().splitlines() if file.exists() else []
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return models[0] if models else platform.processor() or platform.machine()
+    """The name that the processor reports."""
+    return _cpuinfo("model name") or platform.processor() or platform.machine()
 
 
 def instruction_set(cpuinfo: str | None = None, xla_flags: str | None = None) -> str:
-    """The largest of XLA's instruction sets on this processor, such as AVX512_BF16; what XLA_FLAGS caps it at is told.
+    """The largest of XLA's instruction sets on this processor, such as AVX512_BF16, and the limit that XLA_FLAGS sets.
 
-    Args:
-        cpuinfo: text of /proc/cpuinfo; default this machine's.
-        xla_flags: default the environment's XLA_FLAGS.
+    By default the text of /proc/cpuinfo and the flags are this machine's.
     """
-    file = Path("/proc/cpuinfo")
-    text = (file.read_text() if file.exists() else "") if cpuinfo is None else cpuinfo
-    flags = next((line.partition(":")[2].split() for line in text.splitlines() if line.startswith("flags")), [])
+    flags = _cpuinfo("flags", cpuinfo).split()
     found = [name for name, flag in _INSTRUCTION_SETS.items() if flag in flags]
     largest = found[-1] if found else platform.machine()
     given = (os.environ.get("XLA_FLAGS", "") if xla_flags is None else xla_flags).split()
     caps = [flag.partition("=")[2] for flag in given if flag.startswith("--xla_cpu_max_isa=")]
     return f"{largest}, at most {caps[-1]} by XLA_FLAGS" if caps else largest
+
+
+def _cpuinfo(field: str, text: str | None = None) -> str:
+    """The first value of a field of /proc/cpuinfo, or of `text`; empty if there is none."""
+    file = Path("/proc/cpuinfo")
+    if text is None:
+        text = file.read_text() if file.exists() else ""
+    return next((line.partition(":")[2].strip() for line in text.splitlines() if line.startswith(field)), "")
 
 
 def describe() -> dict[str, Any]:
@@ -85,8 +87,7 @@ def versions(packages: Sequence[str] = PACKAGES) -> dict[str, str]:
 def commit(measured: Sequence[str] = MEASURED) -> str | None:
     """Of the checkout this runs from, 12 digits; None outside of one, or without git.
 
-    Args:
-        measured: directories of the checkout; with a change in one of them the commit ends in `+changes`.
+    With a change in one of the `measured` directories it ends in `+changes`.
     """
     if not (ROOT / ".git").exists():  # git would look further up, and find somebody else's repository
         return None
@@ -95,6 +96,19 @@ def commit(measured: Sequence[str] = MEASURED) -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return head + ("+changes" if changed else "")
+
+
+def processor_s() -> float:
+    """Processor time of this process and of all that it started, seconds.
+
+    That of a process that ended counts if its parent waited for it: the time of games that were killed together with
+    their actor is lost.
+    """
+    me, total_s = psutil.Process(), 0.0
+    for process in (me, *me.children(recursive=True)):
+        with contextlib.suppress(psutil.NoSuchProcess):  # it has ended meanwhile
+            total_s += sum(process.cpu_times()[:4])  # user and system, own and of children that were waited for
+    return total_s
 
 
 def _git(*arguments: str) -> str:

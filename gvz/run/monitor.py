@@ -12,6 +12,7 @@ from gvz.run.config import RunConfig
 from gvz.run.progress import Progress, Status
 from gvz.run.telemetry import Rates, Telemetry
 from gvz.transport.messages import Fault
+from learner.config import LearnerConfig
 from learner.ingest import Staleness
 
 STATUS_PERIOD_S = 0.5
@@ -23,7 +24,7 @@ class Counts:
     """What a run has done so far; part of every checkpoint."""
 
     records: int = 0
-    """step records put into the replay, overwritten ones included"""
+    """step records that the learner took, overwritten ones included"""
     env_steps: int = 0
     """decisions among them"""
     updates: int = 0
@@ -36,60 +37,56 @@ class Counts:
     """decisions counted when it was published"""
     logged_updates: int = 0
     saved_updates: int = 0
+    processor_s: float = 0.0
+    """processor time of this run, over all its starts, when it was last looked at"""
 
 
 class Monitor:
     """Looks at the counters of a run and says what they mean, to the panel, the records and the user."""
 
-    def __init__(self, config: RunConfig, parts: RunParts, progress: Progress, telemetry: Telemetry):
-        self._config, self._num_slots, self._progress = config, parts.learner.replay_spec.num_slots, progress
-        self._telemetry = telemetry
+    def __init__(self, config: RunConfig, parts: RunParts, progress: Progress, telemetry: Telemetry, counts: Counts):
+        self._config, self._progress, self._telemetry, self._counts = config, progress, telemetry, counts
+        self._num_slots, self._batch_size = parts.learner.num_slots, parts.learner.batch_size
         self._expected, self._warned = _expected(config, parts), set[str]()
         self._rates, self._last_look_s, self._loss = Rates(), 0.0, float("nan")
 
-    def log(
-        self,
-        counts: Counts,
-        statistics: PoolStatistics,
-        staleness: Staleness,
-        metrics: Mapping[str, float],
-    ) -> None:
-        """A row of records, its alarms, and the panel, once a log period.
-
-        Args:
-            counts: of the run.
-            statistics: of its actors.
-            staleness: since the last look.
-            metrics: the learner's.
-        """
-        row = self._measure(counts, statistics, staleness)
+    def log(self, statistics: PoolStatistics, staleness: Staleness, metrics: Mapping[str, float]) -> None:
+        """A row of records, its alarms, and the panel, once a log period; `metrics` are the learner's."""
+        row = self._measure(statistics, staleness)
         scalars = {**row, **metrics}
-        self._telemetry.scalars(counts.updates, scalars)
+        self._telemetry.scalars(self._counts.updates, scalars)
         for condition, text in alarms(scalars, self._telemetry.task_statuses(), self._expected).items():
             if condition not in self._warned:  # each thing once
                 self._warned.add(condition)
                 self._progress.say(f"warning: {text}")
-                self.fault("warning", text, counts.updates)
+                self._fault("warning", text)
         self._loss = metrics["learner/loss"]
-        self._progress.show(self._status(counts, row))
+        self._progress.show(self._status(row))
 
-    def look(self, counts: Counts, statistics: PoolStatistics, take_staleness: Callable[[], Staleness]) -> None:
+    def look(self, statistics: PoolStatistics, take_staleness: Callable[[], Staleness]) -> None:
         """The panel alone, while there is nothing to log; does nothing if called again too soon."""
         now = time.monotonic()
         if now - self._last_look_s >= STATUS_PERIOD_S:
             self._last_look_s = now
-            self._progress.show(self._status(counts, self._measure(counts, statistics, take_staleness())))
+            self._progress.show(self._status(self._measure(statistics, take_staleness())))
 
-    def fault(self, kind: str, message: str, num_updates: int) -> None:
+    def failed_save(self, failure: str, retry_s: float) -> None:
+        """A checkpoint could not be written; it is tried again after this time at the latest."""
+        self._progress.say(f"checkpoint failed, tried again within {retry_s:.0f} s: {failure}")
+        self._fault("checkpoint", failure)
+
+    def _fault(self, kind: str, message: str) -> None:
         """Records a fault of the learner itself, not of an actor."""
-        self._telemetry.fault(Fault(actor=-1, lane=None, kind=kind, message=message), num_updates=num_updates)
+        fault = Fault(actor=-1, lane=None, kind=kind, message=message)
+        self._telemetry.fault(fault, num_updates=self._counts.updates)
 
-    def _measure(self, counts: Counts, statistics: PoolStatistics, staleness: Staleness) -> dict[str, float]:
+    def _measure(self, statistics: PoolStatistics, staleness: Staleness) -> dict[str, float]:
         """Rates and waits since the last look, and sizes."""
+        counts = self._counts
         rates = self._rates(
             {
                 "learner/updates_per_s": counts.updates,
-                "learner/samples_per_s": counts.updates * self._config.learner.batch_size,
+                "learner/samples_per_s": counts.updates * self._batch_size,
                 "actors/decisions_per_s": counts.env_steps,
                 "actors/frames_per_s": counts.env_steps * self._config.env.frame_skip,
                 "learner/wait_share": statistics.waited_for_records_s,
@@ -103,11 +100,12 @@ class Monitor:
             "actors/staleness_mean_versions": staleness.mean,
             "actors/staleness_p95_versions": staleness.p95,
             "actors/staleness_max_versions": staleness.max,
+            "run/processor_s": counts.processor_s,
             "replay/fill_share": min(1.0, counts.records / self._num_slots),
         }
 
-    def _status(self, counts: Counts, row: Mapping[str, float]) -> Status:
-        learner = self._config.learner
+    def _status(self, row: Mapping[str, float]) -> Status:
+        counts, learner = self._counts, self._config.learner
         if counts.updates:
             phase = "training"
         elif counts.env_steps:
@@ -118,31 +116,25 @@ class Monitor:
             phase=phase,
             num_updates=counts.updates,
             total_updates=learner.total_updates,
-            env_steps=counts.env_steps,
-            updates_per_s=row["learner/updates_per_s"],
-            steps_per_s=row["actors/decisions_per_s"],
-            frames_per_s=row["actors/frames_per_s"],
-            replay_fill=row["replay/fill_share"],
-            learner_wait=row["learner/wait_share"],
-            actor_wait=row["actors/wait_share"],
+            row=row,
             staleness_updates=row["actors/staleness_mean_versions"] * learner.publish_period_updates,
             loss=self._loss,
-            restarts=int(row["actors/restarts"]),
             tasks=self._telemetry.task_statuses(),
         )
 
 
 def _expected(config: RunConfig, parts: RunParts) -> Expected:
-    tasks, spec, agent = parts.pool_config.tasks, parts.learner.agent.spec, config.agent
-    v_min, v_max = agent.value_range(spec.v_min, spec.v_max)
-    waiting = config.num_actors * parts.pool_config.ring_capacity + 2 * config.learner.step_tolerance
+    tasks, learner = parts.table.ids, config.learner
+    v_min, v_max = config.support or parts.table.return_range
+    ahead = 2 * learner.step_tolerance if isinstance(learner, LearnerConfig) else 0
+    waiting = config.num_actors * parts.pool_config.ring_capacity + ahead
     played = Counter(tasks[lane % len(tasks)] for lane in range(config.num_lanes))
     return Expected(
         games={task: played[task] for task in tasks},
-        timeout_steps=-(-config.resolved_scenario().timeout_frames(config.env.profile) // config.env.frame_skip),
-        num_slots=parts.learner.replay_spec.num_slots,
+        timeout_steps=-(-max(row.timeout_frames for row in parts.table.rows) // config.env.frame_skip),
+        num_slots=parts.learner.num_slots,
         v_min=v_min,
         v_max=v_max,
-        distributional=agent.distributional,
-        staleness_versions=1 + waiting / config.learner.env_steps_per_update / config.learner.publish_period_updates,
+        distributional=config.support is not None,
+        staleness_versions=1 + waiting / config.env_steps_per_update / learner.publish_period_updates,
     )

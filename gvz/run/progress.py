@@ -2,8 +2,8 @@
 
 import sys
 import time
-from dataclasses import dataclass, field
-from types import TracebackType
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 from rich.columns import Columns
 from rich.console import Console, Group
@@ -28,29 +28,24 @@ class TaskStatus:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Status:
-    """A moment of a run. Rates are over the last log period; waits are shares of wall-clock time, 0..1."""
+    """A moment of a run."""
 
     phase: str
-    num_updates: int = 0
-    total_updates: int = 1
-    env_steps: int = 0
-    updates_per_s: float = 0.0
-    steps_per_s: float = 0.0
-    frames_per_s: float = 0.0
-    replay_fill: float = 0.0
-    learner_wait: float = 0.0
-    actor_wait: float = 0.0
-    staleness_updates: float = 0.0
-    loss: float = float("nan")
-    restarts: int = 0
-    tasks: tuple[TaskStatus, ...] = field(default_factory=tuple)
+    num_updates: int
+    total_updates: int
+    row: Mapping[str, float]
+    """scalars of the time since the last look, by name (docs/reference/metrics.md)"""
+    staleness_updates: float
+    """mean age of the acting parameters, gradient steps"""
+    loss: float
+    """NaN before the first log period"""
+    tasks: tuple[TaskStatus, ...]
 
     @property
     def eta_s(self) -> float | None:
         """Seconds to the end at the present rate; None while nothing is being learned."""
-        if self.updates_per_s <= 0:
-            return None
-        return (self.total_updates - self.num_updates) / self.updates_per_s
+        rate = self.row["learner/updates_per_s"]
+        return (self.total_updates - self.num_updates) / rate if rate > 0 else None
 
 
 def format_duration(seconds: float | None) -> str:
@@ -66,14 +61,26 @@ def _short_score(task: TaskStatus) -> str:
     return f"{task.score:.0f}/{task.upper_bound:.0f}" if task.episodes else "-"
 
 
+def _figures(status: Status) -> tuple[str, ...]:
+    row = status.row
+    return (
+        f"{row['learner/updates_per_s']:.1f} updates/s",
+        f"{row['actors/decisions_per_s']:,.0f} decisions/s",
+        f"{row['actors/frames_per_s']:,.0f} frames/s",
+        f"loss {status.loss:.4f}",
+        f"replay {row['replay/fill_share']:.0%}",
+        f"learner waits {row['learner/wait_share']:.0%}",
+        f"actors wait {row['actors/wait_share']:.0%}",
+        f"parameters {status.staleness_updates:.0f} updates old",
+    )
+
+
 def plain_line(status: Status) -> str:
     """One line with everything of a status."""
     scores = "  ".join(f"{t.task.split('/')[-1]} {_short_score(t)}" for t in status.tasks)
     return (
         f"{status.phase}  update {status.num_updates:,}/{status.total_updates:,}  eta {format_duration(status.eta_s)}  "
-        f"{status.updates_per_s:.1f} updates/s  {status.steps_per_s:,.0f} decisions/s  {status.frames_per_s:,.0f} "
-        f"frames/s  replay {status.replay_fill:.0%}  waits: learner {status.learner_wait:.0%} actors "
-        f"{status.actor_wait:.0%}  staleness {status.staleness_updates:.0f} updates  loss {status.loss:.4f}  {scores}"
+        f"{'  '.join(_figures(status))}  {scores}"
     )
 
 
@@ -85,21 +92,9 @@ def panel(status: Status, width: int) -> Group:
         f"{scenario}  " if scenario else "",
         f"{status.num_updates:,} / {status.total_updates:,} updates   ETA {format_duration(status.eta_s)}",
     )
-    bar = Table.grid()  # gives the bar a line of its own: it ends none
+    bar = Table.grid()  # puts the bar on a line of its own
     bar.add_row(ProgressBar(total=status.total_updates, completed=status.num_updates, width=min(width, 100)))
-    rates = Columns(
-        (
-            f"{status.updates_per_s:.1f} updates/s",
-            f"{status.steps_per_s:,.0f} decisions/s",
-            f"{status.frames_per_s:,.0f} frames/s",
-            f"loss {status.loss:.4f}",
-            f"replay {status.replay_fill:.0%}",
-            f"learner waits {status.learner_wait:.0%}",
-            f"actors wait {status.actor_wait:.0%}",
-            f"parameters {status.staleness_updates:.0f} updates old",
-        ),
-        padding=(0, 3),
-    )
+    rates = Columns(_figures(status), padding=(0, 3))
     tasks = Table(box=None, padding=(0, 2))
     tasks.add_column("task", overflow="fold")
     tasks.add_column("episodes", justify="right")
@@ -108,7 +103,8 @@ def panel(status: Status, width: int) -> Group:
     for t in status.tasks:
         percent = f"{100 * t.score / t.upper_bound:.1f}" if t.episodes else "-"
         tasks.add_row(t.task.partition("/")[2], f"{t.episodes:,}", _short_score(t), percent)
-    restarts = [Text(f"{status.restarts} actor restarts", style="yellow")] if status.restarts else []
+    num_restarts = int(status.row["actors/restarts"])
+    restarts = [Text(f"{num_restarts} actor restarts", style="yellow")] if num_restarts else []
     return Group(head, bar, rates, *restarts, tasks)
 
 
@@ -123,24 +119,24 @@ class Progress:
     def __enter__(self) -> "Progress":
         if self._console.is_terminal:
             self._live = Live(console=self._console, auto_refresh=False, transient=False)
-            self._live.__enter__()
+            self._live.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._live is not None:
-            self._live.__exit__(kind, error, tb)
+            self._live.stop()
             self._live = None
 
     def say(self, message: str) -> None:
         """Prints a line that stays."""
         self._console.print(message, markup=False, highlight=False, soft_wrap=True)
 
-    def show(self, status: Status, *, force: bool = False) -> None:
+    def show(self, status: Status) -> None:
         """Draws a status: at once on a terminal, at most every PLAIN_PERIOD_S seconds elsewhere."""
         if self._live is not None:
             self._live.update(panel(status, self._console.width), refresh=True)
             return
         now = time.monotonic()
-        if force or now >= self._next_line_s:
+        if now >= self._next_line_s:
             self.say(plain_line(status))
             self._next_line_s = now + PLAIN_PERIOD_S

@@ -3,35 +3,23 @@
     config.json  checkpoints/  metrics.jsonl  episodes.jsonl  faults.jsonl  starts.jsonl  tensorboard/
     work/ (logs of the actors)
 
-The directory is private to its user. Records are JSON lines, flushed row by row; their lengths stand in every
-checkpoint, so that a resumed run drops (into `discarded/`) what a killed one wrote after its last checkpoint.
+The directory is private to its user. The lengths of its record files stand in every checkpoint: a resumed run moves to
+`discarded/` what a killed one wrote after its last checkpoint.
 """
 
-import fcntl
-import gzip
-import io
 import json
 import os
 import shutil
 import time
-import zlib
-from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
+from gvz.core import records
 from gvz.core.durable import fsync
 from gvz.core.errors import ConfigError, GvzError, ResumeError
-from gvz.run.config import RunConfig, config_from_dict, config_to_dict, differences
-
-RECORDS_SCHEMA = 1
-"""Stands in every row as `schema`; raised by one when a row's meaning changes."""
-
-MAX_LINE_LENGTH = 2**20
-MAX_LINES = 2**22
-"""far beyond any record of ours; a small compressed file could hold more than fits into memory"""
-MAX_WAITING_BYTES = 64 * 2**20
-"""rows kept in memory while the disk is full: hours of a run"""
+from gvz.run.config import RunConfig
+from gvz.run.config_files import CONFIG_SCHEMA, config_from_dict, config_to_dict
+from gvz.run.resume import differences
 
 RECORD_FILES = ("metrics.jsonl", "episodes.jsonl", "faults.jsonl")
 START_RECORDS = "starts.jsonl"
@@ -51,36 +39,40 @@ class RunDir:
         try:
             path.mkdir(parents=True, exist_ok=True, mode=0o700)
             self._lock = os.fdopen(os.open(path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600), "a+")
+            locked = records.lock(self._lock)
         except OSError as error:
             raise ResumeError(f"run directory {path}: {error.strerror}; choose another with --run-dir") from error
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+        if not locked:
             self._lock.close()
-            raise ResumeError(
-                f"run directory {path}: another running process uses it; wait or use --run-dir"
-            ) from error
+            raise ResumeError(f"run directory {path}: another running process uses it; wait or use --run-dir")
         self.checkpoints = path / "checkpoints"
         self.tensorboard = path / "tensorboard"
         self.work = path / "work"
-        self._files: dict[str, io.FileIO] = {}
-        self._waiting: dict[str, bytearray] = {}
+        self._writers: dict[str, records.Writer] = {}
         # what orbax, TensorBoard, actors and engines make while it is open is this user's alone, too
         self._umask = os.umask(0o077)
 
-    def saved_config(self) -> RunConfig | None:
-        """The configuration of the run that lives here, or None in an empty directory.
+    def saved_config(self, agent_file: Path | None = None) -> RunConfig | None:
+        """The configuration of the run that lives here, or None in an empty directory. `agent_file`: as for
+        `config_from_dict`.
 
         Raises:
-            ResumeError: config.json is damaged.
+            ResumeError: config.json is damaged, or of a version whose checkpoints this one cannot read.
         """
         file = self.path / "config.json"
         if not file.exists():
             return None
         try:
-            return config_from_dict(json.loads(file.read_text()))
+            saved = json.loads(file.read_text())
+            config = config_from_dict(saved, agent_file)
         except (ValueError, OSError, RecursionError) as error:
-            raise ResumeError(f"{file} cannot be read: {error}; start anew with --fresh or --run-dir") from error
+            raise ResumeError(f"{file} cannot be read: {error}; start again with --fresh or --run-dir") from error
+        if saved["schema"] < CONFIG_SCHEMA:
+            raise ResumeError(
+                f"{self.path} is a run of an earlier version. Its policies can be evaluated, but it cannot be resumed: "
+                "its checkpoints have another layout. Move it aside with --fresh, or give another --run-dir."
+            )
+        return config
 
     def check_resumable(self, config: RunConfig) -> None:
         """Refuses a configuration that would change the meaning of the run that lives here.
@@ -88,7 +80,7 @@ class RunDir:
         Raises:
             ResumeError: names every differing field.
         """
-        saved = self.saved_config()
+        saved = self.saved_config(config.agent_file)
         if saved is not None and (changed := differences(saved, config)):
             raise ResumeError(
                 f"run directory {self.path} holds a run with another configuration:\n  "
@@ -110,69 +102,40 @@ class RunDir:
         Raises:
             GvzError: too many rows wait.
         """
-        waiting = self._waiting.setdefault(name, bytearray())
-        waiting += json.dumps({"schema": RECORDS_SCHEMA, **row}).encode() + b"\n"
-        try:
-            self._write(name)
-        except OSError as error:
-            if len(waiting) > MAX_WAITING_BYTES:
-                raise self._unwritten(name, error) from error
-
-    def _write(self, name: str) -> None:
-        """Writes what waits; what the disk took, if only a part of a row, does not wait any more."""
-        if name not in self._files:
-            self._files[name] = (self.path / name).open("ab", buffering=0)
-        waiting = self._waiting[name]
-        while waiting:
-            del waiting[: self._files[name].write(waiting)]
-
-    def _unwritten(self, name: str, error: OSError) -> GvzError:
-        return GvzError(
-            f"{self.path / name}: {len(self._waiting[name])} bytes of records cannot be written: {error.strerror}; "
-            "make room and give the same command: the run goes on from its newest checkpoint"
-        )
+        if name not in self._writers:
+            self._writers[name] = records.Writer(self.path / name)
+        self._writers[name].append(row)
 
     def record_lengths(self) -> dict[str, int]:
         """Bytes of each record file now, with the rows that wait: what a checkpoint vouches for."""
-        sizes = {n: (self.path / n).stat().st_size if (self.path / n).exists() else 0 for n in RECORD_FILES}
-        return {n: size + len(self._waiting.get(n, b"")) for n, size in sizes.items()}
+        files = {name: self.path / name for name in RECORD_FILES}
+        sizes = {name: file.stat().st_size if file.exists() else 0 for name, file in files.items()}
+        waiting = {name: writer.waiting_bytes for name, writer in self._writers.items()}
+        return {name: size + waiting.get(name, 0) for name, size in sizes.items()}
 
     def truncate_records(self, lengths: dict[str, int]) -> int:
         """Cuts the records to the lengths a checkpoint vouches for, keeping the rest in `discarded/`.
 
         Returns: number of bytes moved.
         """
-        moved = 0
-        for name, length in lengths.items():
-            file = self.path / name
-            if name not in RECORD_FILES or not file.exists() or file.stat().st_size <= length:
-                continue
-            with file.open("r+b") as stream:
-                stream.seek(length)
-                tail = stream.read()
-                (self.path / "discarded").mkdir(exist_ok=True)
-                with (self.path / "discarded" / name).open("ab") as keep:
-                    keep.write(tail)
-                stream.truncate(length)
-            moved += len(tail)
-        return moved
+        known = {name: length for name, length in lengths.items() if name in RECORD_FILES}
+        return sum(
+            records.cut(self.path / name, length, self.path / "discarded" / name) for name, length in known.items()
+        )
 
     def close(self) -> None:
-        """Closes the record files and releases the lock. Idempotent.
+        """Closes the record files and releases the lock. Can be repeated.
 
         Raises:
             GvzError: rows waited for room on the disk, and there is none yet.
         """
         lost: list[GvzError] = []
-        for name in self._waiting:
+        for writer in self._writers.values():
             try:
-                self._write(name)
-            except OSError as error:
-                lost.append(self._unwritten(name, error))
-        for file in self._files.values():
-            file.close()
-        self._files.clear()
-        self._waiting.clear()
+                writer.close()
+            except GvzError as error:
+                lost.append(error)
+        self._writers.clear()
         shutil.rmtree(self.work / "engines", ignore_errors=True)
         if not self._lock.closed:
             os.umask(self._umask)
@@ -183,7 +146,7 @@ class RunDir:
     def __enter__(self) -> "RunDir":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -206,39 +169,3 @@ def move_aside(path: Path) -> Path | None:
             target = target.with_name(target.name + "+")
         path.rename(target)
     return target
-
-
-def read_records(file: Path) -> tuple[list[dict[str, Any]], list[str]]:
-    """Reads a JSON-lines record file (`.gz`: compressed); everything readable is returned.
-
-    Returns: rows, and one message for each line that is damaged or of another schema.
-
-    Raises:
-        GvzError: there is no such file.
-    """
-    if not file.exists():
-        raise GvzError(f"{file}: no such record file; is {file.parent} a run directory?")
-    rows: list[dict[str, Any]] = []
-    problems: list[str] = []
-    try:
-        with gzip.open(file, "rt", errors="replace") if file.suffix == ".gz" else file.open(errors="replace") as stream:
-            for number, line in enumerate(iter(partial(stream.readline, MAX_LINE_LENGTH), ""), 1):
-                if len(line) == MAX_LINE_LENGTH or number > MAX_LINES:
-                    problems.append(
-                        f"{file}, line {number}: not read on; want lines shorter than {MAX_LINE_LENGTH} characters, "
-                        f"and at most {MAX_LINES} of them"
-                    )
-                    break
-                try:
-                    row = json.loads(line)
-                except (ValueError, RecursionError):
-                    problems.append(f"{file}, line {number}: not JSON (half-written?)")
-                    continue
-                if not isinstance(row, dict) or row.get("schema") != RECORDS_SCHEMA:
-                    got = row.get("schema") if isinstance(row, dict) else type(row).__name__
-                    problems.append(f"{file}, line {number}: schema {got!r}, want {RECORDS_SCHEMA}")
-                    continue
-                rows.append(row)
-    except (OSError, EOFError, zlib.error) as error:
-        problems.append(f"{file}, after {len(rows)} rows: cannot be read on ({error})")
-    return rows, problems

@@ -38,8 +38,7 @@ class Saver:
         """Removes what a killed run was still writing.
 
         Args:
-            run: where they go.
-            config: period, and number to keep.
+            run, config: where checkpoints go, their period, and how many are kept.
             counts: of the run; `saved_updates` is kept here.
             take: gives the state of the run now.
             report: is told why a save failed, and the seconds until it is tried again.

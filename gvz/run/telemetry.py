@@ -18,13 +18,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]  # made at run time
 from tensorboardX.record_writer import masked_crc32c
 from tensorboardX.summary import scalar
 
 from gvz.core.errors import ConfigError
+from gvz.run.config import LogConfig
 from gvz.run.progress import TaskStatus
 from gvz.run.rundir import RunDir
+from gvz.task_table import TaskTable
 from gvz.transport.messages import EpisodeStats, Fault
 
 RECENT_EPISODES = 30
@@ -34,7 +37,7 @@ UPLOAD_TIMEOUT_S = 600.0
 
 
 class Rates:
-    """Turns counters into rates per second between calls."""
+    """Rates per second of counters between two calls."""
 
     def __init__(self) -> None:
         self._last: dict[str, float] = {}
@@ -52,34 +55,17 @@ class Rates:
 class Telemetry:
     """Writes the records of one run and remembers the recent score of each task."""
 
-    def __init__(
-        self,
-        run: RunDir,
-        *,
-        tasks: tuple[str, ...],
-        upper_bound: float,
-        tensorboard: bool,
-        num_updates: int,
-        wandb: bool = False,
-    ):
-        """Opens the records.
-
-        Args:
-            run: the run directory.
-            tasks: ids, in the order of the step records' task index.
-            upper_bound: of the scenario's score.
-            tensorboard: write events too.
-            num_updates: gradient steps done; later events of a killed run are hidden.
-            wandb: send the scalars to Weights & Biases, too.
+    def __init__(self, run: RunDir, table: TaskTable, config: LogConfig, num_updates: int):
+        """Opens the records. Events of a killed run that come after `num_updates` gradient steps are hidden.
 
         Raises:
             ConfigError: wandb is wanted, and not installed or not logged in.
         """
-        self._run, self._tasks, self._upper_bound = run, tasks, upper_bound
-        self._recent: list[deque[float]] = [deque(maxlen=RECENT_EPISODES) for _ in tasks]
-        self._episodes = [0] * len(tasks)
-        self._events = start_events(run.tensorboard, num_updates) if tensorboard else None
-        self._wandb = start_wandb(run) if wandb else None
+        self._run, self._table = run, table
+        self._recent: list[deque[float]] = [deque(maxlen=RECENT_EPISODES) for _ in table.rows]
+        self._episodes = [0] * len(table)
+        self._events = start_events(run.tensorboard, num_updates) if config.tensorboard else None
+        self._wandb = start_wandb(run) if config.wandb else None
 
     def episode(self, stats: EpisodeStats, *, num_updates: int, env_steps: int) -> None:
         """Records a finished episode."""
@@ -91,12 +77,12 @@ class Telemetry:
             {
                 "num_updates": num_updates,
                 "env_steps": env_steps,
-                "task": self._tasks[stats.task],
+                "task": self._table.ids[stats.task],
                 "lane": stats.lane,
                 "episode": stats.episode,
                 "seed": stats.seed,
                 "score": stats.score,
-                "normalized_score": 100 * stats.score / self._upper_bound,
+                "normalized_score": 100 * stats.score / self._table.rows[stats.task].upper_bound,
                 "reward": stats.reward,
                 "reward_components": stats.reward_components,
                 "length_frames": stats.length_frames,
@@ -110,18 +96,9 @@ class Telemetry:
 
     def fault(self, fault: Fault, *, num_updates: int) -> None:
         """Records something that failed and was handled."""
-        self._run.append(
-            "faults.jsonl",
-            {
-                "num_updates": num_updates,
-                "time_s": time.time(),
-                "actor": fault.actor,
-                "lane": fault.lane,
-                "kind": fault.kind,
-                "message": fault.message,
-                "traceback": fault.traceback,
-            },
-        )
+        row = {"num_updates": num_updates, "time_s": time.time(), **msgspec.structs.asdict(fault)}
+        del row["fatal"]
+        self._run.append("faults.jsonl", row)
 
     def scalars(self, num_updates: int, values: Mapping[str, float]) -> None:
         """Records a row of scalars at a gradient step."""
@@ -135,7 +112,7 @@ class Telemetry:
             self._wandb.log({"num_updates": num_updates, **row})
 
     def _write_events(self, data: bytes, num_updates: int) -> None:
-        """Events cannot go on after a gap. The records, which hold the same, can."""
+        """After a write that failed, events end, because their file is damaged. The records have the same scalars."""
         assert self._events is not None
         try:
             if self._events.write(data) < len(data):
@@ -150,12 +127,12 @@ class Telemetry:
         """Recent play of each task."""
         return tuple(
             TaskStatus(
-                task=task,
+                task=row.task.id,
                 episodes=self._episodes[i],
                 score=sum(self._recent[i]) / len(self._recent[i]) if self._recent[i] else float("nan"),
-                upper_bound=self._upper_bound,
+                upper_bound=row.upper_bound,
             )
-            for i, task in enumerate(self._tasks)
+            for i, row in enumerate(self._table.rows)
         )
 
     def state(self) -> dict[str, Any]:
@@ -177,10 +154,10 @@ class Telemetry:
 
 
 def start_events(directory: Path, num_updates: int) -> io.FileIO:
-    """A file of TensorBoard events, in which those of a killed run from `num_updates` on are taken back.
+    """A new file of TensorBoard events, which hides older events from `num_updates` on: a killed run wrote them.
 
-    (tensorboardX's own `SummaryWriter` writes in a thread, which ends at the first error; its queue then blocks
-    whoever logs, for ever.)
+    (tensorboardX's own `SummaryWriter` writes in a thread, which ends at the first error. Its queue then blocks the
+    logging thread for ever.)
     """
     directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     file = (directory / f"events.out.tfevents.{time.time():.0f}.{socket.gethostname()}").open("ab", buffering=0)
@@ -202,10 +179,7 @@ def start_wandb(run: RunDir) -> Any:  # wandb.Run, a type only where the extra i
     """The Weights & Biases run of a run directory, begun or, where one began before, gone on with.
 
     WANDB_MODE, WANDB_PROJECT, WANDB_ENTITY and the others of its environment variables hold; with WANDB_MODE=offline
-    all stays in `wandb/` of the run directory, for `wandb sync`.
-
-    Args:
-        run: a run directory with its config.json.
+    all stays in `wandb/` of the run directory, for `wandb sync`. The directory must have its config.json.
 
     Raises:
         ConfigError: wandb is not installed, or does not know who logs.
@@ -221,9 +195,8 @@ def start_wandb(run: RunDir) -> Any:  # wandb.Run, a type only where the extra i
     if not id_file.exists():
         id_file.write_text(uuid.uuid4().hex[:12])
     # versions that cannot bound the last upload wait for it
-    bounded: dict[str, Any] = (
-        {"finish_timeout": UPLOAD_TIMEOUT_S} if "finish_timeout" in wandb.Settings.model_fields else {}
-    )
+    can_bound = "finish_timeout" in wandb.Settings.model_fields
+    bounded: dict[str, Any] = {"finish_timeout": UPLOAD_TIMEOUT_S} if can_bound else {}
     try:
         started = wandb.init(
             dir=str(run.path),

@@ -12,15 +12,14 @@ import time
 import jax
 import jax.numpy as jnp
 
-from actors.inline import InlinePool
-from actors.pool import STOP_TIMEOUT_S, ActorPool
+from actors.pool import STOP_TIMEOUT_S
 from gvz.core import janitor
 from gvz.core.cache import xla_cache_directory
 from gvz.core.errors import CheckpointError, GvzError, WaitTimeoutError, WorkerError
 from gvz.core.stop import StopRequest
-from gvz.core.watchdog import Watchdog
+from gvz.core.watchdog import AwakeClock, Watchdog
 from gvz.run import footprint, machine
-from gvz.run.assemble import Pool, RunParts, assemble
+from gvz.run.assemble import RunParts, assemble
 from gvz.run.config import RunConfig
 from gvz.run.monitor import Counts, Monitor
 from gvz.run.progress import Progress
@@ -29,14 +28,14 @@ from gvz.run.saver import Saver, Snapshot
 from gvz.run.telemetry import Telemetry
 from gvz.transport.messages import EpisodeStats, Fault, ParamsHeader
 from learner.checkpoint import Restored, restore_newest
-from learner.learner import Learner
 from learner.memory import keep_freed_memory
-from learner.off_policy import OffPolicyLearner
 
 DRAIN_RECORDS = 256
 """most records taken between two looks at the limiter"""
 DRAIN_WAIT_S = 0.02
 """longest wait for a record before the loop looks after its actors again"""
+LONGEST_WAIT_S = 1.0
+"""most of a round that counts as waiting for records; a longer one was stopped or busy"""
 NO_RECORDS_TIMEOUT_S = 900.0
 """a run whose actors deliver nothing for this time is stopped; a stuck actor is replaced long before"""
 LONGEST_ROUND_S = 1800.0
@@ -50,33 +49,20 @@ class Trainer:
         host = None if restored is None else restored.host
         self._config, self._run, self._parts, self._progress = config, run, parts, progress
         self._counts = Counts() if host is None else Counts(**host["counts"])
-        self._learner: Learner = OffPolicyLearner(
-            parts.learner,
-            jax.random.key(config.seed),
-            parts.pool_config.tasks,
-            run.path,
-            None if restored is None else (restored.arrays, restored.host),
-        )
+        self._processor_start_s = machine.processor_s() - self._counts.processor_s
+        self._learner = parts.learner.make(jax.random.key(config.seed), parts.table.ids, run.path, restored)
         self._published_params = self._learner.acting_params() if restored is None else restored.arrays["acting"]
-        self._telemetry = Telemetry(
-            run,
-            tasks=parts.pool_config.tasks,
-            upper_bound=config.resolved_scenario().upper_bound(config.env.profile),
-            tensorboard=config.log.tensorboard,
-            num_updates=self._counts.updates,
-            wandb=config.log.wandb,
-        )
+        self._telemetry = Telemetry(run, parts.table, config.log, self._counts.updates)
         if host is not None:
             self._telemetry.restore(host["telemetry"])
-        self._monitor = Monitor(config, parts, progress, self._telemetry)
-        self._saver = Saver(run, config.checkpoint, self._counts, self._snapshot, self._report_failed_save)
-        self._collected_s, self._without_records_s = time.monotonic(), 0.0
-        pool = InlinePool if config.mode == "sync" else ActorPool
-        self._pool: Pool = pool(parts.pool_config, None if host is None else host["pool"])
+        self._monitor = Monitor(config, parts, progress, self._telemetry, self._counts)
+        self._saver = Saver(run, config.checkpoint, self._counts, self._snapshot, self._monitor.failed_save)
+        self._clock, self._collected_s = AwakeClock(LONGEST_WAIT_S), 0.0
+        self._pool = parts.make_pool(config, None if host is None else host["pool"])
         self._send()
 
     def run(self, stop: StopRequest) -> None:
-        """Trains until the last update, or until asked to stop; then writes a checkpoint.
+        """Trains until the last update, the end of its processor time, or a stop; then writes a checkpoint.
 
         The last row of metrics of an interrupted run stands after what its checkpoint vouches for: a resumed run sets
         it aside, and its next row has the whole log period.
@@ -87,10 +73,10 @@ class Trainer:
             CheckpointError: the last checkpoint could not be written.
         """
         # rates count from here
-        self._monitor.look(self._counts, self._pool.statistics(), self._learner.take_staleness)
+        self._monitor.look(self._pool.statistics(), self._learner.take_staleness)
         try:
             with Watchdog("the learner", LONGEST_ROUND_S) as watchdog:
-                while self._counts.updates < self._config.learner.total_updates and not stop.requested:
+                while not self._is_done() and not stop.requested:
                     watchdog.beat()
                     self._collect()
                     self._supervise()
@@ -116,6 +102,12 @@ class Trainer:
         finally:
             self._telemetry.close()
 
+    def _is_done(self) -> bool:
+        """Processor time is looked at with every row of metrics: a row more or less is how exact its limit is."""
+        limit_s = self._config.max_processor_s
+        used_up = limit_s is not None and self._counts.processor_s >= limit_s
+        return used_up or self._counts.updates >= self._config.learner.total_updates
+
     def _collect(self) -> None:
         """Rings -> learner, as far as it allows."""
         ready_to_learn = self._learner.can_update()
@@ -123,12 +115,12 @@ class Trainer:
         blocks = self._pool.drain(allowed, wait_s=0.0 if ready_to_learn else DRAIN_WAIT_S)
         self._counts.env_steps += self._learner.add(blocks, self._counts.version)
         self._counts.records += sum(map(len, blocks))
-        # a round's length at most: the time in which this process was stopped is not the actors' silence
-        waited_s, self._collected_s = min(time.monotonic() - self._collected_s, 1.0), time.monotonic()
-        self._without_records_s = 0.0 if blocks or ready_to_learn else self._without_records_s + waited_s
-        if self._without_records_s > NO_RECORDS_TIMEOUT_S:
+        now_s = self._clock.look()
+        if blocks or ready_to_learn:
+            self._collected_s = now_s
+        if (waited_s := now_s - self._collected_s) > NO_RECORDS_TIMEOUT_S:
             raise WaitTimeoutError(
-                f"learner waited {self._without_records_s:.0f} s for the actors' next step record; their logs are in "
+                f"learner waited {waited_s:.0f} s for the actors' next step record; their logs are in "
                 f"{self._run.work}, what was done about them in faults.jsonl"
             )
 
@@ -138,7 +130,8 @@ class Trainer:
             if isinstance(message, EpisodeStats):
                 self._telemetry.episode(message, num_updates=self._counts.updates, env_steps=self._counts.env_steps)
                 if not message.cut:
-                    self._learner.add_episode(message.task, message.score)
+                    upper_bound = self._parts.table.rows[message.task].upper_bound
+                    self._learner.add_episode(message.task, 100 * message.score / upper_bound)
             elif isinstance(message, Fault):
                 self._telemetry.fault(message, num_updates=self._counts.updates)
                 self._progress.say(f"fault: {message.message}")
@@ -170,19 +163,26 @@ class Trainer:
         if due or counts.updates == self._config.learner.total_updates:
             self._record_row()
         elif counts.updates == 0:
-            self._monitor.look(counts, self._pool.statistics(), self._learner.take_staleness)
+            self._monitor.look(self._pool.statistics(), self._learner.take_staleness)
 
     def _record_row(self) -> None:
         """A row of what came since the last one, if anything did. Waits for the device."""
         counts = self._counts
         if counts.updates > counts.logged_updates:
             counts.logged_updates = counts.updates
+            self._take_processor_time()
             metrics = self._learner.take_metrics()
-            self._monitor.log(counts, self._pool.statistics(), self._learner.take_staleness(), metrics)
+            self._monitor.log(self._pool.statistics(), self._learner.take_staleness(), metrics)
+
+    def _take_processor_time(self) -> None:
+        """Never less than before: a child may have ended without being waited for."""
+        now_s = machine.processor_s() - self._processor_start_s
+        self._counts.processor_s = max(self._counts.processor_s, now_s)
 
     def _snapshot(self) -> Snapshot:
         """The whole state; raises NonFiniteError instead of saving numbers that went wrong."""
         self._learner.check_finite()
+        self._take_processor_time()
         host = {
             "counts": dataclasses.asdict(self._counts),
             "telemetry": self._telemetry.state(),
@@ -192,20 +192,14 @@ class Trainer:
         }
         return Snapshot({**self._learner.arrays(), "acting": self._published_params}, self._learner.params, host)
 
-    def _report_failed_save(self, failure: str, retry_s: float) -> None:
-        self._progress.say(f"checkpoint failed, tried again within {retry_s:.0f} s: {failure}")
-        self._monitor.fault("checkpoint", failure, self._counts.updates)
-
 
 def train(config: RunConfig, run: RunDir, stop: StopRequest) -> int:
     """Trains, resuming if the run directory holds a checkpoint.
 
-    Args:
-        config: of the run.
-        run: where it is kept.
-        stop: entered; from when there is a trainer on, the first signal no longer ends things at once.
+    `stop` is entered; from when there is a trainer on, the first signal no longer ends things at once.
 
-    Returns: 0 when all updates are done; 130 or 143 when a signal stopped the run, which is then saved.
+    Returns: 0 when all updates are done, or the processor time is used up; 130 or 143 when a signal stopped the run,
+    which is then saved.
 
     Raises:
         ResourceError: the machine is too small. GvzError: what a user can do something about.
@@ -217,8 +211,7 @@ def train(config: RunConfig, run: RunDir, stop: StopRequest) -> int:
         for line in janitor.clean_dead_instances():
             progress.say(f"removed what a dead run left: {line}")
         parts = assemble(config, run.work)
-        for line in parts.footprint.lines():
-            progress.say(line)
+        progress.say("\n".join(parts.footprint.lines()))
         footprint.check(parts.footprint)
         acting = jax.ShapeDtypeStruct((parts.pool_config.num_params,), jnp.float32)
         restored = restore_newest(run.checkpoints, {**parts.learner.array_shapes(), "acting": acting})

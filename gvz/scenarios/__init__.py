@@ -1,7 +1,7 @@
 """Tier 1. Scenarios: one file each, discovered by its SCENARIO; the compiler that makes maps of their tasks.
 
-What there is to add is data. An attribute is an entry in its scenario's `attributes`, a named task a word in its
-`tasks`, a scenario a file beside this one. With no file touched, the same from outside:
+To add something is to add data. An attribute is an entry in its scenario's `attributes`, a named task a word in its
+`tasks`, a scenario a file beside this one. The same works from outside without a change of any file:
 
 >>> import dataclasses
 >>> from gvz.scenarios.base import Attribute, Content, Task, Textures

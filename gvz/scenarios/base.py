@@ -1,33 +1,32 @@
-"""What a scenario, an attribute and a task are.
+"""Defines scenario, attribute and task.
 
-A scenario is data: a base map, a script template and what they hold by default (`Content`). An attribute is the
-`Content` it changes. A task is a scenario with a set of attributes. `gvz.scenarios.compiler` makes a map of it.
+A scenario is data: a base map, a script template and their default `Content`. An attribute is the `Content` it changes.
+A task is a scenario with a set of attributes. `gvz.scenarios.compiler` makes a map from a task.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Literal
 
 from gvz.core.env_config import EnvConfig, Profile
-from gvz.core.errors import TaskError
+from gvz.core.errors import TaskError, nearest
 from gvz.scenarios.rewards import Reward, Rewarder, check_weights, return_range
 from gvz.wad.udmf import UdmfMap
 
 
 @dataclass(frozen=True, slots=True)
 class Uniform:
-    """A number drawn uniformly, ends included, whenever the script comes to it."""
+    """A uniformly random number, ends included. The script draws it each time it evaluates the value."""
 
     low: float
     high: float
 
 
 Value = int | float | str | Uniform | tuple[str | float, ...]
-"""A value in a script. int: ACS integer; float: fixed point; str: verbatim ACS expression; tuple: initializer of an
-array, whose strings are quoted."""
+"""A value in a script. int: ACS integer; float: fixed point; str: unchanged ACS expression; tuple: initializer of an
+array, with quoted strings."""
 
 BOOKKEEPING: Mapping[str, str] = MappingProxyType(
     {
@@ -35,21 +34,26 @@ BOOKKEEPING: Mapping[str, str] = MappingProxyType(
         "SPAWNED": "USER2",  # enemies or kits put on the map so far
         "KITS_TAKEN": "USER3",
         "POISONS_TAKEN": "USER4",
-        "MAP_MAGIC": "USER60",  # `CompiledTask.map_magic`: proves that the right map runs
+        "MAP_MAGIC": "USER60",  # `CompiledTask.map_magic`: checks that the right map runs
     }
 )
-"""Variables every compiled map keeps beside the engine's own -> ViZDoom game variable. Those a scenario has no use
-for stay 0. USERn is the script's `global int n`."""
+"""Variables that every compiled map has beside the engine's own -> ViZDoom game variable. Variables that a scenario
+does not use stay 0. USERn is the script's `global int n`."""
 
 Split = Literal["train1", "train4", "train8", "test"]
 
 MAX_LEVEL = 4
-"""Tasks of four and more attributes are level 4 (thesis 3.2: beyond three, difficulty hardly grows)."""
+"""Tasks of four or more attributes are level 4 (thesis 3.2: with more than three, difficulty hardly increases)."""
+
+VARIED = "varied"
+"""name of the tasks whose look is drawn for every episode; `varied-10` draws it from 10 maps"""
+MAX_VARIED_MAPS = 1000
+"""the maps of `varied`, and the most that there can be"""
 
 
 @dataclass(frozen=True, slots=True)
 class Textures:
-    """One texture name for all walls, all floors, all ceilings; walls may name flats and the other way round."""
+    """One texture name each for all walls, floors and ceilings. Walls may use flats; planes may use wall textures."""
 
     wall: str
     floor: str
@@ -58,7 +62,7 @@ class Textures:
 
 @dataclass(frozen=True, slots=True)
 class Thing:
-    """Something that stands on the map from the start. Position in map units, `type` is an editor number."""
+    """An object on the map from the start. Position in map units; `type` is an editor number."""
 
     type: int
     x: float
@@ -68,13 +72,13 @@ class Thing:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Content:
-    """What a map holds, or what a profile or an attribute changes of it."""
+    """The contents of a map, or the part of them that a profile or an attribute changes."""
 
     base_wad: str | None = None
     """file name in vizdoom's scenarios directory"""
     textures: Textures | None = None
     things: Mapping[str, tuple[Thing, ...]] = field(default_factory=dict)
-    """things added, by base map (a coordinate means something on one map only)"""
+    """added things by base map (coordinates are valid on one map only)"""
     parameters: Mapping[str, Value] = field(default_factory=dict)
     """values of the `$names` of the scenario's script; an array `x` also defines its length, `num_x`"""
     entity: Mapping[str, Value] = field(default_factory=dict)
@@ -85,24 +89,36 @@ class Content:
     """class name -> its DECORATE definition"""
 
     def overlaid(self, other: "Content") -> "Content":
-        """This content, with everything `other` states in place of its own."""
+        """This content, with every value that `other` sets replaced by that of `other`."""
+        mappings = ("things", "parameters", "entity", "agent", "actors")
         return Content(
-            base_wad=self.base_wad if other.base_wad is None else other.base_wad,
-            textures=self.textures if other.textures is None else other.textures,
-            things={**self.things, **other.things},
-            parameters={**self.parameters, **other.parameters},
-            entity={**self.entity, **other.entity},
-            agent={**self.agent, **other.agent},
-            actors={**self.actors, **other.actors},
+            base_wad=other.base_wad or self.base_wad,
+            textures=other.textures or self.textures,
+            **{name: {**getattr(self, name), **getattr(other, name)} for name in mappings},
         )
 
     def joined(self, other: "Content") -> "Content":
-        """`overlaid`, but the things of both stand on the map."""
-        things = {
-            base_wad: self.things.get(base_wad, ()) + other.things.get(base_wad, ())
-            for base_wad in (*self.things, *(other.things.keys() - self.things.keys()))
-        }
+        """Like `overlaid`, but with the things of both."""
+        base_wads = {**self.things, **other.things}
+        things = {name: self.things.get(name, ()) + other.things.get(name, ()) for name in base_wads}
         return self.overlaid(dataclasses.replace(other, things=things))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Variety:
+    """What may differ between the maps of a scenario's `varied` tasks. `gvz.scenarios.varied` draws it."""
+
+    entities: tuple[str, ...]
+    """classes of the default task's enemies or kits"""
+    entity_parameters: tuple[str, ...]
+    """the script's parameters that name these classes"""
+    max_decorations: int
+    """most decorations of a map"""
+    solid: bool = True
+    """whether a decoration is as solid as Doom has it; else nothing stops steps, bullets or missiles"""
+    keep_clear: Callable[[float, float], bool] | None = None
+    """whether no decoration may stand at a place, map units: enemies stand there, or it would fill the screen.
+    Walls and the agent's starts are kept clear in any case."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -114,7 +130,7 @@ class Attribute:
     """a task has at most one attribute of a group; each group counts one level"""
     content: Content
     levdoom: Content = field(default_factory=Content)
-    """what profile levdoom has in place of parts of `content`"""
+    """what replaces parts of `content` in profile levdoom"""
     aliases: tuple[str, ...] = ()
     """the thesis's shorter names in combined tasks ("fast+flying")"""
 
@@ -123,36 +139,38 @@ class Attribute:
 class Scenario:
     """A map, an objective, a reward and buttons; the first extension point of the benchmark.
 
-    Scenarios can be pickled, and are equal if all that they hold is, whichever process made them.
+    Scenarios can be pickled. Two scenarios are equal if all their fields are equal, also across processes.
     """
 
     id: str
     title: str
     content: Content
-    """what the default task's map holds"""
+    """contents of the default task's map"""
     levdoom: Content
-    """what profile levdoom has in place of parts of it"""
+    """what replaces parts of it in profile levdoom"""
     script: str
     """ACS source with `$names` (string.Template): `content.parameters`, and `$entity_properties`,
     `$agent_properties`, `$map_magic`, which the compiler fills in"""
     attributes: tuple[Attribute, ...]
-    """where two set the same value, the later one wins"""
+    """if two attributes set the same value, the later one wins"""
     complete: tuple[str, ...]
     """attributes of the task `complete`: one of every group"""
     levdoom_tasks: Mapping[str, Content] = field(default_factory=dict)
-    """exceptions of profile levdoom: task ("default", "gore+mossy_bricks", ...) -> what its map has instead"""
+    """exceptions in profile levdoom: task ("default", "gore+mossy_bricks", ...) -> the changes of its map"""
     tasks: tuple[str, ...]
     """the named tasks, in the thesis's order"""
     splits: Mapping[Split, tuple[str, ...]]
     """training sets of 1, 4 and 8 tasks, and the test set"""
     draw_map: Callable[[UdmfMap], None] | None = None
-    """changes the base map in place, before textures and things"""
+    """changes the base map in place, before textures and things are set"""
+    variety: Variety | None = None
+    """what its `varied` tasks may draw; None: it has no such tasks"""
 
     buttons: tuple[str, ...]
     combination_buttons: tuple[str, ...] | None = None
-    """the buttons that action set `combinations` combines; default all of them"""
+    """buttons that action set `combinations` combines; default: all"""
     game_variables: tuple[str, ...]
-    """what the agent may see beside pixels"""
+    """variables that the agent may see beside pixels"""
     metric: Literal["frames_alive", "kills"]
     render_weapon: bool
     timeouts: Mapping[Profile, int]
@@ -166,18 +184,12 @@ class Scenario:
     def __repr__(self) -> str:
         return f"Scenario({self.id!r})"
 
-    @property
-    def base_wad(self) -> str:
-        """File name, in vizdoom's scenarios directory, of the map the default task is made from."""
-        assert self.content.base_wad is not None
-        return self.content.base_wad
-
     def timeout_frames(self, profile: Profile = "thesis") -> int:
         """Game tics after which an episode is truncated."""
         return self.timeouts[profile]
 
     def upper_bound(self, profile: Profile = "thesis") -> float:
-        """Best possible score, to normalize by."""
+        """Best possible score; divides a score to normalize it."""
         return self.upper_bounds[profile]
 
     def reward_weights(
@@ -186,44 +198,40 @@ class Scenario:
         """The weight of every reward component.
 
         Args:
-            weights: component -> weight, in place of the profile's; those not named keep theirs.
-            profile: whose weights.
+            weights: component -> weight, instead of the profile's; other components keep the profile's weight.
+            profile: the profile of the other weights.
 
         Raises:
-            ConfigError: a weight whose name is no component's, or that is no finite number.
+            ConfigError: an unknown component, or a weight that is not a finite number.
         """
         defaults = {n: r.levdoom if profile == "levdoom" else r.weight for n, r in self.rewards.items()}
         return defaults if weights is None else {**defaults, **check_weights(weights, defaults)}
 
     def make_rewarder(self, weights: Mapping[str, float] | None = None, profile: Profile = "thesis") -> Rewarder:
-        """A rewarder for one game, with `reward_weights(weights, profile)`; raises as that does."""
+        """A rewarder for one game, with `reward_weights(weights, profile)`; raises the same errors."""
         return Rewarder({n: r.event for n, r in self.rewards.items()}, self.reward_weights(weights, profile))
 
     def return_range(self, env: EnvConfig, discount: float) -> tuple[float, float]:
-        """(v_min, v_max): the range of discounted returns in this scenario's tasks.
-
-        Args:
-            env: its profile, frame skip and reward weights.
-            discount: of one decision.
+        """(v_min, v_max): the range of discounted returns in this scenario's tasks; `discount` is of one decision.
 
         Raises:
-            ConfigError: a weight whose name is no component's.
+            ConfigError: a weight of an unknown component.
         """
         weights = self.reward_weights(dict(env.reward_weights), env.profile)
         return return_range(self.rewards, weights, env, discount)
 
     def attribute(self, name: str) -> Attribute:
-        """The attribute called `name`, or by that alias.
+        """The attribute with this name or alias.
 
         Raises:
-            TaskError: there is none; lists those there are, and the nearest.
+            TaskError: there is none; the message lists all attributes and names the nearest.
         """
         for attribute in self.attributes:
             if name == attribute.name or name in attribute.aliases:
                 return attribute
         raise TaskError(
-            f"scenario {self.id}: unknown attribute {name!r}{nearest(name, [a.name for a in self.attributes])}; "
-            f"want {self.choices()}"
+            f"scenario {self.id}: unknown attribute {name!r}"
+            f"{nearest(name, [*(a.name for a in self.attributes), VARIED])}; want {self.choices()}"
         )
 
     def choices(self) -> str:
@@ -233,25 +241,31 @@ class Scenario:
             for group in attribute.groups:
                 groups.setdefault(group, []).append(attribute.name)
         members = "; ".join(f"{group}: {', '.join(names)}" for group, names in groups.items())
-        return f"default, complete, or at most one of each group ({members})"
+        varied = "" if self.variety is None else f", or {VARIED}, or {VARIED}-<number of maps>"
+        return f"default, complete, or at most one of each group ({members}){varied}"
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A scenario with a set of attributes. `gvz.tasks.parse_task` makes it from an id.
+    """A scenario with a set of attributes, or with maps that are drawn. `gvz.tasks.parse_task` makes it from an id.
 
     Attributes:
         scenario: the scenario.
         attributes: canonical names, sorted.
+        num_maps: of a `varied` task: how many maps there are, 1 to MAX_VARIED_MAPS; each is the default task's with
+            another look, and an episode's seed says which is played. 0: one map, that of the attributes.
 
     Raises:
-        TaskError: an unknown attribute, or two of one group.
+        TaskError: an unknown attribute, two of one group, or a number of maps that cannot be.
     """
 
     scenario: Scenario
     attributes: tuple[str, ...] = ()
+    num_maps: int = 0
 
     def __post_init__(self) -> None:
+        if self.num_maps:
+            self._check_varied()
         found = [self.scenario.attribute(name) for name in self.attributes]
         taken: dict[str, str] = {}
         for attribute in found:
@@ -264,9 +278,19 @@ class Task:
                 taken[group] = attribute.name
         object.__setattr__(self, "attributes", tuple(sorted(attribute.name for attribute in found)))
 
+    def _check_varied(self) -> None:
+        if self.scenario.variety is None:
+            raise TaskError(f"scenario {self.scenario.id}: got {VARIED}, but the scenario has no variety; set it")
+        if not 1 <= self.num_maps <= MAX_VARIED_MAPS:
+            raise TaskError(f"{self.scenario.id}/{VARIED}-{self.num_maps}: want 1 to {MAX_VARIED_MAPS} maps")
+        if self.attributes:
+            raise TaskError(f"{self.scenario.id}: got {VARIED} and {'+'.join(self.attributes)}, want one of them")
+
     @property
     def name(self) -> str:
-        """The id without its scenario: "gore+mossy_bricks", "default", "complete"."""
+        """The id without its scenario: "gore+mossy_bricks", "default", "complete", "varied", "varied-10"."""
+        if self.num_maps:
+            return VARIED if self.num_maps == MAX_VARIED_MAPS else f"{VARIED}-{self.num_maps}"
         if set(self.attributes) == set(self.scenario.complete):
             return "complete"
         return "+".join(self.attributes) or "default"
@@ -278,7 +302,7 @@ class Task:
 
     @property
     def level(self) -> int:
-        """Difficulty: the number of groups its attributes change, at most MAX_LEVEL."""
+        """Difficulty: the number of groups its attributes change, at most MAX_LEVEL. A `varied` task has none: 0."""
         groups = sum(len(self.scenario.attribute(name).groups) for name in self.attributes)
         return min(groups, MAX_LEVEL)
 
@@ -287,11 +311,5 @@ class Task:
 
 
 def words(text: str) -> tuple[str, ...]:
-    """The words of a text: a list of names as it is read aloud."""
+    """The words of a text, to write a list of names as plain text."""
     return tuple(text.split())
-
-
-def nearest(name: str, known: Sequence[str]) -> str:
-    """A hint at the known name most like `name`, or nothing."""
-    match = get_close_matches(name, known, n=1)
-    return f" (did you mean {match[0]!r}?)" if match else ""

@@ -1,46 +1,68 @@
-"""Task -> WAD file: content of a task, its map, script and classes, and the cache.
+"""Task -> WAD file: content of a task, its maps, script and classes, and the cache.
 
-A WAD is always built (some 20 ms) and kept in the user's cache directory under the hash of its
-bytes, so a cached file is either what this version of the code builds, or not found. Nothing here starts an engine.
+The WAD of one map is built each time (some 20 ms) and stored in the user's cache directory under the hash of its bytes.
+So a file of another version of the code is never used. The many maps of a `varied` task take seconds. Their file is
+stored under the hash of the first map and of the code that draws the others; it is built if there is none.
+Nothing here starts an engine.
 """
 
 import hashlib
 import os
+import struct
 import tempfile
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from string import Template
 
 from gvz.core.cache import cache_directory
 from gvz.core.env_config import Profile
-from gvz.core.errors import ResourceError, TaskError, WadError
-from gvz.scenarios.base import Content, Task, Thing, Uniform, Value, nearest
+from gvz.core.errors import ResourceError, TaskError, WadError, nearest
+from gvz.engine.process import one_of
+from gvz.scenarios import varied
+from gvz.scenarios.base import Content, Task, Thing, Uniform, Value
 from gvz.wad.acs import compile_acs
 from gvz.wad.decorate import declared_actors, declared_numbers, used_sprites
-from gvz.wad.lumps import read_maps, read_wad, write_map_wad
+from gvz.wad.lumps import HEADER, Lump, read_maps, read_wad, write_map_wad, write_wad
 from gvz.wad.stock import scenario_wad, stock_editor_numbers, stock_sprites, stock_textures
 from gvz.wad.textures import check_textures
 from gvz.wad.udmf import UdmfMap, is_inside, make_thing, parse_textmap, write_textmap
 
 MAP_NAME = "MAP01"
+_BUILD_S = 300.0
+"""how long a process waits for another one that builds the same file, seconds"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class CompiledTask:
-    """A task's WAD file, ready to be loaded."""
+    """A task's WAD file, ready to load."""
 
     task: Task
-    profile: Profile
     wad_path: Path
-    map_magic: int
-    """what the running map's MAP_MAGIC variable must read"""
-    map_name: str = MAP_NAME
+    map_magics: tuple[int, ...]
+    """for each map, the value that the running map's MAP_MAGIC variable must have"""
+
+    @property
+    def map_name(self) -> str:
+        """Name of the first map; the only one, unless the task is a `varied` one."""
+        return _map_name(self.task, 0)
+
+    @property
+    def map_magic(self) -> int:
+        """Magic number of the first map."""
+        return self.map_magics[0]
+
+    def map_of(self, episode_seed: int) -> tuple[str, int]:
+        """(name, magic number) of the map of an episode: map number `episode_seed` modulo the number of maps."""
+        number = episode_seed % len(self.map_magics)
+        return _map_name(self.task, number), self.map_magics[number]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class MapSource:
-    """The text of everything in a task's WAD."""
+    """All texts in a task's WAD."""
 
     textmap: str
     script: str
@@ -54,19 +76,72 @@ def compile_task(task: Task, profile: Profile = "thesis") -> CompiledTask:
     The directory is $GVZ_CACHE_DIR, or else the user's cache directory.
 
     Raises:
-        TaskError, WadError: as map_source.
+        TaskError, WadError: see map_source.
         AcsError: the script does not compile.
         ResourceError: the cache directory cannot be written.
     """
     source = map_source(task, profile)
+    if task.num_maps:
+        return _compile_varied(task, profile, source)
     path = _cached(build_wad(source))
-    return CompiledTask(task=task, profile=profile, wad_path=path, map_magic=source.map_magic)
+    return CompiledTask(task=task, wad_path=path, map_magics=(source.map_magic,))
+
+
+def _compile_varied(task: Task, profile: Profile, first: MapSource) -> CompiledTask:
+    """The file of a `varied` task, built if the cache has none of this name, or a damaged one."""
+    drawn_by = Path(varied.__file__).read_bytes()
+    name = hashlib.sha256(b"\0".join((build_wad(first), drawn_by, str(task.num_maps).encode()))).hexdigest()
+    path = cache_directory() / f"{name}.wad"
+    magics = _read_magics(path, task.num_maps)
+    if magics is None:
+        with one_of([f"build-{name[0]}"], time.monotonic() + _BUILD_S):
+            magics = _read_magics(path, task.num_maps)  # another process may have built it meanwhile
+            if magics is None:
+                data, magics = _build_varied(task, profile)
+                _write(path, data)
+    return CompiledTask(task=task, wad_path=path, map_magics=magics)
+
+
+def _build_varied(task: Task, profile: Profile) -> tuple[bytes, tuple[int, ...]]:
+    """(A WAD of all maps, with the hash of it behind its end; the maps' magic numbers).
+
+    Its first lump, MAGICS, has these numbers. The engine reads neither that lump nor the hash.
+    """
+    classes: set[Lump] = set()
+    maps: list[Lump] = []
+    magics: list[int] = []
+    for number in range(task.num_maps):
+        source = map_source(task, profile, number)
+        decorate, *lumps = read_wad(build_wad(source, _map_name(task, number)))
+        classes.add(decorate)
+        maps += lumps
+        magics.append(source.map_magic)
+    assert [lump.name for lump in classes] == ["DECORATE"], "all maps of a file have the same classes"
+    data = write_wad([Lump("MAGICS", struct.pack(f"<{len(magics)}i", *magics)), *classes, *maps])
+    return data + hashlib.sha256(data).digest(), tuple(magics)
+
+
+def _read_magics(path: Path, num_maps: int) -> tuple[int, ...] | None:
+    """The magic numbers in a file of `_build_varied`; None if there is no such file, or a damaged one."""
+    try:
+        data = path.read_bytes() if path.exists() else b""
+    except OSError as error:
+        raise _cache_error(error) from error
+    whole, digest = data[:-32], data[-32:]
+    if hashlib.sha256(whole).digest() != digest:
+        return None
+    return struct.unpack_from(f"<{num_maps}i", whole, HEADER.size)
+
+
+def _map_name(task: Task, number: int) -> str:
+    """MAP01, or VARY0000 and so on: Doom II has rules of its own for some of MAP01 to MAP32."""
+    return f"VARY{number:04}" if task.num_maps else MAP_NAME
 
 
 def task_content(task: Task, profile: Profile) -> Content:
-    """What a task's map holds: the scenario's content, changed by each attribute in the scenario's order.
+    """The contents of a task's map: the scenario's content, changed by each attribute in the scenario's order.
 
-    In profile levdoom every step is overlaid by its `levdoom`, and at last by the task's own exception.
+    In profile levdoom, each step is overlaid by its `levdoom`, and the result by the task's own exception.
     """
     scenario, levdoom = task.scenario, profile == "levdoom"
     content = scenario.content.overlaid(scenario.levdoom) if levdoom else scenario.content
@@ -78,19 +153,25 @@ def task_content(task: Task, profile: Profile) -> Content:
     return content if exception is None else content.overlaid(exception)
 
 
-def map_source(task: Task, profile: Profile) -> MapSource:
-    """The texts of a task's WAD. The magic number is drawn from the hash of all of them.
+def map_source(task: Task, profile: Profile, number: int = 0) -> MapSource:
+    """The texts of a task's WAD, or of map `number` of a `varied` task; the magic number is made of their hash.
 
     Raises:
-        TaskError: the parameters of scenario and attributes are not those that the script names; a thing that is on no
-            map of the scenario, outside the map, or of no known class; a sprite that is not there.
+        TaskError: the parameters of scenario and attributes do not match the script's names; a thing is not on a map of
+            the scenario, is outside the map, or has an unknown class; a sprite does not exist.
         WadError: an unknown texture or base map.
     """
     content = task_content(task, profile)
+    drawn = _draw(task, content)
+    if task.num_maps:
+        content = varied.draw_look(task.scenario, content, drawn, number)
     decorate = "\n".join(content.actors.values())
     _check_sprites(task, decorate)
-    drawn = _draw(task, content)
     drawn.things += [make_thing(t.type, t.x, t.y, tid=t.tid) for t in _checked_things(task, content, drawn, decorate)]
+    try:
+        check_textures(drawn, stock_textures())
+    except WadError as error:
+        raise WadError(f"task {task.id}: {error}") from error
     textmap = write_textmap(drawn)
     template = Template(task.scenario.script)
     names = _script_names(content)
@@ -106,8 +187,8 @@ def map_source(task: Task, profile: Profile) -> MapSource:
     return MapSource(textmap=textmap, script=script, decorate=decorate, map_magic=magic)
 
 
-def build_wad(source: MapSource) -> bytes:
-    """The bytes of a WAD file; the same source gives the same bytes.
+def build_wad(source: MapSource, map_name: str = MAP_NAME) -> bytes:
+    """The bytes of a WAD file with one map; the same source gives the same bytes.
 
     Raises:
         AcsError: the script does not compile.
@@ -118,7 +199,7 @@ def build_wad(source: MapSource) -> bytes:
         behavior=behavior,
         scripts=source.script,
         decorate=source.decorate,
-        map_name=MAP_NAME,
+        map_name=map_name,
     )
 
 
@@ -136,7 +217,7 @@ def acs_value(value: Value) -> str:
 
 
 def _script_names(content: Content) -> dict[str, str]:
-    """Everything a script template may name, but the magic number."""
+    """All names of a script template and their values, except the magic number."""
     names = {name: acs_value(value) for name, value in content.parameters.items()}
     sizes = {f"num_{n}": str(len(v)) for n, v in content.parameters.items() if isinstance(v, tuple)}
     return {
@@ -156,25 +237,26 @@ def _draw(task: Task, content: Content) -> UdmfMap:
     """The base map with the content's textures and the scenario's own changes."""
     assert content.base_wad is not None
     assert content.textures is not None
-    base = read_maps(read_wad(scenario_wad(content.base_wad)))[MAP_NAME]
-    drawn = parse_textmap(base["TEXTMAP"].decode("latin-1"))
+    drawn = _base_map(content.base_wad).copy()
     if task.scenario.draw_map is not None:
         task.scenario.draw_map(drawn)
     for side in drawn.sidedefs:
-        if "texturemiddle" in side:  # the sides of a line between two open spaces have none
+        if "texturemiddle" in side:  # sides between two open spaces have none
             side["texturemiddle"] = content.textures.wall
     for sector in drawn.sectors:
         sector["texturefloor"] = content.textures.floor
         sector["textureceiling"] = content.textures.ceiling
-    try:
-        check_textures(drawn, stock_textures())
-    except WadError as error:
-        raise WadError(f"task {task.id}: {error}") from error
     return drawn
 
 
+@cache
+def _base_map(file_name: str) -> UdmfMap:
+    """The map of one of the engine's scenarios. To be copied, never changed."""
+    return parse_textmap(read_maps(read_wad(scenario_wad(file_name)))[MAP_NAME]["TEXTMAP"].decode("latin-1"))
+
+
 def _checked_things(task: Task, content: Content, drawn: UdmfMap, decorate: str) -> tuple[Thing, ...]:
-    """The things that are added to the base map. The engine would leave out, or show as a sign, what makes no sense."""
+    """The things added to the base map. The engine itself would leave out an invalid thing, or show a sign instead."""
     scenario = task.scenario
     parts = [scenario.content, scenario.levdoom, *scenario.levdoom_tasks.values()]
     parts += [part for attribute in scenario.attributes for part in (attribute.content, attribute.levdoom)]
@@ -196,7 +278,7 @@ def _checked_things(task: Task, content: Content, drawn: UdmfMap, decorate: str)
 
 
 def _check_sprites(task: Task, decorate: str) -> None:
-    """Refuses classes that show sprites which are not there; the engine would show nothing and go on."""
+    """Refuses classes with missing sprites; the engine itself would show nothing and go on."""
     if strange := sorted(used_sprites(decorate) - stock_sprites()):
         raise TaskError(
             f"task {task.id}: its DECORATE shows the unknown sprite {strange[0][:4]}, frame {strange[0][4]}"
@@ -205,23 +287,35 @@ def _check_sprites(task: Task, decorate: str) -> None:
 
 
 def _cached(data: bytes) -> Path:
-    """The file in the cache directory that holds `data`, written if it is not there or damaged."""
-    directory = cache_directory()
-    path = directory / f"{hashlib.sha256(data).hexdigest()}.wad"
+    """The file in the cache directory that holds `data`; writes it if it is missing or damaged."""
+    path = cache_directory() / f"{hashlib.sha256(data).hexdigest()}.wad"
     try:
         if path.exists() and path.read_bytes() == data:
             return path
-        directory.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(dir=directory, suffix=".tmp")
+    except OSError as error:
+        raise _cache_error(error) from error
+    _write(path, data)
+    return path
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Writes a file of the cache directory."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
         try:
             with os.fdopen(descriptor, "wb") as file:
                 file.write(data)
-            Path(temporary).replace(path)  # readers see the old file or the whole new one
+            Path(temporary).replace(path)  # readers see the old file or the complete new one
         except BaseException:
             Path(temporary).unlink(missing_ok=True)
             raise
     except OSError as error:
-        raise ResourceError(
-            f"map cache {directory}: {error}; make it writable, or set GVZ_CACHE_DIR to a directory that is"
-        ) from error
-    return path
+        raise _cache_error(error) from error
+
+
+def _cache_error(error: OSError) -> ResourceError:
+    directory = cache_directory()
+    return ResourceError(
+        f"map cache {directory}: {error}; make it writable, or set GVZ_CACHE_DIR to a directory that is"
+    )

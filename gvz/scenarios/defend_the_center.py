@@ -1,17 +1,20 @@
-"""Defend the Center: a turret in a round room.
+"""Defend the Center: the agent turns and shoots in the middle of a round room.
 
-Ability tested: aiming, and telling who is nearest. The agent stands in the middle of a round room and cannot walk.
+Ability tested: aiming, and seeing which enemy is nearest. The agent stands in the middle and cannot walk.
 Actions: ATTACK, TURN_LEFT, TURN_RIGHT.
 Observation: the screen with weapon and HUD; variables KILLCOUNT, AMMO2, HEALTH.
 Reward (eq. 3.3): [kill] - [death] - 0.1 [ammo fell] - 0.2 [health fell].
 Start: the centre of the room, a pistol and 26 bullets; 5 enemies of 1 health stand at the wall, 72 degrees apart.
-    90 tics after its death an enemy is back at its place (levdoom: at a random one).
+    90 tics after its death an enemy returns at its place (levdoom: at a random one).
 Termination: the agent dies. Truncation: after 1100 tics (levdoom: 2100).
 Metric: frames alive, at most the time-out.
 Attributes: thesis B.1, below. `complete` takes mossy_bricks for its textures. Tasks: thesis Table A.1.
 """
 
-from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform, words
+import math
+
+from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
+from gvz.scenarios.parts import COUNTED_MARINE, RESIZED, retextured, things_at
 from gvz.scenarios.rewards import Fell, Pace, Reward, Rose, death
 
 WAD = "defend_the_center.wad"
@@ -76,23 +79,19 @@ script 3 (int tid, int kind, int angle)
 }
 """
 
-COUNTED_MARINE = """\
-ACTOR MarineChainsawVzd : MarineChainsaw
-{
-  +COUNTKILL
-}
-"""
-
 SLOW_RESPAWN = Content(parameters={"respawn_delay": 150})
 
+GORE = {
+    26: ((-352, 160), (-96, 608), (480, 352), (96, -224), (-544, -352)),  # a twitching man on a stick
+    28: ((288, 160), (352, -544), (640, 32), (-288, -288), (-608, 352)),  # skulls on a stick
+    29: ((224, 416), (480, -224), (-128, -608), (-352, 416), (-608, -128)),  # candles and skulls
+}
+"""editor number -> places"""
 
-def _gore() -> tuple[Thing, ...]:
-    places = {
-        26: ((-352, 160), (-96, 608), (480, 352), (96, -224), (-544, -352)),  # a twitching man on a stick
-        28: ((288, 160), (352, -544), (640, 32), (-288, -288), (-608, 352)),  # skulls on a stick
-        29: ((224, 416), (480, -224), (-128, -608), (-352, 416), (-608, -128)),  # candles and skulls
-    }
-    return tuple(Thing(kind, x, y) for kind, spots in places.items() for x, y in spots)
+
+def near_agent_or_enemies(x: float, y: float) -> bool:
+    """Whether a place is close to the agent or to the ring on which enemies appear."""
+    return not 200 <= math.hypot(x, y) <= 620
 
 
 SCENARIO = Scenario(
@@ -110,21 +109,19 @@ SCENARIO = Scenario(
             "respawn_delay": 90,
             "respawn_angle": "angle",
         },
-        actors={"MarineChainsawVzd": COUNTED_MARINE},
+        actors=COUNTED_MARINE,
     ),
     levdoom=Content(parameters={"respawn_angle": Uniform(0.0, 1.0)}),
+    variety=Variety(
+        entities=("MarineChainsawVzd", "Demon"),
+        entity_parameters=("classes",),
+        max_decorations=10,
+        keep_clear=near_agent_or_enemies,
+    ),
     attributes=(
-        Attribute(name="gore", groups=("decorations",), content=Content(things={WAD: _gore()})),
-        Attribute(
-            name="mossy_bricks",
-            groups=("textures",),
-            content=Content(textures=Textures("A-MOSBRI", "FLOOR4_6", "CEIL5_1")),
-        ),
-        Attribute(
-            name="stone_wall",
-            groups=("textures",),
-            content=Content(textures=Textures("FLAT5_7", "FLOOR1_6", "CEIL3_3")),
-        ),
+        Attribute(name="gore", groups=("decorations",), content=Content(things={WAD: things_at(GORE)})),
+        retextured("mossy_bricks", "A-MOSBRI", "FLOOR4_6", "CEIL5_1"),
+        retextured("stone_wall", "FLAT5_7", "FLOOR1_6", "CEIL3_3"),
         Attribute(
             name="fuzzy_enemies",
             groups=("entity_rendering",),
@@ -136,7 +133,7 @@ SCENARIO = Scenario(
             name="resized_enemies",
             groups=("entity_size",),
             aliases=("resized",),
-            content=Content(entity={"ScaleX": Uniform(0.3, 3.0), "ScaleY": Uniform(0.3, 3.0)}),
+            content=RESIZED,
             levdoom=SLOW_RESPAWN,
         ),
         Attribute(
@@ -150,7 +147,7 @@ SCENARIO = Scenario(
             name="flying_enemies",
             groups=("entity_type",),
             aliases=("flying",),
-            # the damage factor of fast_enemies makes up for the speed of what walks; lost souls charge at their own
+            # the damage factor of fast_enemies balances the speed of walking enemies; lost souls have their own speed
             content=Content(parameters={"classes": ("LostSoul",), "spawn_delay": 10}, agent={"DamageFactor": 1.0}),
             levdoom=Content(parameters={"respawn_delay": 90}),
         ),
@@ -197,7 +194,7 @@ SCENARIO = Scenario(
     timeouts={"thesis": 1100, "levdoom": 2100},
     upper_bounds={"thesis": 1100, "levdoom": 2100},
     rewards={
-        # A kill costs a bullet. Five enemies are back 90 tics after their deaths: one in 18 tics.
+        # A kill costs a bullet. Five enemies return 90 tics after their deaths: one in 18 tics.
         "kill": Reward(
             event=Rose("KILLCOUNT"),
             weight=1.0,
@@ -211,9 +208,9 @@ SCENARIO = Scenario(
             paces=(Pace(tics=6, times=2), Pace(tics=20, times=24)),
         ),
         "death": Reward(event=death, weight=-1.0, levdoom=0.0, paces=(Pace(times=1),)),
-        # A held trigger fires every 14 tics. Decisions of four tics round that down now and then.
+        # A held ATTACK button fires every 14 tics. With decisions of four tics this is sometimes less.
         "ammo_spent": Reward(event=Fell("AMMO2"), weight=-0.1, levdoom=-0.01, paces=(Pace(tics=13, times=26),)),
-        # Five enemies strike, each blow weakened by the damage factor of fast_enemies.
+        # Five enemies strike; the damage factor of fast_enemies weakens each blow.
         "health_lost": Reward(
             event=Fell("HEALTH"), weight=-0.2, levdoom=-0.01, paces=(Pace(tics=2, times=4), Pace(tics=5, times=32))
         ),

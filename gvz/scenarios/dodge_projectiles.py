@@ -1,19 +1,20 @@
-"""Dodge Projectiles: a shooting gallery with the agent as the target.
+"""Dodge Projectiles: enemies shoot at the agent, which can only step aside.
 
-Ability tested: seeing what flies towards one, and stepping aside in time.
+Ability tested: seeing missiles, and stepping aside in time.
 Actions: SPEED, MOVE_LEFT, MOVE_RIGHT; the agent faces the enemies and cannot turn.
 Observation: the screen with HUD, no weapon; variable HEALTH.
 Reward (eq. 3.6): 0.01 - [health fell].
 Start: a strip 64 units wide at one end of a room; enemies that never move stand along the other end.
-    The agent's damage factor is set by enemy type, so that tasks of one level are alike.
+    The enemy type sets the agent's damage factor, so that tasks of one level are about equally hard.
 Termination: the agent dies. Truncation: after 2100 tics.
 Metric: frames alive, at most the time-out.
-Attributes: thesis B.4, below. Revenants stand for two attributes (their missiles home), so does the Arachnotron
-    (it fires rapidly); `complete` has both kinds, and city for its textures. Tasks: thesis Table A.4.
-Differs: the enemies have their normal health, as in the author's maps; nobody has a weapon to use on them.
+Attributes: thesis B.4, below. Revenants count as two attributes (their missiles home), and so does the Arachnotron
+    (it fires rapidly). `complete` has both kinds, and city for its textures. Tasks: thesis Table A.4.
+Differs: the enemies have their normal health, as in the author's maps; the agent has no weapon.
 """
 
-from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform, Value, words
+from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Value, Variety, words
+from gvz.scenarios.parts import retextured, things_at
 from gvz.scenarios.rewards import Fell, Pace, Reward, living
 from gvz.wad.udmf import UdmfMap
 
@@ -52,11 +53,11 @@ script 2 ENTER
 def draw_cage(room: UdmfMap) -> None:
     """Draws a line from wall to wall that walkers cannot cross, 64 units before the wall behind the agent.
 
-    Missiles fly over it. Without it hits would push the agent back and then let it be anywhere in the room.
+    Missiles fly over it. Without it a hit would push the agent off its strip, and it could walk through the room.
     """
     back, north, south, front = -512.0, 512.0, 64.0, -448.0
     corners = {(back, north), (back, south)}
-    assert corners < {(v["x"], v["y"]) for v in room.vertices}, "the base map is the room we know"
+    assert corners < {(v["x"], v["y"]) for v in room.vertices}, "the base map is the expected room"
     for y in (north, south):
         room.vertices.append({"x": front, "y": y})
         room.sidedefs.append({"sector": 0})
@@ -89,7 +90,7 @@ def _enemies(
     levdoom_damage_factor: float,
     trait: str | None = None,
 ) -> Attribute:
-    """An attribute that puts a row of other enemies in place of the imps."""
+    """An attribute that replaces the imps by a row of other enemies."""
     return Attribute(
         name=name,
         groups=("entity_type",) if trait is None else ("entity_type", trait),
@@ -98,8 +99,13 @@ def _enemies(
     )
 
 
-SKULLS = ((-192, 416), (-224, 320), (-256, 256), (-288, 96), (-288, 480), (-320, 192), (-288, 384))
-"""floating skulls (editor number 42); missiles pass over them"""
+SKULLS = {42: ((-192, 416), (-224, 320), (-256, 256), (-288, 96), (-288, 480), (-320, 192), (-288, 384))}
+"""editor number -> places of floating skulls; missiles pass over them"""
+
+
+def near_agent_or_enemies(x: float, _y: float) -> bool:
+    """Whether a place is close to the agent's strip or to where enemies stand."""
+    return not -320 <= x <= 16
 
 
 SCENARIO = Scenario(
@@ -115,28 +121,23 @@ SCENARIO = Scenario(
         agent={"DamageFactor": 0.7},
     ),
     levdoom=Content(),
+    variety=Variety(
+        entities=("DoomImp",),
+        entity_parameters=("classes",),
+        max_decorations=10,
+        solid=False,  # what stops missiles would change the game
+        keep_clear=near_agent_or_enemies,
+    ),
     attributes=(
-        Attribute(
-            name="city",
-            groups=("textures",),
-            content=Content(textures=Textures("SKY2", "ROCKRED1", "CEIL4_1")),
-        ),
-        Attribute(
-            name="flames",
-            groups=("textures",),
-            content=Content(textures=Textures("SWATER1", "RROCK02", "CAVERN1")),
-        ),
-        Attribute(
-            name="flaming_skulls",
-            groups=("decorations",),
-            content=Content(things={WAD: tuple(Thing(42, x, y) for x, y in SKULLS)}),
-        ),
+        retextured("city", "SKY2", "ROCKRED1", "CEIL4_1"),
+        retextured("flames", "SWATER1", "RROCK02", "CAVERN1"),
+        Attribute(name="flaming_skulls", groups=("decorations",), content=Content(things={WAD: things_at(SKULLS)})),
         _enemies("mancubus", _row("Fatso", 2, 76.0, 114.0, 462.0), 0.5, 0.5),
         _enemies("barons", _row("BaronOfHell", 5, 96.0, 100.0, 460.0), 0.4, 0.4),
         _enemies("cacodemons", _row("Cacodemon", 5, 96.0, 100.0, 480.0), 0.5, 0.5),
         _enemies("revenants", _row("Revenant", 3, 96.0, 84.0, 492.0), 0.3, 0.2, "homing"),
         _enemies("arachnotron", _row("Arachnotron", 1, 56.0, 288.0, 288.0), 0.3, 0.2, "rapid_fire"),
-        Attribute(  # both traits at once, which `complete` needs and the thesis gives no single enemy for
+        Attribute(  # both traits for `complete`; the thesis names no single enemy that has both
             name="revenants_and_arachnotron",
             groups=("entity_type", "homing", "rapid_fire"),
             content=Content(
@@ -189,7 +190,7 @@ SCENARIO = Scenario(
     upper_bounds={"thesis": 2100, "levdoom": 2100},
     rewards={
         "living": Reward(event=living, weight=0.01, levdoom=0.0),
-        # The Arachnotron's hits are the most and the weakest. The agent stands still.
+        # The Arachnotron's hits are the most frequent and the weakest. The agent stands still.
         "health_lost": Reward(
             event=Fell("HEALTH"),
             weight=-1.0,

@@ -1,22 +1,22 @@
 """Health Gathering: staying alive on an acid floor.
 
-Ability tested: finding what helps, avoiding what harms, walking round what stands in the way.
+Ability tested: finding health kits, avoiding poison, walking round obstacles.
 Actions: MOVE_FORWARD, TURN_LEFT, TURN_RIGHT.
 Observation: the screen with HUD, no weapon; variable HEALTH.
 Reward (eq. 3.4): 0.01 - [death] - [poison picked up] + [health rose].
 Start: one of 9 places at a random angle (levdoom: the centre, facing east; on the map of `supreme` one of its 12
-    places). The floor takes 8 of 100 health every 32 tics. 16 kits lie about, and a kit is added every 30 tics.
+    places). The floor takes 8 of 100 health every 32 tics. 16 kits lie on the floor; one is added every 30 tics.
 Termination: the agent dies. Truncation: after 2100 tics.
 Metric: frames alive, at most the time-out.
 Attributes: thesis B.2, below. `complete` takes water for its textures. Tasks: thesis Table A.2.
 """
 
-from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform, words
+from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
+from gvz.scenarios.parts import RESIZED, retextured, starts_at, things_at
 from gvz.scenarios.rewards import Pace, Reward, Rose, death, living
 
 WAD = "health_gathering.wad"
 SUPREME_WAD = "health_gathering_supreme.wad"
-MAP_SPOT = 9001
 
 SCRIPT = """\
 #include "zcommon.acs"
@@ -123,7 +123,7 @@ script 5 OPEN
 
 
 def _health(name: str, sprite: str, amount: int) -> dict[str, str]:
-    """A DECORATE class that heals `amount`, and is taken even by an agent in full health."""
+    """A DECORATE class that heals `amount`; an agent in full health takes it, too."""
     definition = f"""\
 ACTOR {name} : Health
 {{
@@ -148,7 +148,7 @@ STARTS = (
     *((608, 608), (480, 160), (576, 1088), (160, 640), (1120, 512)),
     *((192, 1088), (896, 1120), (480, 480), (864, 224)),
 )
-"""ours: the thesis says that there are several; at least 130 units from each other and from every obstacle"""
+"""our choice, as the thesis only says "several"; at least 130 units from each other and from every obstacle"""
 
 OBSTACLES = {
     WAD: {
@@ -156,7 +156,7 @@ OBSTACLES = {
         32: ((352, 352), (160, 928), (736, 288), (1056, 736), (352, 864), (736, 992), (1056, 1056)),
         36: ((864, 544), (544, 800), (160, 224), (992, 160)),
     },
-    SUPREME_WAD: {  # as many of each; five are LevDoom's, the others ours: no passage narrower than 64 units
+    SUPREME_WAD: {  # the same numbers; five are LevDoom's, the others ours: no passage is narrower than 64 units
         30: ((544, 1120), (1632, 224), (416, 1632), (1056, 1568), (1248, 928), (1696, 1696)),
         32: ((224, 288), (1408, 1120), (864, 1280), (352, 1472), (1312, 352), (640, 96), (1696, 1216)),
         36: ((1056, 672), (864, 1504), (672, 672), (1504, 768)),
@@ -172,7 +172,7 @@ SCENARIO = Scenario(
     content=Content(
         base_wad=WAD,
         textures=Textures("GSTONE1", "NUKAGE1", "CEIL4_1"),
-        things={WAD: tuple(Thing(MAP_SPOT, x, y, 10 + i) for i, (x, y) in enumerate(STARTS))},
+        things={WAD: starts_at(STARTS, 10)},
         parameters={
             "even_kit": '"Medikit"',
             "odd_kit": '"Medikit"',
@@ -189,12 +189,13 @@ SCENARIO = Scenario(
         actors=_poison(0),
     ),
     levdoom=Content(
-        things={WAD: (Thing(MAP_SPOT, 608, 608, 10),)},
+        things={WAD: starts_at([(608, 608)], 10)},
         parameters={"last_spot": 10, "start_angle": 0.0},
         actors=_poison(1),
     ),
+    variety=Variety(entities=("Medikit",), entity_parameters=("even_kit", "odd_kit"), max_decorations=16),
     attributes=(
-        Attribute(  # first: it sets what textures and stimpacks change
+        Attribute(  # first, because textures and stimpacks change what it sets
             name="supreme",
             groups=("map",),
             content=Content(
@@ -215,28 +216,11 @@ SCENARIO = Scenario(
         Attribute(
             name="obstacles",
             groups=("decorations",),
-            content=Content(
-                things={
-                    wad: tuple(Thing(kind, x, y) for kind, spots in kinds.items() for x, y in spots)
-                    for wad, kinds in OBSTACLES.items()
-                }
-            ),
+            content=Content(things={wad: things_at(places) for wad, places in OBSTACLES.items()}),
         ),
-        Attribute(
-            name="slime",
-            groups=("textures",),
-            content=Content(textures=Textures("A-CAMO3", "SLIME04", "GRASS2")),
-        ),
-        Attribute(
-            name="lava",
-            groups=("textures",),
-            content=Content(textures=Textures("AQCONC14", "LAVA1", "CEIL1_1")),
-        ),
-        Attribute(
-            name="water",
-            groups=("textures",),
-            content=Content(textures=Textures("AQSECT09", "FWATER1", "AQF052")),
-        ),
+        retextured("slime", "A-CAMO3", "SLIME04", "GRASS2"),
+        retextured("lava", "AQCONC14", "LAVA1", "CEIL1_1"),
+        retextured("water", "AQSECT09", "FWATER1", "AQF052"),
         Attribute(
             name="stimpacks",
             groups=("entity_type",),
@@ -247,7 +231,7 @@ SCENARIO = Scenario(
             name="resized_kits",
             groups=("entity_size",),
             aliases=("resized",),
-            content=Content(entity={"ScaleX": Uniform(0.3, 3.0), "ScaleY": Uniform(0.3, 3.0)}),
+            content=RESIZED,
         ),
         Attribute(
             name="shaded_kits",
@@ -268,10 +252,7 @@ SCENARIO = Scenario(
             levdoom=Content(parameters={"poison_delay": 60, "first_poison_delay": 0}),
         ),
     ),
-    complete=(
-        *("obstacles", "water", "supreme", "stimpacks", "resized_kits", "shaded_kits", "short_agent"),
-        "poison",
-    ),
+    complete=words("obstacles water supreme stimpacks resized_kits shaded_kits short_agent poison"),
     levdoom_tasks={
         "stimpacks": Content(
             parameters={"even_kit": '"Stimpack25"', "odd_kit": '"Stimpack25"'},
@@ -284,19 +265,11 @@ SCENARIO = Scenario(
         "poison+supreme": Content(parameters={"poison_delay": 50}),
         "complete": Content(
             things={
-                SUPREME_WAD: tuple(
-                    Thing(kind, x, y)
-                    for kind, x, y in (
-                        *((30, 544, 1120), (30, 1632, 224), (36, 1056, 672), (36, 864, 1504)),
-                        (32, 224, 288),
-                    )
+                SUPREME_WAD: things_at(
+                    {30: ((544, 1120), (1632, 224)), 36: ((1056, 672), (864, 1504)), 32: ((224, 288),)}
                 )
             },
-            parameters={
-                "even_kit": '"CustomStimpack"',
-                "odd_kit": '"CustomStimpack"',
-                "poison_delay": 50,
-            },
+            parameters={"even_kit": '"CustomStimpack"', "odd_kit": '"CustomStimpack"', "poison_delay": 50},
             actors=_health("CustomStimpack", "MEDI A -1\n    Stop", 20),
         ),
     },
@@ -328,14 +301,14 @@ SCENARIO = Scenario(
     rewards={
         "living": Reward(event=living, weight=0.01, levdoom=-0.01),
         "death": Reward(event=death, weight=-1.0, levdoom=0.0, paces=(Pace(times=1),)),
-        # The fourth vial kills an agent that was not healed meanwhile. A new vial comes every 30 tics.
+        # The fourth vial kills an agent that takes no kit in between. A new vial comes every 30 tics.
         "poison_taken": Reward(
             event=Rose("POISONS_TAKEN"),
             weight=-1.0,
             levdoom=0.0,
             paces=(Pace(times=4), Pace(tics=30, needs="health_gained")),
         ),
-        # Two kits lie together; stimpacks heal from near death to full health; then a kit for each blow of the floor.
+        # Two kits lie together; stimpacks heal from near death to full health; then one kit each time the floor hurts.
         "health_gained": Reward(
             event=Rose("HEALTH"),
             weight=1.0,

@@ -4,49 +4,48 @@ import math
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Any
 
 from gvz.core.env_config import EnvConfig, typed
-from gvz.core.errors import ConfigError
+from gvz.core.errors import ConfigError, nearest
 
 Variables = Mapping[str, float]
-"""What the game says after a decision: name of a game or bookkeeping variable -> value."""
+"""The game's variables after a decision: name of a game or bookkeeping variable -> value."""
 
 Event = Callable[[Sequence[Variables], bool], float]
-"""f(history, terminated) -> how much of the event this decision brought, at least 0 (the weight has the sign).
+"""f(history, terminated) -> amount of the event in this decision, at least 0 (the sign is in the weight).
 
 `history` holds the variables after each of the last decisions, oldest first: history[-1] is now, history[-2] one
-decision ago, back to the start of the episode or HISTORY_STEPS decisions, whichever is nearer.
+decision ago. It goes back at most HISTORY_STEPS decisions, and not beyond the start of the episode.
 """
 
 HISTORY_STEPS = 5
 """decisions an event can look back (eq. 3.5 needs five)"""
 
 _EDGE_SHARE = 0.05
-"""part of a range of returns that lies on either side of 0, at least; more than what alarms call its edge"""
+"""least part of a range of returns on each side of 0; larger than the edge in gvz/run/alarms.py"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Pace:
-    """How often an event can come, for a while."""
+    """How often an event can come during a period."""
 
     tics: float = 1.0
-    """game tics from one to the next, at least"""
+    """least number of game tics from one event to the next"""
     times: float = math.inf
-    """how often it comes before the next pace holds"""
+    """number of events before the next pace begins"""
     amount: float = 1.0
-    """of each"""
+    """amount of each event"""
     needs: str | None = None
-    """another component, whose event comes with each of these: a kill costs a bullet"""
+    """another component whose event comes with each of these events: a kill costs a bullet"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Reward:
-    """One component of a scenario's reward: an event, what it is worth, and how often it can come.
+    """One component of a scenario's reward: an event, its weight, and how often it can come.
 
-    The paces follow one another, from any decision on. Together they are the most that a player gets of the event, in
-    all tasks: the game's rules where they set a limit, else what was measured and some ten percent.
+    From any decision on, the paces follow one another. Together they are the maximum that a player can get of the event
+    in all tasks: a limit from the game's rules, or else the measured maximum plus some ten percent.
     """
 
     event: Event
@@ -54,11 +53,11 @@ class Reward:
     levdoom: float
     """the weight in profile levdoom"""
     paces: tuple[Pace, ...] = (Pace(),)
-    """default: once a decision, without end"""
+    """default: once every decision"""
     levdoom_paces: tuple[Pace, ...] | None = None
-    """the paces in profile levdoom, where they differ"""
+    """the paces in profile levdoom, if they differ"""
     adds_up: bool = False
-    """what comes in one decision adds up (a distance); else the event counts once in a decision"""
+    """amounts within one decision add up (a distance); else the event counts once in a decision"""
 
 
 def living(_history: Sequence[Variables], _terminated: bool) -> float:
@@ -67,13 +66,13 @@ def living(_history: Sequence[Variables], _terminated: bool) -> float:
 
 
 def death(_history: Sequence[Variables], terminated: bool) -> float:
-    """1 if the episode ended by the rules: in every scenario that is the agent's death."""
+    """1 if the episode terminated: in every scenario this is the agent's death."""
     return float(terminated)
 
 
 @dataclass(frozen=True, slots=True)
 class Rose:
-    """1 if variable `name` is higher than one decision ago. An object, because a closure cannot be pickled."""
+    """1 if variable `name` is higher than one decision ago. A class, because a closure cannot be pickled."""
 
     name: str
 
@@ -99,21 +98,16 @@ def moved(history: Sequence[Variables], _terminated: bool) -> float:
 
 
 def check_weights(weights: Any, components: Collection[str]) -> dict[str, float]:
-    """Reward weights as somebody gave them, as a dict of floats.
-
-    Args:
-        weights: component -> weight.
-        components: names of the components there are.
+    """A user's reward weights, component -> weight, as a dict of floats.
 
     Raises:
-        ConfigError: not a mapping, a name that is no component's, or a weight that is no finite number.
+        ConfigError: not a mapping, an unknown component, or a weight that is not a finite number.
     """
     if not isinstance(weights, Mapping):
         raise ConfigError(f"env.reward_weights: got {weights!r}, want a mapping of component to weight")
     for name in weights:
         if name not in components:
-            near = get_close_matches(str(name), components, n=1)
-            hint = f" (did you mean {near[0]!r}?)" if near else ""
+            hint = nearest(str(name), components)
             raise ConfigError(
                 f"env.reward_weights: unknown component {name!r}{hint}; want some of {', '.join(components)}"
             )
@@ -121,16 +115,16 @@ def check_weights(weights: Any, components: Collection[str]) -> dict[str, float]
 
 
 class Rewarder:
-    """Turns the variables of one game into rewards; remembers the last HISTORY_STEPS decisions of its episode."""
+    """Computes rewards from the variables of one game; keeps the last HISTORY_STEPS decisions of its episode."""
 
     def __init__(self, events: Mapping[str, Event], weights: Mapping[str, float]):
-        """Takes events and their weights, both by component."""
+        """`events` and `weights` are by component."""
         self.weights = dict(weights)
         self._terms = [(name, weights[name], event) for name, event in events.items()]
         self._history: deque[Variables] = deque(maxlen=HISTORY_STEPS + 1)
 
     def reset(self, variables: Variables) -> None:
-        """Starts an episode with the variables that came with its first observation. They are kept, not copied."""
+        """Starts an episode with the variables of its first observation. They are kept, not copied."""
         self._history.clear()
         self._history.append(variables)
 
@@ -138,26 +132,26 @@ class Rewarder:
         """Rewards of one decision, by component, weights applied; the reward is their sum.
 
         Args:
-            variables: the variables after the decision; kept, not copied. When the agent died, the last that could
-                be read.
-            terminated: the episode ended by the rules (a time-out is not).
+            variables: the variables after the decision; kept, not copied. After the agent's death, the last values
+                that the game gave.
+            terminated: the episode terminated (not by a time-out).
         """
         assert self._history, "Rewarder.step before reset"
         self._history.append(variables)
-        history = self._history  # "0.0 +" keeps negative zeros out of the logs
+        history = self._history  # "0.0 +" turns -0.0 into 0.0 for the logs
         return {name: 0.0 + weight * event(history, terminated) for name, weight, event in self._terms}
 
 
 def return_range(
     rewards: Mapping[str, Reward], weights: Mapping[str, float], env: EnvConfig, discount: float
 ) -> tuple[float, float]:
-    """The range of discounted returns of a scenario, from how often its events can come.
+    """The range of discounted returns of a scenario, computed from how often its events can come.
 
-    Each component adds the most that its event can bring: to the upper end if it pays, else to the lower one. So the
-    upper end is the return of a player who gets all that pays at its full pace, and nothing that costs.
+    Each component adds the maximum of its event: to the upper end if its weight is positive, else to the lower end. So
+    the upper end is the return of a player that gets every positive event at its full pace, and no negative one.
 
-    A time-out ends no return: it is a truncation, and learners bootstrap from the frame after it. 0 is inside the range
-    and not at its end, because it is the return of an episode without events.
+    A time-out does not end a return: it is a truncation, and learners bootstrap from the frame after it. 0 is inside
+    the range and not at its end, because it is the return of an episode without events.
 
     Args:
         rewards: the components.

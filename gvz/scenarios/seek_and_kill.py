@@ -1,26 +1,26 @@
-"""Seek and Kill: a hunt through a maze.
+"""Seek and Kill: the agent searches and shoots enemies in a maze.
 
-Ability tested: exploring, telling enemies from everything else, aiming.
+Ability tested: exploring, recognizing enemies, aiming.
 Actions: ATTACK, SPEED, MOVE_FORWARD, TURN_LEFT, TURN_RIGHT.
 Observation: the screen with weapon and HUD; variables KILLCOUNT, AMMO2, HEALTH, POSITION_X, POSITION_Y.
 Reward (eq. 3.5): [kill] - [death] - 0.1 [ammo fell] - 0.01 - 0.3 [health fell] + 0.005 |l_t - l_{t-5}|.
-    Differs: the equation penalizes health that rose, and squares the distance that the text calls linear.
-Start: one of 20 places (levdoom: 12) at a random angle, a pistol and 200 bullets. 20 Demons of 1 health stand
-    about, unable to walk; one more comes every 30 tics.
+    Differs: the equation penalizes rising health, and squares the distance that the text calls linear.
+Start: one of 20 places (levdoom: 12) at a random angle, a pistol and 200 bullets. 20 Demons of 1 health stand in
+    the maze and cannot walk; one more comes every 30 tics.
 Termination: the agent dies. Truncation: after 1200 tics (levdoom: 1250).
 Metric: kills (KILLCOUNT, which also counts enemies that enemies killed); a score is at most 20.
-Attributes: thesis B.3, below. `complete` takes red and mixed_enemies: before red, shadows stand out more than before
-    blue (results/reference/contrast.json). Tasks: thesis Table A.3.
-Known: about one enemy in a hundred appears in the walled-off notch at the map's north side, out of reach; so does
-    a kit on the map of health_gathering/supreme. The author's maps have it too.
+Attributes: thesis B.3, below. `complete` takes red and mixed_enemies: shadows are easier to see in front of red than
+    of blue (results/reference/contrast.json). Tasks: thesis Table A.3.
+Known: about one enemy in a hundred appears in the walled-off notch at the map's north side, out of reach. The same
+    happens to kits of health_gathering/supreme, and in the author's maps.
 """
 
-from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Thing, Uniform, words
+from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Variety, words
+from gvz.scenarios.parts import COUNTED_MARINE, RESIZED, retextured, starts_at, things_at
 from gvz.scenarios.rewards import HISTORY_STEPS, Fell, Pace, Reward, Rose, death, living, moved
 from gvz.wad.udmf import UdmfMap
 
 WAD = "health_gathering_supreme.wad"
-MAP_SPOT = 9001
 
 SCRIPT = """\
 #include "zcommon.acs"
@@ -106,16 +106,9 @@ script 4 (void)
 }
 """
 
-COUNTED_MARINE = """\
-ACTOR MarineChainsawVzd : MarineChainsaw
-{
-  +COUNTKILL
-}
-"""
-
 
 def _born_soul(health: int) -> dict[str, str]:
-    """The soul a Pain Elemental spits out: a class whose death is counted like that of any other enemy."""
+    """The lost soul that a Pain Elemental spits out: its death counts like that of any other enemy."""
     definition = f"""\
 ACTOR BornSoul : LostSoul replaces LostSoul
 {{
@@ -133,7 +126,7 @@ ACTOR BornSoul : LostSoul replaces LostSoul
 
 
 SPOTS = ((640, 1728), (384, 1088), (1152, 1600), (1216, 1024), (1184, 352), (640, 192), (64, 864), (352, 656))
-"""ours: eight starts beside the base map's twelve; at least 130 units from those and from every obstacle"""
+"""our choice: eight starts beside the base map's twelve; at least 130 units from those and from every obstacle"""
 
 TORCHES = {
     44: (
@@ -155,7 +148,7 @@ MIXED = ("ZombieMan", "MarineChainsawVzd", "DoomImp", "Cacodemon", "LostSoul")
 STRONG = ("Arachnotron", "Fatso", "PainElemental", "Archvile", "Revenant")
 
 KILLS = (Pace(tics=4, times=3), Pace(tics=12, times=3), Pace(tics=36))
-"""Enemies that stand together die first, then as many as come: five in 180 tics. Most of them kill each other."""
+"""First the enemies near each other die, then as many as come: five in 180 tics. Most of them kill each other."""
 
 
 def drain_acid(maze: UdmfMap) -> None:
@@ -172,7 +165,7 @@ SCENARIO = Scenario(
     content=Content(
         base_wad=WAD,
         textures=Textures("ICKWALL3", "AQF051", "FLAT19"),
-        things={WAD: tuple(Thing(MAP_SPOT, x, y, 22 + i) for i, (x, y) in enumerate(SPOTS))},
+        things={WAD: starts_at(SPOTS, 22)},
         parameters={
             "classes": ("Demon",),
             "num_per_class": 20,
@@ -184,29 +177,16 @@ SCENARIO = Scenario(
         entity={"Speed": 0.0},
     ),
     levdoom=Content(things={WAD: ()}, parameters={"first_delay": 0, "last_spot": 21}),
+    variety=Variety(entities=("Demon",), entity_parameters=("classes",), max_decorations=24),
     attributes=(
-        Attribute(
-            name="blue",
-            groups=("textures",),
-            content=Content(textures=Textures("FIREBLU2", "FLAT14", "CEIL4_3")),
-        ),
-        Attribute(
-            name="red",
-            groups=("textures",),
-            content=Content(textures=Textures("FIREWALL", "CRACKLE4", "DORED")),
-        ),
-        Attribute(
-            name="obstacles",
-            groups=("decorations",),
-            content=Content(
-                things={WAD: tuple(Thing(kind, x, y) for kind, spots in TORCHES.items() for x, y in spots)}
-            ),
-        ),
+        retextured("blue", "FIREBLU2", "FLAT14", "CEIL4_3"),
+        retextured("red", "FIREWALL", "CRACKLE4", "DORED"),
+        Attribute(name="obstacles", groups=("decorations",), content=Content(things={WAD: things_at(TORCHES)})),
         Attribute(
             name="resized_enemies",
             groups=("entity_size",),
             aliases=("resized",),
-            content=Content(entity={"ScaleX": Uniform(0.3, 3.0), "ScaleY": Uniform(0.3, 3.0)}),
+            content=RESIZED,
         ),
         Attribute(
             name="shadows",
@@ -219,7 +199,7 @@ SCENARIO = Scenario(
             aliases=("mixed",),
             content=Content(
                 parameters={"classes": MIXED, "num_per_class": 3, "first_delay": 180, "spawn_delay": 180},
-                actors={"MarineChainsawVzd": COUNTED_MARINE},
+                actors=COUNTED_MARINE,
             ),
             levdoom=Content(parameters={"first_delay": 0}),
         ),
@@ -271,14 +251,14 @@ SCENARIO = Scenario(
         "kill": Reward(event=Rose("KILLCOUNT"), weight=1.0, levdoom=1.0, paces=KILLS),
         "player_kill": Reward(event=Rose("PLAYER_KILLS"), weight=0.0, levdoom=0.0, paces=KILLS),
         "death": Reward(event=death, weight=-1.0, levdoom=0.0, paces=(Pace(times=1),)),
-        # A held trigger fires every 14 tics. Decisions of four tics round that down now and then.
+        # A held ATTACK button fires every 14 tics. With decisions of four tics this is sometimes less.
         "ammo_spent": Reward(event=Fell("AMMO2"), weight=-0.1, levdoom=0.0, paces=(Pace(tics=13, times=200),)),
         "living": Reward(event=living, weight=-0.01, levdoom=0.0),
         "health_lost": Reward(
             event=Fell("HEALTH"), weight=-0.3, levdoom=0.0, paces=(Pace(tics=3, times=5), Pace(tics=16, times=10))
         ),
         # Map units a tic, each counted by five decisions: 22 while blows push the agent, 25 / 3 along a passage, and
-        # half of that between walls in the long run.
+        # half of that over a long walk between walls.
         "moved": Reward(
             event=moved,
             weight=0.005,

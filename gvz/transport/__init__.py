@@ -1,1 +1,1 @@
-"""Tier 0. All that actors and learner say to each other."""
+"""Tier 0. The communication between actors and learner: shared memory and control messages."""

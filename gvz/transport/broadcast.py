@@ -1,8 +1,9 @@
 """The parameter queue: one writer (the learner), many readers (actors), shared memory.
 
-A version of the parameters is one flat float32 vector. The writer fills the slots in turn and never waits; each slot
-has a ticket that is odd while the slot is written, so a reader that was overtaken sees it and takes the newer one.
-The number of publications is raised after a slot is whole: a writer that dies leaves the version before.
+A version of the parameters is one flat float32 vector. The writer fills the slots in turn and never waits. Each slot
+has a ticket that is odd while the slot is written. So a reader detects that its slot was overwritten and takes the
+newer version. The number of publications increases after a slot is complete: if a writer dies, the version before
+stays.
 """
 
 import struct
@@ -15,12 +16,12 @@ from gvz.transport.messages import ParamsHeader
 from gvz.transport.segment import ALIGN_BYTES, Fence, Segment, aligned, hash_layout
 
 _TICKET, _VERSION, _NUM_UPDATES, _EPSILON_BITS, _NUM_WORDS = 0, 1, 2, 3, 8
-"""u64 words before each slot's vector; the payload starts with as many, of which the first counts publications"""
+"""u64 words before each slot's vector; the payload also starts with 8 words, and the first counts publications"""
 _READ_TIMEOUT_S = 30.0
 
 
 class _ParamsQueue:
-    """What both ends share: the mapped arrays."""
+    """The mapped arrays of both ends."""
 
     def __init__(self, segment: Segment, num_params: int, num_slots: int, layout_hash: int):
         payload = segment.payload
@@ -36,36 +37,29 @@ class _ParamsQueue:
         self._fence = Fence()
 
     def close(self) -> None:
-        """Lets go of the memory. Can be repeated."""
+        """Releases the memory. Can be repeated."""
         self._count = memoryview(bytes(8)).cast("Q")
         self._words, self._vectors = [], []
         self._segment.close()
 
 
 class BroadcastWriter(_ParamsQueue):
-    """The learner's end, which makes the queue."""
+    """The learner's end, which creates the queue."""
 
     @classmethod
     def create(cls, name: str, num_params: int, layout_hash: int, *, num_slots: int = 3) -> "BroadcastWriter":
-        """Makes a queue without a version.
+        """Creates a queue that holds no version yet of a vector float32[num_params]; `name` is its name in errors.
 
-        Args:
-            name: what errors call it.
-            num_params: length P of the flat float32 vector.
-            layout_hash: u64 hash of the parameter tree; readers must bring the same.
-            num_slots: versions kept, at least 2. A reader is overtaken only when `num_slots - 1` publications begin
-                within its one copy.
+        Readers must pass the same `layout_hash`, a u64 of the parameter tree. Of the at least 2 versions kept, a reader
+        must repeat its copy only when `num_slots - 1` publications begin during it.
 
         Raises:
             ResourceError: there is not enough memory.
         """
         if num_slots < 2:
             raise ValueError(f"num_slots: got {num_slots}, want at least 2 (one is read while one is written)")
-        segment = Segment.create(
-            name,
-            broadcast_bytes(num_params, num_slots),
-            layout_hash=hash_layout("broadcast", num_params, num_slots, layout_hash),
-        )
+        whole_hash = hash_layout("broadcast", num_params, num_slots, layout_hash)
+        segment = Segment.create(name, broadcast_bytes(num_params, num_slots), layout_hash=whole_hash)
         queue = cls(segment, num_params, num_slots, layout_hash)
         for words in (queue._count, *queue._words):
             for index in range(_NUM_WORDS):
@@ -74,14 +68,14 @@ class BroadcastWriter(_ParamsQueue):
 
     @property
     def descriptor(self) -> int:
-        """File descriptor by which other processes can attach a `BroadcastReader`."""
+        """File descriptor with which other processes attach a `BroadcastReader`."""
         return self._segment.descriptor
 
     def publish(self, params: np.ndarray, header: ParamsHeader) -> None:
         """Makes `params` float32[P] the newest version. Never waits.
 
         Raises:
-            ValueError: another length, dtype or tree than the queue was made for.
+            ValueError: length, dtype or parameter tree differs from the queue's.
         """
         if params.shape != (self.num_params,) or params.dtype != np.float32:
             raise ValueError(
@@ -115,22 +109,19 @@ class BroadcastReader(_ParamsQueue):
         """Maps the queue.
 
         Raises:
-            TransportError: the descriptor is no queue's, or the queue was made for other parameters.
+            TransportError: the descriptor does not belong to a queue, or the queue was created for other parameters.
         """
-        segment = Segment.attach(
-            descriptor,
-            broadcast_bytes(num_params, num_slots),
-            layout_hash=hash_layout("broadcast", num_params, num_slots, layout_hash),
-        )
+        whole_hash = hash_layout("broadcast", num_params, num_slots, layout_hash)
+        segment = Segment.attach(descriptor, broadcast_bytes(num_params, num_slots), layout_hash=whole_hash)
         return cls(segment, num_params, num_slots, layout_hash)
 
     def read(self) -> tuple[np.ndarray, ParamsHeader] | None:
         """The newest version, float32[P] and its header, if it is newer than the last one read; else None.
 
-        The vector is the caller's own and aligned such that XLA on a CPU takes it without another copy.
+        The vector belongs to the caller and is aligned so that XLA on a CPU takes it without another copy.
 
         Raises:
-            WaitTimeoutError: overtaken by the writer again and again.
+            WaitTimeoutError: the writer overwrote every copy for too long.
             TransportError: the control words contradict each other.
         """
         if self._count[0] == self._seen:

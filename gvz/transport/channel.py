@@ -8,7 +8,7 @@ from gvz.core.errors import TransportError, WaitTimeoutError
 from gvz.transport.messages import Message, decode, encode
 
 MAX_MESSAGE_BYTES = 64 * 2**20
-"""the largest is an ActorSpec with its policy; anything larger is damage"""
+"""the largest message is an ActorSpec with its policy; a larger one is damaged"""
 _RECEIVE_BYTES = 65536
 
 
@@ -24,13 +24,13 @@ class Channel:
         self._peer = peer
         self._buffer = bytearray()
         self.closed = False
-        """the peer has gone; nothing more will come"""
+        """the peer has closed its end; nothing more will arrive"""
 
     def fileno(self) -> int:
         return self._socket.fileno()
 
     def send(self, message: Message) -> None:
-        """Sends a message whole. If the peer has gone, sets `closed` instead.
+        """Sends a complete message. If the peer has closed its end, sets `closed` instead.
 
         Raises:
             WaitTimeoutError: the peer does not read.
@@ -46,12 +46,12 @@ class Channel:
             self.closed = True
 
     def receive(self) -> list[Message]:
-        """All messages that have arrived whole.
+        """All messages that have arrived completely.
 
         Raises:
             TransportError: what arrived is not a message.
         """
-        # not more than the longest message at a time: a peer that never stops talking must not fill the memory
+        # at most the longest message at a time: a peer that never stops sending must not fill the memory
         while not self.closed and len(self._buffer) < 4 + MAX_MESSAGE_BYTES and self._poll.poll(0):
             self._fill()
         messages: list[Message] = []
@@ -63,7 +63,7 @@ class Channel:
         """The next message.
 
         Raises:
-            WaitTimeoutError: none came in time. TransportError: the peer has gone, or sent something else.
+            WaitTimeoutError: none came in time. TransportError: the peer closed its end, or sent something else.
         """
         while (message := self._take()) is None:
             if self.closed:
@@ -81,7 +81,7 @@ class Channel:
         self._socket.close()
 
     def _fill(self) -> None:
-        """Moves a piece of what arrives into the buffer."""
+        """Moves bytes that have arrived into the buffer."""
         try:
             data = self._socket.recv(_RECEIVE_BYTES)
         except ConnectionResetError:
@@ -90,7 +90,7 @@ class Channel:
         self._buffer += data
 
     def _take(self) -> Message | None:
-        """The first message of the buffer, if it is whole."""
+        """The first message of the buffer, if it is complete."""
         if len(self._buffer) < 4:
             return None
         (length,) = struct.unpack_from("<I", self._buffer)

@@ -1,8 +1,8 @@
-"""Anonymous shared memory with a header that proves what it is.
+"""Anonymous shared memory with a header that identifies it.
 
-A segment is a `memfd_create` file, mapped. It has no name in any directory: a process is given its descriptor when it
-is started, and the kernel frees the memory when the last process that maps it or holds its descriptor has ended. So
-no crash leaves anything behind. It counts as memory of the process group, not towards the size of /dev/shm.
+A segment is a mapped `memfd_create` file. It has no name in any directory: a process inherits its descriptor. The
+kernel frees the memory when the last process that maps it or holds its descriptor has ended, so no crash leaves
+anything behind. It counts as memory of the process group, not towards the size of /dev/shm.
 
 Layout: eight little-endian u64 (magic, schema, total bytes, layout hash, four unused), then the payload.
 """
@@ -23,17 +23,18 @@ from gvz.transport.messages import SCHEMA_VERSION
 MAGIC = int.from_bytes(b"GViZ-shm", "little")
 HEADER_BYTES = 64
 ALIGN_BYTES = 64
-"""parts of a payload start at multiples of this: a cache line, and what XLA wants of an array it reads in place"""
+"""parts of a payload start at multiples of this: a cache line, and XLA's alignment of arrays that it reads in place"""
 POISON = 0xFF
-"""fills a new payload: as float32 it is NaN, as a sequence number it is impossible"""
+"""fills a new payload: NaN as a float32, impossible as a sequence number"""
 
 
 class Segment:
     """One mapped piece of shared memory. Views of `payload` keep the mapping alive after `close`.
 
     Attributes:
-        name: what errors and `/proc/PID/maps` call it.
-        descriptor: the file descriptor to give to another process (`pass_fds`); -1 where the segment is attached.
+        name: its name in errors and in `/proc/PID/maps`.
+        descriptor: the file descriptor to pass to another process (`pass_fds`); -1 if this process attached the
+            segment.
     """
 
     def __init__(self, name: str, mapping: mmap.mmap, descriptor: int = -1):
@@ -43,19 +44,16 @@ class Segment:
 
     @classmethod
     def create(cls, name: str, payload_bytes: int, *, layout_hash: int) -> "Segment":
-        """Makes a segment, all of its memory allocated at once and poisoned. Its size can never change.
+        """Creates a segment. Its memory is allocated at once and filled with POISON. Its size can never change.
 
-        Args:
-            name: any label; several segments may have the same.
-            payload_bytes: size without the header.
-            layout_hash: u64; `attach` must bring the same.
+        Several segments may have the same name. `attach` must pass the same `layout_hash`, a u64.
 
         Raises:
             ResourceError: there is not enough memory.
         """
         total = HEADER_BYTES + payload_bytes
         available = _available_bytes()
-        if total > available:  # the kernel would not refuse: it would kill processes until there is room
+        if total > available:  # the kernel would not refuse, but kill processes to make room
             raise ResourceError(
                 f"segment {name}: got {available} bytes of available memory, want {total}; "
                 "lower actors.ring_capacity or actors.num_actors"
@@ -76,10 +74,10 @@ class Segment:
 
     @classmethod
     def attach(cls, descriptor: int, payload_bytes: int, *, layout_hash: int) -> "Segment":
-        """Maps the segment that another process made. The descriptor stays the caller's, who may close it.
+        """Maps a segment of another process. The descriptor still belongs to the caller, who may close it.
 
         Raises:
-            TransportError: no such descriptor, or the file is not what was expected.
+            TransportError: no such descriptor, or the file is not the expected segment.
         """
         total = HEADER_BYTES + payload_bytes
         try:
@@ -101,7 +99,7 @@ class Segment:
         return cls(name, mapping)
 
     def close(self) -> None:
-        """Lets go of mapping and descriptor. Can be repeated."""
+        """Releases mapping and descriptor. Can be repeated."""
         self.payload = memoryview(b"")
         if self.descriptor >= 0:
             os.close(self.descriptor)
@@ -109,7 +107,7 @@ class Segment:
 
 
 def _available_bytes() -> int:
-    """Memory that can be taken without swapping."""
+    """Memory that is available without swapping."""
     found = re.search(r"^MemAvailable: +(\d+) kB$", Path("/proc/meminfo").read_text(), re.MULTILINE)
     assert found is not None, "/proc/meminfo has no line MemAvailable"
     return 1024 * int(found[1])
@@ -121,15 +119,15 @@ def aligned(num_bytes: int) -> int:
 
 
 def hash_layout(*parts: object) -> int:
-    """u64 hash of the printed form of `parts`: what both sides of a segment must agree on."""
+    """u64 hash of the printed form of `parts`, on which both sides of a segment must agree."""
     return int.from_bytes(hashlib.blake2b(repr(parts).encode(), digest_size=8).digest(), "little")
 
 
 class Fence:
-    """Orders memory accesses: what stands before the call is done before what stands after it.
+    """Orders memory accesses: all accesses before the call happen before all accesses after it.
 
-    x86-64 keeps stores in order anyway; on ARM two handovers of an uncontended lock are the barrier that plain
-    Python offers (release, then acquire; 0.1 microseconds).
+    x86-64 keeps stores in order anyway. On ARM, locking and unlocking an uncontended lock twice is the barrier that
+    plain Python offers (release, then acquire; 0.1 microseconds).
     """
 
     def __init__(self) -> None:

@@ -2,8 +2,9 @@
 
 import re
 
-# What is begun is always ended, at the latest by the end of the text: else each unclosed beginning would be searched
-# for its end again, in a time that grows with the square of their number. Likewise blank lines below.
+# The end of the text also ends a comment or string. Otherwise each unclosed comment would be searched to the end again,
+# in a time that grows with the square of their number. For the same reason the patterns below start with the blanks of
+# one line only.
 _COMMENT_OR_STRING = re.compile(r'//[^\n]*|/\*.*?(?:\*/|\Z)|"(?:[^"\\\n]|\\.)*"?', re.DOTALL)
 _ACTOR = re.compile(r"^[^\S\n]*actor\s+(?P<name>[A-Za-z0-9_~.]+)", re.IGNORECASE | re.MULTILINE)
 _NAME = r"[A-Za-z0-9_~.]+"
@@ -16,11 +17,11 @@ _STATE = re.compile(
     re.IGNORECASE | re.MULTILINE,
 )
 _NO_SPRITE = "TNT1"
-"""the sprite of what is not to be seen"""
+"""the sprite of invisible things"""
 
 
 def declared_actors(decorate: str) -> list[str]:
-    """Names of the classes that DECORATE text declares with `ACTOR name ...`, in its order."""
+    """Names of the classes that DECORATE text declares with `ACTOR name ...`, in the order of the text."""
     return [match["name"] for match in _ACTOR.finditer(_plain(decorate))]
 
 
@@ -30,7 +31,7 @@ def declared_numbers(decorate: str) -> frozenset[int]:
 
 
 def used_sprites(decorate: str) -> frozenset[str]:
-    """Sprites with their frames, such as `BON1A`, that the states in DECORATE text show; quoted ones are left out."""
+    """Sprites with their frames, such as `BON1A`, in the states of DECORATE text, without quoted ones."""
     return frozenset(
         f"{match['sprite']}{frame}".upper()
         for match in _STATE.finditer(_plain(decorate))
@@ -41,5 +42,5 @@ def used_sprites(decorate: str) -> frozenset[str]:
 
 def _plain(decorate: str) -> str:
     """The text without comments and strings."""
-    # Blanks instead of nothing: a comment between two words must go on keeping them apart.
+    # Blanks, not nothing: a comment between two words must still separate them.
     return _COMMENT_OR_STRING.sub(" ", decorate)

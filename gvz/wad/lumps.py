@@ -1,7 +1,7 @@
 """WAD files: a header, lumps of bytes, a directory of their names. Works on bytes, never on files.
 
-Written here in place of omgifol, because that library collapses lumps of one name, writes what is added to a map behind
-its ENDMAP (where the engine does not look), opens files for writing, and takes damaged bytes for good ones.
+This replaces omgifol. That library merges lumps with the same name, writes additions to a map after its ENDMAP (where
+the engine does not look), opens files for writing, and accepts damaged bytes.
 """
 
 import itertools
@@ -19,7 +19,7 @@ _NAME = re.compile(r"[!-~]{1,8}")
 
 @dataclass(frozen=True, slots=True)
 class Lump:
-    """A named piece of a WAD; names are upper case, and need not be unique."""
+    """A named piece of a WAD; names are upper case and may repeat."""
 
     name: str
     data: bytes
@@ -29,7 +29,7 @@ def read_wad(data: bytes) -> list[Lump]:
     """Reads the lumps of a WAD in directory order.
 
     Raises:
-        WadError: the bytes are not a whole WAD; names the lump, the offset, and what is wrong there.
+        WadError: the bytes are not a complete WAD; the message names the lump, the offset and the error.
     """
     if len(data) < HEADER.size:
         raise WadError(f"WAD: got {len(data)} bytes, want at least a header of {HEADER.size}")
@@ -45,7 +45,7 @@ def read_wad(data: bytes) -> list[Lump]:
     for number in range(count):
         lumps.append(_read_lump(data, number, directory + number * ENTRY.size))
         total += len(lumps[-1].data)
-        # Lumps that share bytes would let a small file name more data than fits into memory.
+        # Without this check, lumps that share bytes could make a small file fill the memory.
         if total > len(data):
             raise WadError(
                 f"WAD: got {number + 1} lumps of {total} bytes in a file of {len(data)}, want lumps that do not overlap"
@@ -84,10 +84,10 @@ def write_wad(lumps: Sequence[Lump]) -> bytes:
 def read_maps(lumps: Sequence[Lump]) -> dict[str, dict[str, bytes]]:
     """The UDMF maps of a WAD: map name -> lump name -> data.
 
-    Editors leave several lumps of one name behind; the engine takes the last one before ENDMAP, and so does this.
+    Editors can leave several lumps with the same name. The engine takes the last one before ENDMAP, and so does this.
 
     Raises:
-        WadError: a map has no ENDMAP (the engine would refuse to start), or its name stands twice.
+        WadError: a map has no ENDMAP (the engine would refuse to start), or a name occurs twice.
     """
     maps: dict[str, dict[str, bytes]] = {}
     name: str | None = None  # of the map that the next lumps belong to
@@ -112,27 +112,24 @@ def write_map_wad(
     behavior: bytes,
     scripts: str,
     decorate: str = "",
-    mapinfo: str = "",
     map_name: str = "MAP01",
 ) -> bytes:
     """Writes a WAD with one map; the same arguments give the same bytes.
 
-    There are no nodes (ZNODES): the engine builds them itself in a few milliseconds, and stale ones would be wrong.
+    There are no nodes (ZNODES): the engine builds them in a few milliseconds, and outdated nodes would be wrong.
 
     Args:
         textmap: UDMF text of the map.
         behavior: compiled scripts.
-        scripts: their source, for whoever opens the map in an editor; the engine does not read it.
+        scripts: their source, for a reader who opens the map in an editor; the engine does not read it.
         decorate: actor definitions; no lump if empty.
-        mapinfo: MAPINFO text; no lump if empty.
         map_name: name of the map.
 
     Raises:
-        WadError: a text holds a character beyond Latin-1, or `map_name` is no lump name.
+        WadError: a text has a character outside Latin-1, or `map_name` is not a lump name.
     """
     lumps = [
         *([Lump("DECORATE", _encode("DECORATE", decorate))] if decorate else []),
-        *([Lump("MAPINFO", _encode("MAPINFO", mapinfo))] if mapinfo else []),
         Lump(map_name, b""),
         Lump("TEXTMAP", _encode("TEXTMAP", textmap)),
         Lump("BEHAVIOR", behavior),

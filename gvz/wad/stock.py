@@ -1,4 +1,4 @@
-"""What the installed engine brings along: base maps, actor classes, textures.
+"""The installed engine's base maps, actor classes, sprites and textures.
 
 Read from the vizdoom package's data files; its compiled module is never imported.
 """
@@ -15,7 +15,7 @@ from gvz.wad.lumps import read_wad
 from gvz.wad.textures import flats, wall_textures
 
 _MAPINFO = ("common", "doomcommon", "doomitems", "doom2")
-"""MAPINFO texts that hold for Doom II, the game that is played"""
+"""MAPINFO texts for Doom II, the game that we play"""
 
 
 @cache
@@ -35,7 +35,7 @@ def scenario_wad(file_name: str) -> bytes:
     """The bytes of one of the engine's own scenarios, such as `defend_the_center.wad`.
 
     Raises:
-        WadError: there is none of that name; lists those there are.
+        WadError: there is none with that name; the message lists all.
     """
     directory = engine_directory() / "scenarios"
     known = sorted(path.name for path in directory.glob("*.wad"))
@@ -46,9 +46,9 @@ def scenario_wad(file_name: str) -> bytes:
 
 @cache
 def stock_actors() -> frozenset[str]:
-    """Names of the actor classes the engine has for Doom, from the DECORATE text in its vizdoom.pk3.
+    """Names of the engine's actor classes for Doom, from the DECORATE text in its vizdoom.pk3.
 
-    Classes of Heretic, Hexen, Strife and Chex Quest are left out: the engine knows them, but has no pictures.
+    Classes of Heretic, Hexen, Strife and Chex Quest are left out: the engine has no sprites for them.
     """
     with zipfile.ZipFile(engine_directory() / "vizdoom.pk3") as archive:
         texts = [
@@ -75,12 +75,12 @@ def stock_sprites() -> frozenset[str]:
     found = names[names.index("S_START") + 1 : names.index("S_END")]
     with zipfile.ZipFile(engine_directory() / "vizdoom.pk3") as archive:
         found += [Path(name).stem.upper() for name in archive.namelist() if name.startswith("sprites/")]
-    # A name is sprite, frame, rotation; a mirrored picture stands for a second frame and rotation.
+    # A name is sprite, frame, rotation; a mirrored picture has a second frame and rotation in its name.
     return frozenset(name[:4] + name[place] for name in found for place in (4, 6) if place < len(name))
 
 
 @cache
 def stock_textures() -> frozenset[str]:
-    """Upper-case names of all wall textures and flats of freedoom2.wad, the resources every game is played with."""
+    """Upper-case names of all wall textures and flats of freedoom2.wad, which every game uses."""
     lumps = read_wad((engine_directory() / "freedoom2.wad").read_bytes())
     return wall_textures(lumps) | flats(lumps)

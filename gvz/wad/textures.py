@@ -1,11 +1,10 @@
-"""Names of textures: what a WAD has, what a map uses."""
+"""Names of textures: those in a WAD, and those that a map uses."""
 
-import difflib
 import re
 import struct
 from collections.abc import Collection, Sequence
 
-from gvz.core.errors import WadError
+from gvz.core.errors import WadError, nearest
 from gvz.wad.lumps import Lump
 from gvz.wad.udmf import UdmfMap
 
@@ -18,7 +17,7 @@ _NAME = re.compile(r"[!-~]{1,8}")
 def wall_textures(lumps: Sequence[Lump]) -> frozenset[str]:
     """Names in the TEXTURE1 and TEXTURE2 lumps.
 
-    The first name of TEXTURE1 is left out: the engine takes it for "no texture" and shows nothing.
+    The first name of TEXTURE1 is left out: to the engine it means "no texture".
 
     Raises:
         WadError: a texture lump is damaged.
@@ -76,19 +75,18 @@ def used_textures(udmf_map: UdmfMap) -> dict[str, str]:
 
 
 def check_textures(udmf_map: UdmfMap, textures: Collection[str]) -> None:
-    """Refuses a map that uses a texture which is not there; the engine would show a checkerboard and go on.
+    """Refuses a map with an unknown texture; the engine itself would show a checkerboard and go on.
 
-    Walls may use flats, floors and ceilings wall textures: the engine looks in both.
+    Walls may use flats, and floors and ceilings may use wall textures: the engine searches both.
 
     Args:
         udmf_map: the map.
         textures: upper-case names of all wall textures and flats.
 
     Raises:
-        WadError: names the texture, its place, and the nearest name there is.
+        WadError: an unknown texture; the message names it, its place, and the nearest known name.
     """
     for texture, place in used_textures(udmf_map).items():
         if texture not in textures:
-            near = difflib.get_close_matches(texture, textures, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise WadError(f"{place}: got the unknown texture {texture!r}, want a wall texture or flat{hint}")
+            hint = nearest(texture, textures)
+            raise WadError(f"{place}: got the unknown texture {texture!r}{hint}, want a wall texture or flat")

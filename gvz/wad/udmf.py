@@ -1,7 +1,7 @@
 """UDMF, the map format: TEXTMAP text to lists of blocks and back.
 
-The engine ends the process on a map whose blocks refer to others that are not there, so references and required
-fields are checked when a map is read and again when it is written.
+The engine ends the process if a block of a map refers to a missing block. So references and required fields are checked
+when a map is read and again when it is written.
 """
 
 import re
@@ -18,10 +18,10 @@ Block = dict[str, Value]
 MAX_COORDINATE = 32767
 """map units; the engine's coordinates are 16.16 fixed point"""
 MAX_NUMBER_LENGTH = 40
-"""characters of a number; more are damage, not precision"""
+"""characters of a number; a longer number is damaged"""
 
 REFERENCES = (
-    # kind, field, what it counts, required
+    # kind, field, kind of the block it refers to, required
     ("linedef", "v1", "vertex", True),
     ("linedef", "v2", "vertex", True),
     ("linedef", "sidefront", "sidedef", True),
@@ -29,7 +29,7 @@ REFERENCES = (
     ("sidedef", "sector", "sector", True),
 )
 NO_REFERENCE = -1
-"""what editors write into an optional reference to nothing"""
+"""value of an optional reference that is not used, as editors write it"""
 REQUIRED: tuple[tuple[str, str, type], ...] = (
     ("vertex", "x", float),
     ("vertex", "y", float),
@@ -57,7 +57,7 @@ _STRING = re.compile(r"[\x20-\x7e\xa0-\xff]*")
 
 @dataclass(slots=True)
 class UdmfMap:
-    """A map. A block is known by its place in its list: linedefs name vertices and sidedefs by it."""
+    """A map. A block's number is its place in its list; linedefs refer to vertices and sidedefs by this number."""
 
     namespace: str = "zdoom"
     things: list[Block] = field(default_factory=list)
@@ -67,7 +67,7 @@ class UdmfMap:
     sectors: list[Block] = field(default_factory=list)
 
     def blocks(self) -> dict[str, list[Block]]:
-        """The lists by the name UDMF has for one of their blocks, in the order they are written."""
+        """The lists by UDMF's name of their blocks, in the order in which they are written."""
         return {
             "thing": self.things,
             "vertex": self.vertices,
@@ -76,14 +76,19 @@ class UdmfMap:
             "sector": self.sectors,
         }
 
+    def copy(self) -> "UdmfMap":
+        """A map that can be changed without changing this one."""
+        lists = ([dict(block) for block in blocks] for blocks in self.blocks().values())
+        return UdmfMap(self.namespace, *lists)
+
 
 def make_thing(type_number: int, x: float, y: float, *, tid: int = 0, angle: int = 0) -> Block:
-    """A thing that is there at every skill level and in every game mode.
+    """A thing that exists at every skill level and in every game mode.
 
     Args:
         type_number: editor number of its actor class.
         x, y: place, map units.
-        tid: number scripts know it by; 0 for none.
+        tid: number by which scripts refer to it; 0 for none.
         angle: degrees, 0 is east, 90 north.
     """
     present = ("skill1", "skill2", "skill3", "skill4", "skill5", "single", "coop", "dm")
@@ -117,7 +122,7 @@ def parse_textmap(text: str) -> UdmfMap:
     """Reads the text of a TEXTMAP lump.
 
     Raises:
-        WadError: it is not UDMF, a block lacks a required field, or refers to a block that is not there.
+        WadError: it is not UDMF, or a block lacks a required field or refers to a missing block.
     """
     return _Parser(text).parse()
 
@@ -237,8 +242,7 @@ def write_textmap(udmf_map: UdmfMap) -> str:
     """Writes a map as the text of a TEXTMAP lump; equal maps give equal text.
 
     Raises:
-        WadError: a block lacks a required field, refers to a block that is not there, or holds a value that
-            UDMF cannot express.
+        WadError: a block lacks a required field, refers to a missing block, or holds a value that UDMF cannot express.
     """
     _check(udmf_map, {})
     parts = [f"namespace = {_write_value('namespace', udmf_map.namespace)};\n"]
@@ -258,7 +262,7 @@ def _write_value(where: str, value: Value) -> str:
         case int() if -(2**31) <= value < 2**31:
             return str(value)
         case float() if abs(value) < float("inf"):
-            # The shortest digits that read back the same; Python leaves the point out of 1e-05, UDMF wants it.
+            # The shortest digits that give the same number. Python writes 1e-05 without a point; UDMF needs the point.
             digits, exponent_mark, exponent = repr(value).partition("e")
             return (digits if "." in digits else digits + ".0") + exponent_mark + exponent
         case str() if _STRING.fullmatch(value):
@@ -268,7 +272,7 @@ def _write_value(where: str, value: Value) -> str:
 
 
 def _check(udmf_map: UdmfMap, lines: Mapping[str, Sequence[int]]) -> None:
-    """Refuses what the engine would fail on. `lines` are those of the blocks, where the map comes from a text."""
+    """Refuses maps on which the engine would fail. `lines` are the line numbers of blocks, if a text was read."""
     all_blocks = udmf_map.blocks()
     counts = {kind: len(blocks) for kind, blocks in all_blocks.items()}
     for kind, blocks in all_blocks.items():

@@ -5,18 +5,18 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.export
 import jax.numpy as jnp
 import msgpack
+import msgspec
 import numpy as np
 import pytest
-from fake_env import FRAME_SHAPE, Checker, config
+from fake_env import FRAME_SHAPE, Checker, config, export_act
 from watched_pool import segments
 
 from actors.inline import InlinePool
 from actors.loop import derive_seed
 from actors.pool import PoolConfig
+from actors.preprocess import ObservationBatch
 from gvz.core.errors import ConfigError, ResumeError
 from gvz.transport.messages import EpisodeStats, Fault, Message, ParamsHeader, StepBlock
 
@@ -34,19 +34,12 @@ def inline_config(work_dir: Path, options: dict[str, Any] | None = None, **chang
 def hashing_policy(num_games: int) -> bytes:
     """The action is a hash of every byte of the observation, of the parameters, the task and the key."""
 
-    def act(params, obs, task, key, epsilon):
-        mixed = (obs.reshape(num_games, -1).astype(jnp.uint32) * WEIGHTS).sum(1)
+    def act(params, obs, key, epsilon):
+        mixed = (obs["frames"].reshape(num_games, -1).astype(jnp.uint32) * WEIGHTS).sum(1)
         mixed += params[0].sum().astype(jnp.uint32) + key.sum() * epsilon.astype(jnp.uint32)
-        return (((mixed >> 7) + task.astype(jnp.uint32)) % 5).astype(jnp.int32)
+        return (((mixed >> 7) + obs["task"].astype(jnp.uint32)) % 5).astype(jnp.int32)
 
-    arguments = (
-        [jax.ShapeDtypeStruct((3,), jnp.float32)],
-        jax.ShapeDtypeStruct((num_games, *STACKED), jnp.uint8),
-        jax.ShapeDtypeStruct((num_games,), jnp.int32),
-        jax.ShapeDtypeStruct((2,), jnp.uint32),
-        jax.ShapeDtypeStruct((), jnp.float32),
-    )
-    return bytes(jax.export.export(jax.jit(act), platforms=["cpu"])(*arguments).serialize())
+    return export_act(act, [(3,)], ObservationBatch(num_games, FRAME_SHAPE, 4))
 
 
 def params(version: int) -> tuple[np.ndarray, ParamsHeader]:
@@ -118,6 +111,61 @@ def test_the_policy_saw_the_stack_of_the_recorded_frames(tmp_path: Path):
                 assert step["action"] == ((mixed >> 7) + lane % 2) % 5
                 seen.add(int(step["action"]))
     assert len(seen) > 2
+
+
+def test_game_variables_past_actions_masks_and_extras_are_acted_on_and_recorded(tmp_path: Path):
+    """The action is 1 + 2 (last two actions) + the game's step count, mod 5, or 4 where that is masked."""
+    masks = ((True,) * 5, (True, False, True, False, True))
+    observed = ObservationBatch(3, FRAME_SHAPE, 4, past_actions=2, variables=("STEPS", "ABSENT"), action_masks=masks)
+
+    def act(_params, obs, _key, _epsilon):
+        wanted = (1 + 2 * obs["actions"].sum(1) + obs["vector"][:, 0].astype(jnp.int32)) % 5
+        allowed = jnp.take_along_axis(obs["mask"], wanted[:, None], axis=1)[:, 0]
+        return jnp.where(allowed, wanted, 4).astype(jnp.int32), jnp.stack([obs["vector"][:, 0] / 2], axis=1)
+
+    pool_config = inline_config(
+        tmp_path,
+        policy=export_act(act, [(3,)], observed, num_extras=1),
+        num_params=3,
+        past_actions=2,
+        variables=("STEPS", "ABSENT"),
+        num_extras=1,
+        action_masks=masks,
+    )
+    with InlinePool(pool_config) as pool:
+        pool.publish(params(0)[0], ParamsHeader(version=0, num_updates=0))
+        steps, _ = gather(pool.drain(3 * 40))
+        state = pool.state()
+        onward, _ = gather(pool.drain(3 * 20))
+    with InlinePool(pool_config, state) as pool:
+        np.testing.assert_array_equal(gather(pool.drain(3 * 20))[0], onward)
+    assert steps.dtype.itemsize == 48 + 4 + 3 * 4
+    for lane in range(3):
+        past, t = [-1, -1], 0
+        for step in steps[steps["lane"] == lane]:
+            if step["first"]:
+                past, t = [-1, -1], 0
+            np.testing.assert_array_equal(step["vector"], [t, 0])
+            assert step["extras"] == t / 2
+            if not step["terminated"]:
+                wanted = (1 + 2 * sum(past) + t) % 5
+                assert step["action"] == (wanted if masks[lane % 2][wanted] else 4)
+            past, t = [past[1], int(step["action"])], t + 1
+
+
+def test_an_assigned_task_begins_with_the_lanes_next_episode(tmp_path: Path):
+    pool_config = inline_config(tmp_path)
+    with InlinePool(pool_config) as pool:
+        pool.drain(5)
+        pool.assign(0, 1)
+        steps, _ = gather(pool.drain(3 * 12))
+        state = pool.state()
+        onward, _ = gather(pool.drain(30))
+    with InlinePool(pool_config, state) as pool:
+        np.testing.assert_array_equal(gather(pool.drain(30))[0], onward)
+    own = steps[steps["lane"] == 0]
+    np.testing.assert_array_equal(own["task"], own["episode"] > 0)
+    assert own["episode"].max() > 0
 
 
 def test_the_same_seed_plays_the_same_and_another_does_not(tmp_path: Path):
@@ -213,8 +261,7 @@ def test_two_actors_do_not_fit_into_one_process(tmp_path: Path):
 
 
 def test_frames_of_another_shape_are_refused(tmp_path: Path):
-    pool_config = inline_config(tmp_path)
-    object.__setattr__(pool_config, "frame_shape", (12, 10, 1))
+    pool_config = msgspec.structs.replace(inline_config(tmp_path), frame_shape=(12, 10, 1))
     with pytest.raises(
         ConfigError, match=r"fake_env:make\('a'\): got a frame uint8\[12, 10, 3\], want uint8\[12, 10, 1\]"
     ):

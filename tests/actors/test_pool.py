@@ -6,17 +6,16 @@ import time
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.export
 import jax.numpy as jnp
 import numpy as np
 import psutil
 import pytest
-from fake_env import FRAME_SHAPE, config
+from fake_env import FRAME_SHAPE, config, export_act
 from watched_pool import DEADLINE_S, Run, alive, segments
 
 from actors.config import ActorsConfig
-from actors.pool import ActorPool
+from actors.preprocess import ObservationBatch
+from actors.process_pool import ProcessPool
 from gvz.core.errors import ConfigError, ResumeError
 from gvz.transport.messages import EpisodeStats, ParamsHeader, Ready
 from gvz.transport.ring import WriterState
@@ -24,7 +23,7 @@ from gvz.transport.ring import WriterState
 
 def test_records_come_from_all_actors_and_episodes_are_reported(tmp_path: Path):
     pool_config = config(tmp_path, {})
-    with ActorPool(pool_config) as pool:
+    with ProcessPool(pool_config) as pool:
         run = Run(pool, pool_config)
         pids = run.until_all_ready()
         for pid in pids:
@@ -41,14 +40,13 @@ def test_records_come_from_all_actors_and_episodes_are_reported(tmp_path: Path):
     assert all(m.length_steps == 10 and m.reward == 55.0 and not m.cut for m in episodes)
     assert run.checker.num_cuts == 0
     assert stats.restarts == 0
-    assert stats.episodes == len(episodes)
     assert stats.env_steps == pytest.approx(run.checker.num_records * 10 / 11, rel=0.02)
     assert stats.waited_for_records_s > 0
 
 
 def test_full_rings_hold_the_actors_back_and_lose_nothing(tmp_path: Path):
     pool_config = config(tmp_path, {}, actors=ActorsConfig(ring_capacity=16))
-    with ActorPool(pool_config) as pool:
+    with ProcessPool(pool_config) as pool:
         run = Run(pool, pool_config)
         run.until_all_ready()
         run.play(100)
@@ -62,7 +60,7 @@ def test_full_rings_hold_the_actors_back_and_lose_nothing(tmp_path: Path):
 
 def test_draining_is_fair_and_bounded(tmp_path: Path):
     pool_config = config(tmp_path, {}, actors=ActorsConfig(ring_capacity=64))
-    with ActorPool(pool_config) as pool:
+    with ProcessPool(pool_config) as pool:
         pids = Run(pool, pool_config).until_all_ready()
         time.sleep(0.5)  # both rings are full
         assert sorted(len(block) for block in pool.drain(11)) == [5, 6]
@@ -79,7 +77,7 @@ def test_draining_is_fair_and_bounded(tmp_path: Path):
 def test_a_new_process_begins_new_episodes_even_if_the_old_one_wrote_nothing(tmp_path: Path):
     options = {"fault": "no_start", "fault_file": str(tmp_path / "struck")}
     pool_config = config(tmp_path / "work", options)
-    with ActorPool(pool_config) as pool:
+    with ProcessPool(pool_config) as pool:
         run = Run(pool, pool_config)
         run.until(lambda: len(run.first_episodes()) == 4)
         episodes = np.array(pool.state()["next_episodes"])
@@ -89,43 +87,62 @@ def test_a_new_process_begins_new_episodes_even_if_the_old_one_wrote_nothing(tmp
 
 def test_a_resumed_pool_goes_on_with_new_episodes(tmp_path: Path):
     pool_config = config(tmp_path, {})
-    with ActorPool(pool_config) as pool:
+    with ProcessPool(pool_config) as pool:
         run = Run(pool, pool_config)
         run.play(300)
         state = pool.state()
     assert max(int(step["episode"]) for step in run.checker.last.values()) < max(state["next_episodes"])
-    with ActorPool(pool_config, state) as pool:
+    with ProcessPool(pool_config, state) as pool:
         resumed = Run(pool, pool_config)
         resumed.until(lambda: len(resumed.first_episodes()) == 4)
     assert [resumed.first_episodes()[lane] for lane in range(4)] == state["next_episodes"]
 
 
+def test_a_lane_plays_its_new_task_from_its_next_episode_on_also_after_a_restart_and_a_resume(tmp_path: Path):
+    pool_config = config(tmp_path, {})
+    with ProcessPool(pool_config) as pool:
+        run = Run(pool, pool_config)
+        run.until_all_ready()
+        run.checker.assigned = {0: 1, 2: 1}
+        pool.assign(2, 1)
+        run.until(lambda: any(isinstance(m, EpisodeStats) and (m.lane, m.task) == (2, 1) for m in run.messages))
+        pool.assign(0, 1)
+        os.kill(pool.writer_statuses()[0].pid, signal.SIGKILL)
+        run.until(lambda: pool.statistics().restarts == 1 and pool.statistics().actors_ready == 2)
+        before = len(run.messages)
+        run.until(lambda: any(isinstance(m, EpisodeStats) and m.lane == 0 for m in run.messages[before:]))
+        state = pool.state()
+    tasks = {lane: [m.task for m in run.messages if isinstance(m, EpisodeStats) and m.lane == lane] for lane in (0, 2)}
+    assert tasks[0][-1] == 1
+    assert sorted(tasks[2]) == tasks[2], "task 0 first, then task 1"
+    assert state["tasks"] == [1, 1, 1, 1]
+    with ProcessPool(pool_config, state) as pool:
+        resumed = Run(pool, pool_config)
+        resumed.checker.assigned = run.checker.assigned
+        resumed.until(lambda: len(resumed.checker.last) == 4)
+    assert {int(step["task"]) for step in resumed.checker.last.values()} == {1}
+
+
 def test_a_state_of_another_size_is_refused(tmp_path: Path):
     with pytest.raises(ResumeError, match=r"got 3 lanes, want 4 \(2 actors with 2 games\)"):
-        ActorPool(config(tmp_path, {}), {"next_episodes": [0, 0, 0]})
+        ProcessPool(config(tmp_path, {}), {"next_episodes": [0, 0, 0], "tasks": [0, 1, 0]})
 
 
 def constant_policy() -> bytes:
     """Plays its first parameter."""
 
-    def act(params, _obs, task, _key, _epsilon):
-        return jnp.full(len(task), params[0][0].astype(jnp.int32))
+    def act(params, obs, _key, _epsilon):
+        return jnp.full(len(obs["task"]), params[0][0].astype(jnp.int32))
 
-    arguments = (
-        [jax.ShapeDtypeStruct((1000,), jnp.float32)],
-        jax.ShapeDtypeStruct((2, *FRAME_SHAPE[:2], 4 * FRAME_SHAPE[2]), jnp.uint8),
-        jax.ShapeDtypeStruct((2,), jnp.int32),
-        jax.ShapeDtypeStruct((2,), jnp.uint32),
-        jax.ShapeDtypeStruct((), jnp.float32),
-    )
-    return bytes(jax.export.export(jax.jit(act), platforms=["cpu"])(*arguments).serialize())
+    return export_act(act, [(1000,)], ObservationBatch(2, FRAME_SHAPE, 4))
 
 
 def test_published_parameters_are_acted_by_and_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
     monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     pool_config = config(tmp_path / "work", {}, policy=constant_policy(), num_params=1000, layout_hash=99)
-    with ActorPool(pool_config) as pool:
+    with ProcessPool(pool_config) as pool:
         run = Run(pool, pool_config)
         assert sum(segments().values()) == pool_config.shared_memory_bytes() + 3 * 64
         time.sleep(0.2)
@@ -150,7 +167,7 @@ def test_published_parameters_are_acted_by_and_recorded(tmp_path: Path, monkeypa
 def test_closing_is_quick_bounded_and_repeatable(tmp_path: Path):
     options = {"fault": "hang", "fault_at": 20}
     pool_config = config(tmp_path, options)
-    pool = ActorPool(pool_config)
+    pool = ProcessPool(pool_config)
     run = Run(pool, pool_config)
     pids = run.until_all_ready()
     os.kill(pids[0], signal.SIGSTOP)
@@ -163,7 +180,7 @@ def test_closing_is_quick_bounded_and_repeatable(tmp_path: Path):
 
 
 def test_closing_while_the_actors_start_leaves_nothing(tmp_path: Path):
-    pool = ActorPool(config(tmp_path, {}))
+    pool = ProcessPool(config(tmp_path, {}))
     pids = {child.pid for child in psutil.Process().children()}
     pool.close()
     assert len(pids) >= 2

@@ -5,19 +5,20 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
-import jax
-import jax.export
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 import pytest
-from fake_env import FRAME_SHAPE, config
+from fake_env import FRAME_SHAPE, config, export_act
 
 from actors import worker
-from actors.process import ActorProcess, log_path, read_log_tail
+from actors.pool import lanes_to_begin_with
+from actors.preprocess import ObservationBatch
+from actors.process import ActorProcess, log_path
 from actors.worker import Worker
+from gvz.core import records
 from gvz.core.errors import WaitTimeoutError
 from gvz.transport.broadcast import BroadcastWriter
 from gvz.transport.channel import Channel
@@ -28,23 +29,16 @@ LAYOUT, NUM_PARAMS = 5, 4
 
 
 def first_param_policy() -> bytes:
-    def act(params, _obs, task, _key, _epsilon):
-        return jnp.full(len(task), params[0][0].astype(jnp.int32))
+    def act(params, obs, _key, _epsilon):
+        return jnp.full(len(obs["task"]), params[0][0].astype(jnp.int32))
 
-    arguments = (
-        [jax.ShapeDtypeStruct((NUM_PARAMS,), jnp.float32)],
-        jax.ShapeDtypeStruct((2, *FRAME_SHAPE[:2], 4 * FRAME_SHAPE[2]), jnp.uint8),
-        jax.ShapeDtypeStruct((2,), jnp.int32),
-        jax.ShapeDtypeStruct((2,), jnp.uint32),
-        jax.ShapeDtypeStruct((), jnp.float32),
-    )
-    return bytes(jax.export.export(jax.jit(act), platforms=["cpu"])(*arguments).serialize())
+    return export_act(act, [(NUM_PARAMS,)], ObservationBatch(2, FRAME_SHAPE, 4))
 
 
 @pytest.fixture
 def spec(tmp_path: Path) -> ActorSpec:
     pool_config = config(tmp_path, {}, num_actors=1)
-    return pool_config.actor_specs([0, 0])[0]
+    return pool_config.actor_specs(lanes_to_begin_with(pool_config, None))[0]
 
 
 @pytest.fixture
@@ -110,17 +104,17 @@ def test_told_to_stop_it_ends_well(spec: ActorSpec, ring: RingReader, monkeypatc
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_max_isa=AVX2")
     process = ActorProcess(spec, ring, None)
     try:
-        while not any(isinstance(message, Ready) for message in process.receive()):
+        while not any(isinstance(message, Ready) for message in process.channel.receive()):
             assert process.exit_text() is None
             ring.read(100)
         environment = Path(f"/proc/{process.pid}/environ").read_text().split("\0")
         flags = "XLA_FLAGS=--xla_cpu_max_isa=AVX2 --xla_cpu_multi_thread_eigen=false"
         assert flags in environment, "the user's flags hold for actors too"
-        process.ask_to_stop()
+        process.channel.send(Stop())
         assert process.wait(30)
         assert process.exit_text() == "exited with code 0"
         assert ring.writer_status().state == WriterState.STOPPED
-        assert read_log_tail(log_path(spec)) == ""
+        assert records.last_lines(log_path(spec)) == []
     finally:
         process.end(grace_s=0.0)
 
@@ -137,7 +131,7 @@ def test_a_learner_that_never_publishes_is_given_up(
     spec: ActorSpec, ring: RingReader, channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(worker, "PARAMS_TIMEOUT_S", 0.05)
-    spec = replace(spec, policy=first_param_policy(), num_params=NUM_PARAMS, layout_hash=LAYOUT)
+    spec = msgspec.structs.replace(spec, policy=first_param_policy(), num_params=NUM_PARAMS, layout_hash=LAYOUT)
     queue = BroadcastWriter.create("gvz-test", NUM_PARAMS, LAYOUT)
     try:
         with pytest.raises(
@@ -153,7 +147,7 @@ def test_a_learner_that_never_publishes_is_given_up(
 def test_taking_parameters_keeps_to_its_share_of_the_time(
     spec: ActorSpec, ring: RingReader, channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
 ):
-    spec = replace(spec, policy=first_param_policy(), num_params=NUM_PARAMS, layout_hash=LAYOUT)
+    spec = msgspec.structs.replace(spec, policy=first_param_policy(), num_params=NUM_PARAMS, layout_hash=LAYOUT)
     queue = BroadcastWriter.create("gvz-test", NUM_PARAMS, LAYOUT)
     try:
         actor = Worker(spec, channels[1], ring.descriptor, queue.descriptor)

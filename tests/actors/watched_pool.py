@@ -7,7 +7,8 @@ from pathlib import Path
 
 from fake_env import Checker
 
-from actors.pool import ActorPool, PoolConfig
+from actors.pool import PoolConfig
+from actors.process_pool import ProcessPool
 from gvz.core import janitor
 from gvz.transport.messages import EpisodeStats, Fault, Message
 
@@ -17,7 +18,7 @@ DEADLINE_S = 240.0
 class Run:
     """A pool that is drained and polled until something has happened, every record checked."""
 
-    def __init__(self, pool: ActorPool, pool_config: PoolConfig):
+    def __init__(self, pool: ProcessPool, pool_config: PoolConfig):
         self.pool = pool
         self.checker = Checker(pool_config)
         self.messages: list[Message] = []

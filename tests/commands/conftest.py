@@ -9,9 +9,10 @@ import pytest
 
 from gvz.core.env_config import EnvConfig
 from gvz.run.assemble import run_agent
-from gvz.run.config import RunConfig, config_to_dict
+from gvz.run.config import RunConfig
+from gvz.run.config_files import config_to_dict
 from learner import checkpoint
-from learner.config import AgentConfig
+from learner.agents.configs.rainbow import RainbowConfig
 
 
 @pytest.fixture
@@ -21,7 +22,7 @@ def small_run(tmp_path: Path) -> Path:
         name="small",
         seed=7,
         env=EnvConfig(frame_height=24, frame_width=32, grayscale=True),
-        agent=AgentConfig(conv_channels=(4,), conv_kernels=(8,), conv_strides=(4,), hidden_units=8),
+        agent=RainbowConfig(conv_channels=(4,), conv_kernels=(8,), conv_strides=(4,), hidden_units=8),
     )
     path = tmp_path / "run"
     template = jax.eval_shape(run_agent(config).init, jax.random.key(0))

@@ -31,9 +31,9 @@ def test_clean_removes_what_a_dead_run_left(capsys, monkeypatch, tmp_path):
     tmp_path.chmod(0o700)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setattr(doctor, "CHECKS", (doctor.check_leftovers,))
-    left = tmp_path / "gvz-test-0123456789abcdef"
+    left = tmp_path / "gvz-engine-0123456789abcdef"
     left.mkdir()
-    code = f"from gvz.core import janitor; janitor.record('directory', {str(left)!r})"
+    code = f"from pathlib import Path; from gvz.core import janitor; janitor.record(Path({str(left)!r}))"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
     assert cli.main(["doctor"]) == 0
     assert f"1: {left}" in capsys.readouterr().out

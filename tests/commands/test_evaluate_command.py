@@ -10,7 +10,7 @@ import pytest
 
 from gvz import cli
 from gvz.commands.evaluate import run_tasks
-from gvz.evaluation.episode_log import read_rows
+from gvz.evaluation.episode_log import RecordFile, read_rows
 from gvz.evaluation.selection import TaskSelection
 from gvz.tasks import named_tasks
 
@@ -30,7 +30,7 @@ from gvz.tasks import named_tasks
         ("{file}", "is not a run directory"),
         ("{run} --checkpoints last", "--checkpoints: got 'last', want newest, all, last5"),
         ("{run} --checkpoints 30", "10, 20"),
-        ("{run} --scenario seek_and_kill", "the run was trained on defend_the_center, whose buttons are others"),
+        ("{run} --scenario seek_and_kill", "the run was trained on defend_the_center, which has other buttons"),
         ("{run} --tasks defend_the_center/gor", "unknown attribute 'gor' (did you mean 'gore'?)"),
     ],
 )
@@ -86,6 +86,25 @@ def test_all_checkpoints_meet_the_same_episodes_and_none_twice(small_run, capsys
     assert [score["score"] for score in scores] == [
         first[updates, seed]["score"] for updates, seed in ((10, 0), (10, 4), (20, 0), (20, 4))
     ]
+
+
+@pytest.mark.engine
+def test_a_signal_inside_a_destructor_is_not_lost(tmp_path, monkeypatch, capsys):
+    class Interrupted:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    append = RecordFile.append
+
+    def append_and_interrupt(file, row):
+        append(file, row)
+        Interrupted()
+
+    monkeypatch.setattr(RecordFile, "append", append_and_interrupt)
+    command = ["evaluate", "--player", "idle", "--episodes", "9", "--workers", "1"]
+    assert cli.main([*command, "--tasks", "defend_the_center/default", "--out", str(tmp_path / "rows.jsonl")]) == 130
+    assert "interrupted; the same command goes on from here" in capsys.readouterr().err
+    assert len(read_rows(tmp_path / "rows.jsonl")) == 1
 
 
 @pytest.mark.engine

@@ -1,29 +1,45 @@
-"""`gvz experiment`: list, plan by known rates, status; what is bad input. Running is tests/e2e's."""
+"""`gvz experiment`: list, plan by earlier records, status; what is bad input. Running is tests/e2e's."""
 
 import json
 import os
-import tempfile
+from pathlib import Path
 
 import pytest
 
 from gvz.cli import main
-from gvz.experiments import inventory as progress
+from gvz.experiments import inventory
 from gvz.experiments.base import experiments
-from gvz.experiments.jobs import Slot
+from gvz.experiments.costs import Rates, read_rates
 from gvz.experiments.plan import Plan, write_plan
-from gvz.experiments.rates import measure, rates_file, read_rates
+from gvz.run.machine import cpu_model
 
-CORES = tuple(sorted(os.sched_getaffinity(0)))
+RUN = "rainbow_4task/defend_the_center/train4/seed_1111"
+CORES = len(os.sched_getaffinity(0))
 
 
 @pytest.fixture
-def known_rates(tmp_path, monkeypatch):
-    """Of one job on all cores: 10 updates/s, 1000 evaluation decisions/s."""
-    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path / "cache"))
+def results(tmp_path, monkeypatch):
+    """Of one run on all cores: 10 updates/s, 1000 evaluation decisions/s."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    file = rates_file("rainbow_4task", 1, Slot(cores=CORES, environment={}))
-    file.parent.mkdir(parents=True)
-    file.write_text(json.dumps({"updates_per_s": 10, "evaluation_steps_per_s": 1000, "measured": "2026-11-21 12:00"}))
+    monkeypatch.chdir(tmp_path)
+    run = tmp_path / "results" / "runs" / RUN
+    write(run / "starts.jsonl", {"cpu": cpu_model(), "cores": CORES})
+    rates = [0.0, 9.0, 10.0, 11.0]
+    write(run / "metrics.jsonl", *({"num_updates": n, "learner/updates_per_s": rate} for n, rate in enumerate(rates)))
+    write(run / "evaluation.jsonl", *({"length_steps": 1500} for _ in range(8)))
+    log = inventory.log_file(tmp_path / "results", RUN)
+    log.parent.mkdir(parents=True)
+    log.write_text(
+        f"# 2026-11-22 12:00:00 python -m gvz.launch --config rainbow_4task\n{inventory.END_MARK}0 after 600 s\n"
+        f"# 2026-11-22 12:10:00 python -m gvz.cli evaluate {run}\nplaying\n{inventory.END_MARK}130 after 4 s\n"
+        f"# 2026-11-22 12:11:00 python -m gvz.cli evaluate {run}\n{inventory.END_MARK}0 after 8 s\n"
+    )
+    return tmp_path / "results"
+
+
+def write(file: Path, *rows: dict) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text("".join(json.dumps({"schema": 1, **row}) + "\n" for row in rows))
 
 
 def test_list_names_every_experiment_with_its_question(capsys):
@@ -31,38 +47,57 @@ def test_list_names_every_experiment_with_its_question(capsys):
     out = capsys.readouterr().out
     for experiment in experiments().values():
         assert f"{experiment.name}: {experiment.question}" in out
-        assert f"{len(experiment.runs())} runs of {experiment.total_updates:,} gradient steps" in out
+        assert f"{len(experiment.runs())} runs of {experiment.budget}" in out
+    assert "16 runs of 600 seconds of processor time, at most 60,000 gradient steps" in out
+    assert "rainbow_quick+decisions_4, rainbow_quick+decisions_8" in out
     assert main(["experiment", "list", "--json"]) == 0
     rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert {row["name"]: row["runs"] for row in rows} == {e.name: len(e.runs()) for e in experiments().values()}
 
 
-@pytest.mark.usefixtures("known_rates")
-def test_plan_prints_runs_steps_episodes_and_hours_and_counts_shared_runs_once(capsys):
+def test_plan_prints_runs_steps_episodes_and_hours_and_counts_shared_runs_once(results, capsys):
     arguments = ["experiment", "plan", "rainbow_evaluation", "training_set_size", "--jobs", "1", "--shard", "1/2"]
+    arguments += ["--results", str(results)]
     assert main([*arguments, "--scenario", "defend_the_center"]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     # 18 tasks x 100 episodes x 20 checkpoints; (200,000 + 10,000 / 4) / 10 s and 36,000 x 1100 / 4 / 1000 s
-    run = ["rainbow_4task/defend_the_center/train4/seed_1111", "200,000", "810,000", "36,000", "8.38"]
+    run = ["rainbow_4task/defend_the_center/train4/seed_1111", "200,000", "810,000", "36,000", "5.62", "2.75"]
     assert run in lines
-    assert ["rainbow_evaluation:", "3", "runs", "600,000", "2,430,000", "108,000", "25.12"] in lines
+    assert ["rainbow_evaluation:", "3", "runs", "600,000", "2,430,000", "108,000", "16.88", "8.25"] in lines
     assert lines[-4][:6] == ["together,", "shared", "runs", "once:", "9", "runs"]
     assert lines[-4][6:9] == ["1,800,000", "7,290,000", "192,000"]  # 3 x 36,000 + 6 x 7 x 100 x 20
     seeds = [cells[0] for cells in lines if cells and cells[0].startswith("rainbow_4task/")]
     assert len(seeds) == 5  # of nine runs, every other one
-    assert lines[-1][:3] == ["rainbow_4task:", "10.00", "updates/s,"]
+    assert lines[-1][:4] == ["rainbow_4task:", "10.00", "updates/s,", "1000.00"]
     assert main([*arguments, "--scenario", "defend_the_center", "--json"]) == 0
     rows = {row["run"]: row for row in map(json.loads, capsys.readouterr().out.splitlines())}
     assert len(rows) == 5
     row = rows["rainbow_4task/defend_the_center/train4/seed_1111"]
     assert row["experiments"] == ["rainbow_evaluation", "training_set_size"]
-    assert (row["updates"], row["episodes"], round(row["hours"], 2)) == (200_000, 36_000, 8.38)
+    assert (row["updates"], row["episodes"]) == (200_000, 36_000)
+    assert (row["training_hours"], row["evaluation_hours"]) == (5.625, 2.75)
+
+
+def test_a_gate_s_hours_follow_from_its_processor_time_and_its_variants_have_rates_of_their_own(results, capsys):
+    fast = results / "runs" / "rainbow_quick+decisions_8" / "dodge_projectiles" / "train4" / "seed_1111"
+    write(fast / "starts.jsonl", {"cpu": cpu_model(), "cores": CORES})
+    write(fast / "metrics.jsonl", {"num_updates": 1, "learner/updates_per_s": 7.0})
+    assert main(["experiment", "plan", "gate_reuse", "--jobs", "1", "--results", str(results)]) == 0
+    out = capsys.readouterr().out
+    assert "rainbow_quick+decisions_8: 7.00 updates/s" in out
+    assert "rainbow_quick+decisions_4: - updates/s" in out
+    assert main(["experiment", "plan", "gate_reuse", "--jobs", "1", "--results", str(results), "--json"]) == 0
+    rows = {row["run"]: row for row in map(json.loads, capsys.readouterr().out.splitlines())}
+    assert len(rows) == 16
+    row = rows["rainbow_quick+decisions_32/defend_the_center/train4/seed_2222"]
+    assert row["training_hours"] == pytest.approx(600 / CORES / 3600)
+    assert (row["updates"], row["env_steps"], row["episodes"]) == (60_000, 2_000 + 32 * 60_000, (3 + 4) * 20)
 
 
 def test_status_tells_done_failed_and_waiting_apart(tmp_path, capsys):
     plan = write_plan(tmp_path, Plan(names=("algorithm_comparison",), scale=0.001))
     (dqn, rainbow), evaluations = plan.runs(), plan.evaluations()
-    directory = progress.run_directory(tmp_path, dqn)
+    directory = inventory.run_directory(tmp_path, dqn)
     for step in dqn.checkpoints:
         (directory / "policies" / str(step)).mkdir(parents=True)
     rows = [
@@ -73,7 +108,7 @@ def test_status_tells_done_failed_and_waiting_apart(tmp_path, capsys):
     ]
     (directory / "evaluation.jsonl").write_text("\n".join(rows) + "\n")
     (directory / "metrics.jsonl").write_text('{"num_updates": 200}\n')
-    log = progress.log_file(tmp_path, rainbow.id)
+    log = inventory.log_file(tmp_path, rainbow.id)
     log.parent.mkdir(parents=True)
     log.write_text("error: memory: 1 GB available\n# ended with exit code 2 after 3 s\n")
     assert main(["experiment", "status", "--results", str(tmp_path)]) == 1
@@ -114,27 +149,22 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capsys, arguments, m
     assert list(tmp_path.iterdir()) == []
 
 
-def test_damaged_rates_are_no_rates(tmp_path):
-    file = tmp_path / "rates.json"
-    assert read_rates(file) is None
-    for text in ("{", '{"updates": 3}', "[]"):
-        file.write_text(text)
-        assert read_rates(file) is None
+def test_a_run_of_the_trainer_counts_and_one_of_another_machine_or_with_other_cores_does_not(results, tmp_path):
+    assert read_rates(results, "rainbow_4task", 1, CORES) == Rates(updates_per_s=10.0, evaluation_steps_per_s=1000.0)
+    unknown = Rates(updates_per_s=None, evaluation_steps_per_s=None)
+    assert read_rates(results, "rainbow_4task", 1, CORES + 1) == unknown
+    write(results / "runs" / RUN / "starts.jsonl", {"cpu": "another", "cores": CORES})
+    assert read_rates(results, "rainbow_4task", 1, CORES) == unknown
+    own = tmp_path / "runs" / "rainbow_4task" / "seed_7"
+    write(own / "starts.jsonl", {"cpu": cpu_model(), "cores": CORES})
+    write(own / "metrics.jsonl", {"num_updates": 1, "learner/updates_per_s": 7.0}, {"learner/updates_per_s": "x"})
+    assert read_rates(results, "rainbow_4task", 1, CORES) == Rates(updates_per_s=7.0, evaluation_steps_per_s=None)
+    assert read_rates(results, "rainbow_4task", 0.001, CORES) == unknown, "its networks are other ones"
 
 
-@pytest.mark.slow
-@pytest.mark.engine
-def test_rates_are_measured_by_training_and_playing(tmp_path, monkeypatch):
-    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path / "cache"))
-    work = tmp_path / "work"
-    work.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(work))
-    run = Plan(names=("algorithm_comparison",), scale=0.001).runs()[0]
-    shown: list[str] = []
-    slot = Slot(cores=CORES, environment={})
-    rates = measure(run, 0.001, slot, lambda text, _: shown.append(text))
-    assert rates.updates_per_s > 0
-    assert rates.evaluation_steps_per_s > 0
-    assert {"dqn_4task: train", "dqn_4task: evaluate"} == set(shown)
-    assert read_rates(rates_file("dqn_4task", 0.001, slot)) == rates
-    assert list(work.iterdir()) == []
+def test_plan_without_records_says_how_to_get_some(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["experiment", "plan", "quick_comparison"]) == 0
+    out = capsys.readouterr().out
+    assert "hours are not known yet; begin with gvz experiment run" in out
+    assert "dqn_quick: - updates/s, - evaluation decisions/s" in out

@@ -28,7 +28,7 @@ from tests.tensorboard_events import read_events
         ("{run} --out v.webp --seed -1", "--seed: got -1, want at least 0"),
         ("{run} --out v.webp --checkpoint 30", "--checkpoints: got '30', want newest"),
         ("{run} --out v.webp --checkpoint all", "--checkpoint: got all, want one of 10, 20"),
-        ("{run} --out v.webp --task seek_and_kill/blue", "whose buttons are others"),
+        ("{run} --out v.webp --task seek_and_kill/blue", "which has other buttons"),
         ("{file} --out v.webp", "is not a run directory"),
         ("{run} --out v.webp --tensorboard", "--tensorboard: want a run directory and an --out that ends with .gif"),
         ("--player idle --task seek_and_kill/blue --out v.gif --tensorboard", "--tensorboard: want a run directory"),

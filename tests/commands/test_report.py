@@ -27,7 +27,7 @@ def test_a_run_and_chance_beside_it_damaged_and_all(tmp_path):
     assert done.stderr == "note: random.jsonl, line 100: not JSON (half-written?)\n"
     text = (tmp_path / "out" / "report.md").read_text()
     assert "rainbow_quick beats random by" in text
-    assert "| rainbow_quick | 54.6 [51.5, 57.7] |" in text  # 601.0 [566.0, 634.9] of 1100 frames, by the README
+    assert "| rainbow_quick | 65.5 [61.7, 69.4] |" in text  # 720.1 [678.2, 763.2] of 1100 frames, by the README
     assert (tmp_path / "out" / "figures" / "learning_defend_the_center_rainbow_quick.png").exists()
 
 

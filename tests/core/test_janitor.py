@@ -33,8 +33,8 @@ def registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def directory(tmp_path: Path) -> Path:
-    """A private directory, as `temporary_directory` names it."""
-    path = tmp_path / "gvz-test-0123456789abcdef"
+    """A private directory, as `make_directory` names it."""
+    path = tmp_path / "gvz-engine-0123456789abcdef"
     path.mkdir()
     return path
 
@@ -50,9 +50,9 @@ def run_until_killed(code: str) -> str:
     return line
 
 
-def change_record(registry: Path, **changes: object) -> None:
-    (path,) = registry.glob("*.json")
-    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+def give_up(directory: Path) -> None:
+    """Unlocks the record of a directory, as the end of its owner does."""
+    janitor._held.pop(directory).close()
 
 
 def wait_until_gone(pid: int) -> bool:
@@ -63,22 +63,23 @@ def wait_until_gone(pid: int) -> bool:
 
 
 def test_records_are_private(registry: Path):
-    janitor.record("directory", "/tmp/gvz-test-0123456789abcdef")
+    directory = Path("/tmp/gvz-engine-0123456789abcdef")
+    janitor.record(directory)
     (path,) = registry.glob("*.json")
     assert path.stat().st_mode & 0o777 == 0o600
     assert registry.stat().st_mode & 0o777 == 0o700
-    janitor.forget("directory", "/tmp/gvz-test-0123456789abcdef")
+    janitor.forget(directory)
     assert list(registry.iterdir()) == []
-    janitor.forget("directory", "/tmp/gvz-test-0123456789abcdef")  # again, and of what was never recorded
+    janitor.forget(directory)  # again, and of what was never recorded
 
 
 def test_a_temporary_directory_goes_with_its_block_or_with_the_next_start(registry: Path):
-    with janitor.temporary_directory("test") as directory:
+    with janitor.temporary_directory() as directory:
         (directory / "file").touch()
         assert directory.stat().st_mode & 0o777 == 0o700
         assert janitor.clean_dead_instances() == []
     assert not directory.exists()
-    code = "from gvz.core import janitor\nwith janitor.temporary_directory('test') as d: print(d, flush=True); input()"
+    code = "from gvz.core import janitor\nwith janitor.temporary_directory() as d: print(d, flush=True); input()"
     killed = Path(run_until_killed(code))
     assert janitor.dead_instances() == [str(killed)]
     assert janitor.clean_dead_instances() == [f"directory {killed}"]
@@ -86,98 +87,87 @@ def test_a_temporary_directory_goes_with_its_block_or_with_the_next_start(regist
     assert list(registry.iterdir()) == []
 
 
-def test_a_record_half_written_long_ago_is_removed(registry: Path):
-    for name, age_s in (("new.partial", 60), ("old.partial", 7200)):
-        (registry / name).write_text("{")
-        os.utime(registry / name, times=(time.time() - age_s,) * 2)
+def test_a_record_whose_owner_was_killed_before_it_wrote_is_removed(registry: Path):
+    (registry / "gvz-engine-x.json").touch()
+    assert janitor.dead_instances() == []
     assert janitor.clean_dead_instances() == []
-    assert [path.name for path in registry.iterdir()] == ["new.partial"]
+    assert list(registry.iterdir()) == []
+
+
+def test_a_record_that_a_janitor_took_for_a_dead_owner_s_is_written_again(
+    registry: Path, directory: Path, monkeypatch: pytest.MonkeyPatch
+):
+    lock, looks = janitor.records.lock, []
+
+    def lock_late(file) -> bool:
+        if not looks:
+            looks.append(1)
+            assert janitor.clean_dead_instances() == []  # between the file and its lock
+        return lock(file)
+
+    monkeypatch.setattr(janitor.records, "lock", lambda file: lock_late(file) if file.writable() else lock(file))
+    janitor.record(directory)
+    assert len(list(registry.glob("*.json"))) == 1
+    assert janitor.clean_dead_instances() == []
+    assert directory.exists()
+    janitor.forget(directory)
 
 
 def test_what_a_living_owner_has_is_left_alone(registry: Path, directory: Path):
-    janitor.record("directory", str(directory))
+    janitor.record(directory)
     assert janitor.clean_dead_instances() == []
     assert directory.exists()
     assert len(list(registry.glob("*.json"))) == 1
+    janitor.forget(directory)
 
 
-def test_a_dead_owners_directory_is_removed(registry: Path, directory: Path):
-    run_until_killed(
-        f"from gvz.core import janitor; janitor.record('directory', {str(directory)!r}); print(1, flush=True); input()"
+def test_what_another_living_process_has_is_left_alone_until_it_ends(registry: Path, directory: Path):
+    code = (
+        "from pathlib import Path; from gvz.core import janitor\n"
+        f"janitor.record(Path({str(directory)!r})); print(1, flush=True); input()"
     )
-    assert len(list(registry.glob("*.json"))) == 1
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as owner:
+        assert owner.stdout is not None
+        owner.stdout.readline()
+        owner.send_signal(signal.SIGSTOP)  # a stopped process lives
+        assert (janitor.dead_instances(), janitor.clean_dead_instances()) == ([], [])
+        owner.kill()
+        owner.wait()
     assert janitor.clean_dead_instances() == [f"directory {directory}"]
     assert not directory.exists()
     assert list(registry.iterdir()) == []
     assert janitor.clean_dead_instances() == []
 
 
-def test_a_reused_process_id_is_not_the_owner(registry: Path, directory: Path):
-    janitor.record("directory", str(directory))
-    start = janitor.process_start(os.getpid())
-    assert start is not None
-    change_record(registry, owner_start=start - 1)
-    assert janitor.clean_dead_instances() == [f"directory {directory}"]
-
-
-def test_records_of_another_machine_are_left_alone(registry: Path, directory: Path):
-    janitor.record("directory", str(directory))
-    change_record(registry, owner_start=1, machine="another boot")
-    assert janitor.clean_dead_instances() == []
-    assert directory.exists()
-
-
 @pytest.mark.parametrize(
-    ("kind", "name"),
+    "name",
     [
-        ("segment", "gvz-x"),
-        ("directory", ""),
-        ("engine", "gvz-engine-relative"),
-        ("engine", "/tmp/gvz-engine-x/../../home"),
-        ("engine", "/home/someone"),
-        ("directory", "/tmp/x"),
-        ("directory", "gvz-test-0123456789abcdef"),
-        ("directory", "/tmp/gvz-test-0123456789abcdef/.."),
-        ("directory", "/tmp/gvz-engine-x"),
-        ("file", "/tmp/gvz-test-0123456789abcdef"),
+        "",
+        "gvz-engine-relative",
+        "/tmp/gvz-engine-x/../../home",
+        "/home/someone",
+        "/tmp/x",
+        "/tmp/gvz-engine-x/..",
     ],
 )
-def test_forged_records_delete_nothing(registry: Path, directory: Path, kind: str, name: str):
-    janitor.record("directory", str(directory))
-    change_record(registry, owner_start=1, kind=kind, name=name)
+def test_forged_records_delete_nothing(registry: Path, name: str):
+    (registry / "forged.json").write_text(json.dumps({"directory": name}))
     (line,) = janitor.clean_dead_instances()
     assert line.startswith("left alone: unreadable record")
-    assert directory.exists()
-    with pytest.raises(ValueError, match="record of kind"):
-        janitor.record(kind, name)
-
-
-def forged(**changes: object) -> str:
-    machine = janitor._machine()
-    record = {
-        "kind": "directory",
-        "name": "/tmp/gvz-test-0123456789abcdef",
-        "owner_pid": 1,
-        "owner_start": 1,
-        "machine": machine,
-    }
-    return json.dumps({**record, **changes})
+    assert (registry / "forged.json").exists()
+    with pytest.raises(ValueError, match=r"record of .*: want an absolute path that ends in gvz-engine-"):
+        janitor.record(Path(name))
 
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "{",
-        "[" * 100_000,
-        "[]",
-        forged(owner_pid="../self"),
-        forged(owner_start=None),
-        forged(kind="engine", name=f"/{'a' * 300}/gvz-engine-x"),
-    ],
-    ids=range(6),
+    ["{", "[" * 100_000, "[]", '{"directory": 5}', json.dumps({"directory": f"/{'a' * 300}/gvz-engine-x"})],
+    ids=range(5),
 )
 def test_a_record_that_is_damaged_is_reported_and_left(registry: Path, text: str):
-    path = registry / "directory-1-1-x.json"
+    path = registry / "gvz-engine-x.json"
     path.write_text(text)
     assert len(janitor.dead_instances()) <= 1  # a name can be too long only for the disk
     (line,) = janitor.clean_dead_instances()
@@ -185,25 +175,23 @@ def test_a_record_that_is_damaged_is_reported_and_left(registry: Path, text: str
     assert path.exists()
 
 
-def test_a_process_without_the_instance_id_is_not_killed(registry: Path, tmp_path: Path):
-    directory = tmp_path / "gvz-engine-x"
-    directory.mkdir()
+@pytest.mark.usefixtures("registry")
+def test_a_process_without_the_instance_id_is_not_killed(directory: Path):
     with subprocess.Popen(["sleep", "60"]) as bystander:
         start = janitor.process_start(bystander.pid)
         (directory / janitor.INSTANCE_FILE).write_text(f"{bystander.pid} {start} Abc123\n")
-        janitor.record("engine", str(directory))
-        change_record(registry, owner_start=1)
+        janitor.record(directory)
+        give_up(directory)
         assert janitor.clean_dead_instances() == [f"directory {directory}"]
         assert bystander.poll() is None
         bystander.kill()
 
 
-def test_an_instance_file_that_is_not_ours_is_reported(registry: Path, tmp_path: Path):
-    directory = tmp_path / "gvz-engine-x"
-    directory.mkdir()
+@pytest.mark.usefixtures("registry")
+def test_an_instance_file_that_is_not_ours_is_reported(directory: Path):
     (directory / janitor.INSTANCE_FILE).write_text("1 2 ../../etc\n")
-    janitor.record("engine", str(directory))
-    change_record(registry, owner_start=1)
+    janitor.record(directory)
+    give_up(directory)
     (line,) = janitor.clean_dead_instances()
     assert "want process id, start time, instance id" in line
     assert directory.exists()
@@ -242,7 +230,7 @@ def test_an_engine_killed_before_it_was_one_leaves_nothing(registry: Path):
                 wrappers = [child for child in children if str(WRAPPER) in child.cmdline()[:3]]
         wrappers[0].kill()
         assert client.wait(120) != 0
-    (directory,) = (Path(json.loads(path.read_text())["name"]) for path in registry.glob("*.json"))
+    (directory,) = (Path(json.loads(path.read_text())["directory"]) for path in registry.glob("*.json"))
     assert not (directory / janitor.INSTANCE_FILE).exists()
     instance_id = (directory / janitor.ARGUMENTS_FILE).read_text().split("+viz_instance_id ")[1].split()[0]
     assert len(list(janitor.SHM_DIR.glob(f"ViZDoomMQ*{instance_id}"))) == 2
@@ -251,11 +239,10 @@ def test_an_engine_killed_before_it_was_one_leaves_nothing(registry: Path):
     assert not directory.exists()
 
 
-def test_what_a_client_had_made_when_it_died_before_the_launch_is_what_nobody_holds(registry: Path, tmp_path: Path):
-    directory = tmp_path / f"{janitor.ENGINE_DIR_PREFIX}0123456789abcdef"
-    janitor.record("engine", str(directory))
-    change_record(registry, owner_start=1)
-    directory.mkdir()
+@pytest.mark.usefixtures("registry")
+def test_what_a_client_had_made_when_it_died_before_the_launch_is_what_nobody_holds(directory: Path):
+    janitor.record(directory)
+    give_up(directory)
     names = [f"ViZDoomMQ{part}" for part in ("Ctrlost", "Doomlost", "Ctrheld", "Ctrran", "Ctrold")] + ["ViZDoomSMran"]
     files = {name: janitor.SHM_DIR / f"{name}{os.getpid()}" for name in names}
     try:
@@ -282,11 +269,12 @@ def test_a_launched_engine_without_a_client_removes_what_that_had_made(tmp_path:
 
 
 @pytest.mark.engine
-def test_an_engine_that_outlived_its_owner_is_ended(registry: Path):
+@pytest.mark.usefixtures("registry")
+def test_an_engine_that_outlived_its_owner_is_ended():
     from gvz.engine.engine import Engine, EngineConfig
 
     engine = Engine(EngineConfig(wad=STOCK_WAD, buttons=(), variables=()))
-    change_record(registry, owner_start=1)
+    give_up(engine.log.parent)
     assert f"engine {engine.instance_id} (pid {engine.pid})" in janitor.clean_dead_instances()
     assert wait_until_gone(engine.pid)
     engine.close()

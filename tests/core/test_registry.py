@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from gvz.core.registry import discover
+from gvz.core.errors import ConfigError
+from gvz.core.registry import discover, find
 
 
 @pytest.fixture
@@ -41,3 +42,38 @@ def test_a_module_that_cannot_be_imported_is_not_skipped(package: Path):
 def test_a_module_that_is_no_package_is_refused():
     with pytest.raises(ValueError, match=r"'gvz\.core\.registry' is a module, want a package"):
         discover("gvz.core.registry")
+
+
+@pytest.mark.usefixtures("package")
+def test_a_constant_is_found_by_the_name_of_its_module():
+    assert find("found_by_name", "NAME", "zebra", "zoo.animal") == "found_by_name.zebra"
+
+
+@pytest.mark.usefixtures("package")
+def test_a_name_that_no_module_has_is_refused_with_the_nearest():
+    with pytest.raises(
+        ConfigError, match=r"zoo\.animal: got 'zebar' \(did you mean 'zebra'\?\), want one of ant, zebra"
+    ):
+        find("found_by_name", "NAME", "zebar", "zoo.animal")
+
+
+def test_a_module_without_the_constant_is_not_offered(package: Path):
+    (package / "helper.py").write_text("")
+    with pytest.raises(ConfigError, match=r"got 'helper', want one of ant, zebra, or the path of a file"):
+        find("found_by_name", "NAME", "helper", "zoo.animal")
+
+
+@pytest.mark.usefixtures("package")
+def test_a_file_is_found_by_its_path_and_executed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    file = tmp_path / "mine.py"
+    file.write_text("NAME = object()\n")
+    monkeypatch.chdir(tmp_path)
+    assert find("found_by_name", "NAME", "./mine.py", "zoo.animal") is find("", "NAME", str(file), "zoo.animal")
+
+
+def test_a_file_that_is_missing_or_does_not_set_the_constant_is_refused(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"zoo\.animal: no file .*/other\.py; give a path from here, or an absolute"):
+        find("", "NAME", str(tmp_path / "other.py"), "zoo.animal")
+    (tmp_path / "empty.py").write_text("")
+    with pytest.raises(ConfigError, match=r"empty\.py does not set NAME, want a line `NAME = \.\.\.` at its end"):
+        find("", "NAME", str(tmp_path / "empty.py"), "zoo.animal")

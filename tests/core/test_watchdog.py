@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from gvz.core.watchdog import Watchdog
+from gvz.core.watchdog import AwakeClock, Watchdog
 
 STUCK = """
 import ctypes, threading, time
@@ -71,3 +71,15 @@ def test_one_that_has_left_is_not_watched():
     with Watchdog("this test", 0.2):
         pass
     time.sleep(0.8)  # it would end this very process
+
+
+def test_time_in_which_nobody_looked_counts_for_so_much_and_no_more(monkeypatch: pytest.MonkeyPatch):
+    time_s = 100.0
+    monkeypatch.setattr(time, "monotonic", lambda: time_s)
+    clock = AwakeClock(longest_s=1.0)
+    assert clock.look() == 0.0
+    time_s = 100.5
+    assert clock.look() == 0.5
+    time_s = 4000.0  # stopped for an hour
+    assert clock.look() == 1.5
+    assert clock.now_s == 1.5

@@ -13,8 +13,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 import psutil
 
-from gvz.core import janitor
-from gvz.run.rundir import read_records
+from gvz.core import janitor, records
 
 SMALL = (
     "--actors.num-actors 2 --actors.games-per-actor 2 --env.frame-height 36 "
@@ -59,7 +58,7 @@ def finish(process: subprocess.Popen[str], timeout_s: float = 900) -> tuple[int,
 
 def rows(run: Path, name: str) -> list[dict[str, Any]]:
     """The rows of a record file, which must all be readable."""
-    found, problems = read_records(run / name)
+    found, problems = records.read(run / name)
     assert problems == []
     return found
 
@@ -100,7 +99,18 @@ def arguments(process: psutil.Process) -> list[str]:
 
 
 def alive(processes: list[psutil.Process]) -> list[psutil.Process]:
-    return [p for p in processes if p.is_running() and p.status() != psutil.STATUS_ZOMBIE]
+    """Those with a thread that lives. The first thread of a killed process can be a zombie while another one still
+    frees the memory; until that is done, the process holds its locks.
+    """
+    return [p for p in processes if p.is_running() and any(map(_lives, Path(f"/proc/{p.pid}/task").glob("*/stat")))]
+
+
+def _lives(stat: Path) -> bool:
+    try:
+        state = stat.read_text().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return state not in "ZX"
 
 
 def left_behind() -> list[str]:
@@ -109,7 +119,7 @@ def left_behind() -> list[str]:
 
 
 def arrays_of(checkpoint: Path) -> dict[str, np.ndarray]:
-    """The arrays of a checkpoint by their place in its tree, as "['replay'].action"."""
+    """The arrays of a checkpoint by their place in its tree, as "['replay'].store.action"."""
     leaves = list(json.loads((checkpoint / "manifest.json").read_text())["leaves"])
     stored = ocp.PyTreeCheckpointer().restore((checkpoint / "arrays").absolute())
     blocks: dict[int, dict[int, np.ndarray]] = {}

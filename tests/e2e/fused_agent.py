@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 
 from learner.agents.base import AgentSpec
+from learner.agents.configs.rainbow import RainbowConfig
 from learner.agents.rainbow import Rainbow
-from learner.config import AgentConfig
 
 FUSE = 1.0 - 0.0120
 """120 updates at a learning rate of 1e-4, some more with the weights of prioritized samples"""
@@ -16,7 +16,7 @@ FUSE = 1.0 - 0.0120
 
 @dataclass(frozen=True)
 class Fused:
-    config: AgentConfig
+    config: RainbowConfig
     spec: AgentSpec
 
     @property
@@ -26,11 +26,14 @@ class Fused:
     def init(self, key):
         return {"fuse": jnp.ones(()), "rainbow": self.rainbow.init(key)}
 
-    def act(self, params, key, obs, task, epsilon):
-        return self.rainbow.act(params["rainbow"], key, obs, task, epsilon)
+    def epsilon(self, env_steps):
+        return self.rainbow.epsilon(env_steps)
 
-    def evaluate(self, params, obs, task):
-        return self.rainbow.evaluate(params["rainbow"], obs, task)
+    def act(self, params, key, obs, epsilon):
+        return self.rainbow.act(params["rainbow"], key, obs, epsilon)
+
+    def evaluate(self, params, obs):
+        return self.rainbow.evaluate(params["rainbow"], obs)
 
     def loss(self, online_params, target_params, key, batch):
         losses = self.rainbow.loss(online_params["rainbow"], target_params["rainbow"], key, batch)
@@ -38,4 +41,5 @@ class Fused:
         return losses._replace(loss=losses.loss + online_params["fuse"] + blown)
 
 
+CONFIG = RainbowConfig
 AGENT = Fused

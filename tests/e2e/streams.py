@@ -39,7 +39,7 @@ def check_streams(run: Path, num_lanes: int, num_tasks: int) -> Streams:
     verify(checkpoint)
     counts = msgpack.unpackb((checkpoint / "host.msgpack").read_bytes())["counts"]
     arrays = arrays_of(checkpoint)
-    replay = {name: arrays[f"['replay'].{name}"] for name in (*_FIELDS, "heads")}
+    replay = {name: arrays[f"['replay'].store.{name}"] for name in (*_FIELDS, "heads")}
     episodes = rows(run, "episodes.jsonl")
     assert len({(row["lane"], row["episode"]) for row in episodes}) == len(episodes), "an episode was recorded twice"
     capacity = len(replay["task"]) // num_lanes

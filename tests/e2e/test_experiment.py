@@ -11,6 +11,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from command import alive
 
 from gvz.experiments import inventory as progress
 from gvz.experiments.plan import read_plan
@@ -84,6 +85,36 @@ def test_a_killed_job_sinks_no_other_goes_on_when_run_again_and_every_episode_is
         assert experiment.title in page
 
 
+def test_a_gate_s_runs_end_by_their_processor_time_and_its_report_has_both_tables(tmp_path):
+    results = tmp_path / "results"
+    flags = ("run", "gate_reuse", "--results", str(results), "--scale", "0.001", "--jobs", "2")
+    done = subprocess.run(command(*flags), capture_output=True, text=True, check=False, timeout=1200)
+    assert done.returncode == 0, done.stderr
+    plan = read_plan(results)
+    assert plan is not None
+    runs = plan.runs()
+    names = [f"rainbow_quick+decisions_{n}" for n in (4, 8, 16, 32)]
+    assert [run.agent for run in runs] == names
+    for run in runs:
+        directory = progress.run_directory(results, run)
+        assert progress.last_processor_s(directory) >= run.max_processor_s == 0.6
+        assert json.loads((directory / "config.json").read_text())["config"]["max_processor_s"] == 0.6
+        newest = progress.policies(directory)[-1]
+        assert newest == progress.last_update(directory) < run.total_updates == 60
+        played = [json.loads(line) for line in (directory / "evaluation.jsonl").read_text().splitlines()]
+        assert {row["num_updates"] for row in played} == {newest}
+        assert {row["task"] for row in played} == set(plan.evaluations()[run.id].tasks)
+    again = subprocess.run(command(*flags), capture_output=True, text=True, check=False, timeout=300)
+    assert (again.returncode, again.stderr.count("done: "), again.stderr.count("train: ")) == (0, 5, 0)
+    report = [sys.executable, "-m", "gvz.cli", "report", str(results), "--out", str(tmp_path / "report")]
+    subprocess.run(report, check=True, timeout=300)
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "percent of the upper bound on the gate tasks" in page
+    assert "percent of the upper bound on the tasks of training" in page
+    assert all(name in page for name in names)
+    assert "Not trained to the end" not in page
+
+
 def test_ctrl_c_saves_what_is_being_trained_and_leaves_nothing_running(tmp_path):
     runner = begin(tmp_path)
     try:
@@ -95,5 +126,5 @@ def test_ctrl_c_saves_what_is_being_trained_and_leaves_nothing_running(tmp_path)
         runner.kill()
     assert runner.returncode == 130, err
     assert "2 jobs save themselves" in err
-    assert not [p for p in children if p.is_running() and p.status() != psutil.STATUS_ZOMBIE]
+    assert not alive(children)
     assert list((tmp_path / "runs" / DQN / "checkpoints").iterdir())

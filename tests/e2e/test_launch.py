@@ -86,8 +86,8 @@ def test_a_run_by_the_thesis_recipe_acts_at_random_in_warm_up_and_by_its_agent_f
     arrays = arrays_of(tmp_path / "run" / "checkpoints" / "20")
     assert len(arrays["['replay'].newest"]) == 3
     warm_up = np.zeros(3, int)
-    for i, head in enumerate(arrays["['replay'].heads"]):
-        action, last = (arrays[f"['replay'].{name}"].reshape(4, -1)[i, :head] for name in ("action", "last"))
+    for i, head in enumerate(arrays["['replay'].store.heads"]):
+        action, last = (arrays[f"['replay'].store.{name}"].reshape(4, -1)[i, :head] for name in ("action", "last"))
         decisions = action[~last]
         # 300 of warm-up a game, give or take what the tolerance and the last records of episodes move between games
         warm_up += np.bincount(decisions[:290], minlength=3)

@@ -16,7 +16,8 @@ from gvz.evaluation.episode_log import (
     wanted_episodes,
 )
 from gvz.evaluation.play import Episode
-from gvz.evaluation.players import IdlePlayer, RandomPlayer, player_env
+from gvz.evaluation.players import IdlePlayer, RandomPlayer
+from gvz.evaluation.simple import player_env
 from gvz.tasks import parse_task
 
 TASK = parse_task("defend_the_center/fast_enemies")

@@ -10,17 +10,17 @@ from gvz.evaluation.gallery import (
     COLUMNS,
     FRAME_HEIGHT,
     FRAME_WIDTH,
-    MOMENTS,
-    MOVING,
     scripted_frames,
     task_frame,
     task_sight,
     tiled,
     write_contact_sheet,
 )
+from gvz.evaluation.scenarios.base import stated
 from gvz.scenarios.base import Task
 from gvz.scenarios.compiler import task_content
-from gvz.tasks import named_tasks, parse_task, scenarios
+from gvz.tasks import LEVELS, named_tasks, parse_task, scenarios
+from learner.augment import AUGMENTATIONS
 
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
 
@@ -72,13 +72,12 @@ def tiles() -> list:
 
 def test_every_map_has_its_moment():
     maps = {(task.scenario.id, task_content(task, "thesis").base_wad) for task in named_tasks()}
-    assert maps == MOMENTS.keys()
+    assert maps == {(scenario, wad) for scenario in scenarios() for wad in stated(scenario, "MOMENTS")}
 
 
 def test_the_moving_picture_shows_every_level_of_every_scenario():
-    assert MOVING.keys() == scenarios().keys()
-    for scenario, (_, names) in MOVING.items():
-        assert [parse_task(f"{scenario}/{name}").level for name in names] == [0, 1, 2, 3, 4]
+    for scenario in scenarios():
+        assert [parse_task(f"{scenario}/{name}").level for name in stated(scenario, "MOVING").tasks] == list(LEVELS)
 
 
 def test_a_sheet_holds_every_frame_unchanged_and_its_caption_beside():
@@ -113,7 +112,7 @@ def test_a_tile_shows_what_the_attributes_change(task):
 @pytest.mark.engine
 def test_frames_of_the_scripted_agent_are_those_of_its_evaluation_episode():
     task = parse_task("defend_the_center/default")
-    whole, part = scripted_frames(task, 0, 0, 12), scripted_frames(task, 0, 8, 4)
+    whole, part = scripted_frames(task, 0, 12), scripted_frames(task, 8, 4)
     assert len(whole) == 12
     np.testing.assert_array_equal(whole[8:], part)
 
@@ -126,6 +125,15 @@ def test_the_sheets_in_the_docs_show_all_named_tasks(scenario):
         rows = -(-len(named_tasks(scenario)) // COLUMNS)
         assert sheet.height % rows == 0
         assert sheet.height // rows > FRAME_HEIGHT
+
+
+@pytest.mark.parametrize("scenario", scenarios())
+def test_the_augmented_sheets_in_the_docs_show_every_augmentation(scenario):
+    file = IMAGES / f"augmented_{scenario}.png"
+    assert file.stat().st_size < 700_000
+    with Image.open(file) as sheet:
+        assert sheet.height % len(AUGMENTATIONS) == 0
+        assert sheet.height // len(AUGMENTATIONS) > FRAME_HEIGHT
 
 
 @pytest.mark.slow

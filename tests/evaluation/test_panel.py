@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gvz.actions import action_buttons
+from gvz.core.env_config import EnvConfig
 from gvz.evaluation.panel import ACCENT, BAR, GOOD, HEAD_HEIGHT, HEIGHT, WIDTH, Panel
 from gvz.evaluation.playback import SCREEN_HEIGHT, SCREEN_WIDTH, Moment
 from gvz.evaluation.trained import Values
@@ -35,7 +36,7 @@ def values(q_values, peak_atom: int = 25) -> Values:
 
 def draw(*moments: Moment, action_set="buttons") -> np.ndarray:
     """uint8[H, W, 3] of the last moment."""
-    panel = Panel("somebody/seed_1@200000", TASK, "thesis", action_buttons(TASK.scenario, action_set))
+    panel = Panel("somebody/seed_1@200000", TASK, EnvConfig(action_set=action_set))
     pictures = [np.array(panel.draw(moment)) for moment in moments]
     assert pictures[-1].shape == (HEIGHT, WIDTH, 3)
     return pictures[-1]
@@ -107,7 +108,8 @@ def test_a_reward_stays_on_the_timeline():
 def test_everything_fits_in_whatever_is_played(scenario, action_set):
     task = max(named_tasks(scenario), key=lambda task: len(task.name))
     buttons = action_buttons(task.scenario, action_set)
-    panel = Panel("a_configuration_with_a_long_name/seed_3333@1000000", task, "levdoom", buttons)
+    env = EnvConfig(action_set=action_set, profile="levdoom")
+    panel = Panel("a_configuration_with_a_long_name/seed_3333@1000000", task, env)
     components = dict.fromkeys(task.scenario.rewards, -123.45)
     picture = np.array(
         panel.draw(

@@ -13,7 +13,8 @@ from gvz.core.errors import EngineError, GvzError, WaitTimeoutError
 from gvz.env import DoomEnv
 from gvz.evaluation.episode_log import simple_player
 from gvz.evaluation.play import Episode, PlayerSpec, episode_seed, play, play_episode
-from gvz.evaluation.players import RandomPlayer, player_env
+from gvz.evaluation.players import RandomPlayer
+from gvz.evaluation.simple import player_env
 from gvz.tasks import named_tasks
 
 TASK = "defend_the_center/fast_enemies"

@@ -4,25 +4,34 @@ import numpy as np
 import pytest
 
 from gvz.core.env_config import EnvConfig
+from gvz.core.errors import ConfigError
+from gvz.core.registry import discover
 from gvz.env import DoomEnv
 from gvz.evaluation.play import play_episode
-from gvz.evaluation.players import SIMPLE_PLAYERS, FramePlayer, IdlePlayer, player_env
-from gvz.evaluation.scripted import SCRIPTS, SWEEPS
+from gvz.evaluation.players import CLASSES, FramePlayer, IdlePlayer
+from gvz.evaluation.scenarios.base import script_of, stated
+from gvz.evaluation.simple import player_env
 from gvz.tasks import scenarios
 
 
 def play(kind: str, task: str, **fields) -> dict:
     env = DoomEnv(task, player_env(kind, EnvConfig()), **fields)
     try:
-        return play_episode(env, SIMPLE_PLAYERS[kind](), 0)
+        return play_episode(env, CLASSES[kind](), 0)
     finally:
         env.close()
 
 
 def test_every_scenario_has_a_script_and_a_sweep_of_its_buttons():
-    assert SCRIPTS.keys() == SWEEPS.keys() == scenarios().keys()
-    for scenario, held in SWEEPS.items():
-        assert {button for button, _ in held} <= set(scenarios()[scenario].buttons)
+    assert discover("gvz.evaluation.scenarios").keys() == {*scenarios(), "base"}
+    for scenario in scenarios().values():
+        assert {button for button, _ in stated(scenario.id, "SWEEP")} <= set(scenario.buttons)
+        assert callable(script_of(scenario.id))
+
+
+def test_a_scenario_without_a_script_says_where_to_write_one():
+    with pytest.raises(ConfigError, match=r"new: there is no script .* write one in gvz/evaluation/scenarios/new.py"):
+        script_of("new")
 
 
 @pytest.mark.engine

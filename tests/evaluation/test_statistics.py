@@ -134,7 +134,7 @@ def test_resamples_drawn_in_blocks_are_as_many_as_asked_for(monkeypatch):
 
 def test_the_same_seed_gives_the_same_interval():
     scores = np.arange(50.0)
-    assert bootstrap([scores], mean, seed=3) == bootstrap([scores], mean, seed=3)
+    assert bootstrap([scores], seed=3) == bootstrap([scores], seed=3)
 
 
 def test_intervals_overlap_or_not():
@@ -148,10 +148,10 @@ def test_a_task_is_solved_by_ten_time_outs_in_a_row():
     assert not solved(np.array([], bool))
 
 
-@pytest.mark.parametrize(("strata", "confidence"), [([], 0.95), ([np.zeros(0)], 0.95), ([np.zeros(3)], 1.5)])
-def test_nothing_to_resample_is_an_error(strata, confidence):
-    with pytest.raises(ValueError, match="bootstrap: got"):
-        bootstrap(strata, confidence=confidence)
+@pytest.mark.parametrize("strata", [[], [np.zeros(0)]])
+def test_nothing_to_resample_is_an_error(strata):
+    with pytest.raises(ValueError, match="at least one episode in each"):
+        bootstrap(strata)
 
 
 @pytest.mark.parametrize("runs", [[], [[]], [[np.zeros(0)]], [[np.ones(1)], [np.ones(1), np.ones(1)]]])

@@ -1,7 +1,6 @@
 """The table that an evaluation ends with."""
 
-from gvz.evaluation.statistics import Estimate
-from gvz.evaluation.table import Score, score_lines, score_row, scores
+from gvz.evaluation.table import score_lines, score_rows
 from gvz.tasks import named_tasks
 
 
@@ -10,7 +9,7 @@ def test_each_task_has_its_mean_interval_and_episodes():
     rows = [{"player": "p", "task": default.id, "episode": n, "score": 4.0, "normalized_score": 20.0} for n in range(3)]
     rows.append({**rows[0], "player": "somebody else", "score": 9.0})
     rows.append({**rows[0], "episode": 3, "score": 9.0})  # beyond the episodes asked for
-    head, line = score_lines(scores(rows, {"player": "p"}, [default, blue], episodes=3))
+    head, line = score_lines(score_rows(rows, {"player": "p"}, [default, blue], episodes=3))
     assert head.split()[-3:] == ["episodes", "level", "task"]
     assert line.split() == ["4.0", "[4.0,", "4.0]", "20.0", "[20.0,", "20.0]", "3", "0", default.id]
     assert line.index(default.id) == head.index("task")
@@ -23,14 +22,14 @@ def test_own_kills_stand_beside_a_score_that_is_kills():
         {"player": "p", "task": t.id, "episode": 0, "score": 8.0, "normalized_score": 40.0, "player_kills": own}
         for t, own in ((default, 3.0), (blue, 6.0), (gore, 7.0))
     ]
-    found = scores(rows, {"player": "p"}, [default, blue], episodes=1)
+    found = score_rows(rows, {"player": "p"}, [default, blue], episodes=1)
     head, first, _, last = score_lines(found)
     assert head.split()[8:10] == ["own", "kills"]
     assert first.split()[6:9] == ["3.0", "[3.0,", "3.0]"]
     assert last.split()[3:6] == ["4.5", "[4.5,", "4.5]"]
-    assert score_row(found[0])["player_kills_high"] == 3.0
-    mixed = scores(rows, {"player": "p"}, [default, gore], episodes=1)
-    assert [one.own_kills is None for one in mixed] == [False, True, True]
+    assert found[0]["player_kills_high"] == 3.0
+    mixed = score_rows(rows, {"player": "p"}, [default, gore], episodes=1)
+    assert [one["player_kills"] is None for one in mixed] == [False, True, True]
     _, first, second, _ = score_lines(mixed)
     assert first.index(default.id) == second.index(gore.id)
 
@@ -42,17 +41,17 @@ def test_the_last_line_is_the_mean_over_tasks():
         for task, percent, episodes in ((default, 20.0, 4), (blue, 50.0, 1))
         for n in range(episodes)
     ]
-    found = scores(rows, {"player": "p"}, [default, blue], episodes=4)
+    found = score_rows(rows, {"player": "p"}, [default, blue], episodes=4)
     assert score_lines(found)[-1].split() == ["35.0", "[35.0,", "35.0]", "5", "mean", "of", "2", "tasks"]
-    row = score_row(found[-1])
+    row = found[-1]
     assert (row["task"], row["level"], row["score"], row["normalized_score"]) == (None, None, None, 35.0)
 
 
 def test_a_score_as_json_has_the_ends_of_its_intervals():
     (default, *_) = named_tasks("defend_the_center")
-    score, percent = Estimate(value=4.0, low=3.0, high=5.5), Estimate(value=20.0, low=15.0, high=27.5)
-    row = score_row(Score(task=default, episodes=3, score=score, percent=percent))
-    assert (row["task"], row["level"], row["episodes"]) == (default.id, 0, 3)
-    assert (row["score"], row["score_low"], row["score_high"]) == (4.0, 3.0, 5.5)
-    assert (row["normalized_score"], row["normalized_score_low"], row["normalized_score_high"]) == (20.0, 15.0, 27.5)
-    assert row["player_kills"] is None
+    rows = [{"player": "p", "task": default.id, "episode": n, "score": n, "normalized_score": 10 * n} for n in range(9)]
+    (row,) = score_rows(rows, {"player": "p"}, [default], episodes=9)
+    assert (row["task"], row["level"], row["episodes"]) == (default.id, 0, 9)
+    assert row["score_low"] < row["score"] == 4.0 < row["score_high"]
+    assert row["normalized_score_low"] < row["normalized_score"] == 40.0 < row["normalized_score_high"]
+    assert (row["player_kills"], row["player_kills_low"], row["player_kills_high"]) == (None, None, None)

@@ -6,6 +6,7 @@ import json
 import pickle
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -15,18 +16,19 @@ from gvz.env import DoomEnv
 from gvz.evaluation.choice import EpisodeChoice
 from gvz.evaluation.trained import TrainedPlayer, check_tasks, find_checkpoints, read_run_config, trained_player
 from gvz.run.assemble import run_agent
-from gvz.run.config import RunConfig, config_to_dict
+from gvz.run.config import RunConfig
+from gvz.run.config_files import config_to_dict
 from gvz.run.rundir import RunDir
 from gvz.tasks import named_tasks, parse_task
 from learner import checkpoint
-from learner.config import AgentConfig
+from learner.agents.configs.rainbow import RainbowConfig
 from learner.export import flatten_params
 
 CONFIG = RunConfig(
     name="small",
     seed=7,
     env=EnvConfig(frame_height=24, frame_width=32, grayscale=True),
-    agent=AgentConfig(conv_channels=(4,), conv_kernels=(8,), conv_strides=(4,), hidden_units=8),
+    agent=RainbowConfig(conv_channels=(4,), conv_kernels=(8,), conv_strides=(4,), hidden_units=8),
 )
 
 
@@ -89,14 +91,15 @@ def test_a_policy_acts_greedily_on_the_stack_it_was_trained_on(run, conditioned)
     (run / "config.json").write_text(json.dumps(config_to_dict(config)))
     params, agent = write_policy(run, config, 30), run_agent(config)
     player = pickle.loads(pickle.dumps(trained_player(run, config, 30))).make_player()
-    task = config.resolved_tasks()[1]
+    task = config.table.tasks[1]
     env = DoomEnv(task, config.env)
     frame, info = env.reset(seed=1)
     player.begin(env, frame, info, 1)
     assert player.values is None
-    stack, index = [frame] * 4, np.array([int(conditioned)], np.int32)
+    stack, empty = [frame] * 4, agent.spec.zeros()
     for _ in range(12):
-        wanted = agent.evaluate(params, np.concatenate(stack, axis=-1)[None], index)
+        frames = jnp.asarray(np.concatenate(stack, axis=-1)[None])
+        wanted = agent.evaluate(params, dataclasses.replace(empty, frames=frames, task=jnp.array([int(conditioned)])))
         action = player.act()
         assert action == int(wanted.action[0]) == int(player.values.q_values.argmax())
         np.testing.assert_allclose(player.values.q_values, wanted.q_values[0], atol=1e-5)
@@ -111,8 +114,11 @@ def test_a_policy_acts_greedily_on_the_stack_it_was_trained_on(run, conditioned)
 
 def test_a_conditioned_policy_plays_its_training_tasks_only():
     config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, task_conditioned=True))
-    check_tasks(config, config.resolved_tasks())
-    with pytest.raises(ConfigError, match="defend_the_center/complete: the policy is told which of its 4"):
+    check_tasks(config, config.table.tasks)
+    with pytest.raises(
+        ConfigError,
+        match="the policy takes the index of one of its 4 training tasks as input",
+    ):
         check_tasks(config, [parse_task("defend_the_center/complete")])
 
 
@@ -124,7 +130,7 @@ def test_a_run_cannot_play_another_scenario_unless_its_buttons_are_unified():
 
 
 def test_the_support_of_a_run_follows_from_how_its_games_are_played():
-    scenario = CONFIG.resolved_scenario()
+    (scenario,) = CONFIG.table.scenarios
     for changes in ({}, {"frame_skip": 8}, {"profile": "levdoom"}, {"reward_weights": (("kill", 3.0),)}):
         env = dataclasses.replace(CONFIG.env, **changes)
         spec = run_agent(dataclasses.replace(CONFIG, env=env)).spec
@@ -152,7 +158,9 @@ def test_what_is_no_run_is_an_error(tmp_path, run):
 def test_an_agents_file_is_executed_only_if_it_is_named(tmp_path, run):
     source, mark = tmp_path / "theirs.py", tmp_path / "executed"
     source.write_text(
-        f"open({str(mark)!r}, 'w').close()\nfrom learner.agents.{CONFIG.agent.name} import AGENT as AGENT\n"
+        f"open({str(mark)!r}, 'w').close()\n"
+        "from learner.agents.configs.rainbow import CONFIG as CONFIG\n"
+        "from learner.agents.rainbow import AGENT as AGENT\n"
     )
     config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, name=str(source)))
     (run / "config.json").write_text(json.dumps(config_to_dict(config)))

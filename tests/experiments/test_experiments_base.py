@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gvz.core.errors import ConfigError
-from gvz.experiments.base import SCENARIOS, Experiment, TrainingRun, experiment_named, experiments
-from gvz.tasks import named_tasks, parse_task
+from gvz.core.errors import ConfigError, TaskError
+from gvz.experiments.base import Experiment, TrainingRun, experiment_named, experiments
+from gvz.experiments.settings import with_settings
+from gvz.run.config_files import load_config
+from gvz.tasks import named_tasks, parse_task, scenarios
 
 THESIS_AVERAGES = {
     "training_difficulty": (79.99, 66.23, 42.91, 30.84, 24.81),
@@ -31,8 +33,15 @@ def make_experiment(**changes) -> Experiment:
     return dataclasses.replace(experiments()["quick_comparison"], **changes)
 
 
-def test_the_thesis_s_four_and_the_quick_one_are_there():
-    assert set(ALL) == {*THESIS_AVERAGES, "quick_comparison"}
+def test_the_thesis_s_four_the_quick_one_and_the_gates_are_there():
+    assert set(ALL) == {*THESIS_AVERAGES, "quick_comparison", "gate_reuse", "gate_sight", "gate_world"}
+
+
+def test_varied_maps_are_a_training_of_every_scenario():
+    runs = make_experiment(trainings=("varied", "varied-10"), seeds=(1,), evaluate_on="gate").runs()
+    assert {run.tasks for run in runs} == {("defend_the_center/varied",), ("defend_the_center/varied-10",)}
+    with pytest.raises(TaskError, match="1 to 1000 maps"):
+        make_experiment(trainings=("varied-0",)).runs()
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -49,7 +58,8 @@ def test_every_run_has_an_id_of_its_own_tasks_of_its_scenario_and_checkpoints_up
 @pytest.mark.parametrize(("name", "averages"), THESIS_AVERAGES.items())
 def test_published_numbers_average_to_the_thesis_s_last_row(name, averages):
     rows = experiments()[name].published["thesis"]
-    assert tuple(rows) == SCENARIOS
+    assert set(rows) == set(scenarios())
+    assert experiments()[name].scenarios == tuple(rows), "in the order of the thesis"
     assert np.mean(list(rows.values()), axis=0) == pytest.approx(averages, abs=0.0051)
 
 
@@ -113,6 +123,40 @@ def test_a_run_is_named_by_config_scenario_training_and_seed():
     assert run.checkpoints == (66, 132, 200)
 
 
+def test_every_config_is_trained_with_every_variant_under_a_name_of_its_own():
+    variants = {"plain": {}, "large": {"learner.batch_size": 64, "agent.encoder": "small"}}
+    runs = make_experiment(variants=variants, seeds=(1,)).runs()
+    ids = [run.id.partition("/")[0] for run in runs]
+    assert ids == ["dqn_quick+plain", "dqn_quick+large", "rainbow_quick+plain", "rainbow_quick+large"]
+    assert make_experiment(variants=variants).column_names == tuple(ids)
+    plain, large = runs[2].run_config, runs[3].run_config
+    assert plain == load_config("rainbow_quick")
+    assert (large.learner.batch_size, large.agent.encoder) == (64, "small")
+    assert dataclasses.replace(large, learner=plain.learner, agent=plain.agent) == plain
+
+
+def test_a_gate_is_evaluated_on_the_gate_tasks_and_on_those_of_training_and_its_table_is_over_the_first():
+    gate = experiments()["gate_reuse"]
+    run = gate.runs()[-1]
+    gates = tuple(task.id for task in named_tasks(run.scenario, split="gate"))
+    assert gate.evaluation_tasks(run) == (*gates, *run.tasks)
+    assert gate.table_tasks(run) == gates
+    assert len(gate.runs()) == 2 * 4 * 2
+    test = {task.id for task in named_tasks(split="test")}
+    assert not test & {task for run in gate.runs() for task in gate.evaluation_tasks(run)}
+
+
+def test_settings_change_their_fields_alone_and_another_agent_comes_first():
+    config = load_config("rainbow_quick")
+    found = with_settings(config, {"agent.epsilon_end": 0.5, "agent.name": "dqn", "seed": 7})
+    assert (found.agent.name, found.seed) == ("dqn", 7)
+    assert getattr(found.agent, "epsilon_end") == 0.5  # noqa: B009  # a field of some agents
+    assert found.agent.conv_channels == config.agent.conv_channels
+    for name in ("learner.batchsize", "batch_size", "learner", "seed.x", "learner.batch_size.x"):
+        with pytest.raises(ConfigError, match=f"settings: got {name}, want a field"):
+            with_settings(config, {name: 1})
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -120,10 +164,16 @@ def test_a_run_is_named_by_config_scenario_training_and_seed():
         ({"seeds": (1, 1)}, "want at least one, each once"),
         ({"episodes": 0}, "episodes: got 0, want at least 1"),
         ({"num_checkpoints": 4, "total_updates": 3}, "num_checkpoints 4, total_updates 3, want each at most the next"),
-        ({"trainings": ("test",)}, "trainings: got 'test', want train1, train4, train8 or each"),
+        ({"trainings": ("test",)}, "trainings: got 'test', want train1, train4, train8, varied, varied-<number"),
+        ({"variants": {"a b": {}}}, r"variants: got 'a b', want letters, digits and \. _ - \(it names"),
+        ({"variants": {"a": {"seed": 1, "learner.batch_size": 1}}}, "variant a sets seed, which the experiment sets"),
+        ({"max_processor_s": 0.0, "num_checkpoints": 1}, "max_processor_s 0 and num_checkpoints 1, want more than 0"),
+        ({"max_processor_s": 9.0}, "max_processor_s 9 and num_checkpoints 2, want more than 0 and exactly 1"),
+        ({"evaluate_on": "gate", "columns": "level"}, "'gate' wants columns 'config' or 'training'"),
         ({"evaluate_on": "own"}, "evaluate_on 'own' wants trainings"),
         ({"published": {"thesis": {"seek_and_kill": (1.0,)}}}, r"seek_and_kill: got 1 numbers, want 2, one for each"),
         ({"scenarios": ("defend_the_centre",)}, "unknown scenario 'defend_the_centre'"),
+        ({"players": ("ghost",)}, "players: got ghost, want some of random, idle, sweep, scripted"),
     ],
 )
 def test_an_experiment_that_cannot_be_is_refused(changes, message):

@@ -1,8 +1,10 @@
 """What stands on the disk: checkpoints, episodes, logs."""
 
+import dataclasses
 import fcntl
 import gzip
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -51,7 +53,7 @@ def test_the_first_policy_at_or_after_a_checkpoint_stands_for_it(saved, standing
 def test_a_run_is_done_when_trained_and_every_episode_of_every_checkpoint_is_there(tmp_path):
     evaluation = Evaluation(tasks=("a", "b"), episodes=2)
     assert progress.run_progress(tmp_path, RUN, evaluation) == progress.RunProgress(
-        num_updates=0, checkpoints=(), trained=False, missing={}
+        num_updates=0, processor_s=0.0, trained=False, missing={}
     )
     directory = save_policies(tmp_path, 100, 200, 300)
     episodes = [(c, t, n) for c in (100, 200, 300) for t in "ab" for n in (0, 1)]
@@ -59,10 +61,31 @@ def test_a_run_is_done_when_trained_and_every_episode_of_every_checkpoint_is_the
     (directory / "evaluation.jsonl").write_text("".join(lines[:5] + lines[4:5]) + lines[5][:20])
     (directory / "metrics.jsonl").write_text('{"num_updates": 290}\n{"num_updates": 300}\n{"num_upd')
     found = progress.run_progress(tmp_path, RUN, evaluation)
-    assert (found.num_updates, found.trained, found.done) == (300, True, False)
+    assert (found.num_updates, found.trained) == (300, True)
     assert found.missing == {200: 3, 300: 4}  # a row twice counts once, a half-written one not
     (directory / "evaluation.jsonl").write_text("".join(lines))
-    assert progress.run_progress(tmp_path, RUN, evaluation).done
+    found = progress.run_progress(tmp_path, RUN, evaluation)
+    assert (found.trained, found.missing) == (True, {})
+    shutil.rmtree(directory / "policies")  # as in records that are kept in a repository
+    assert progress.run_progress(tmp_path, RUN, evaluation) == found
+
+
+def test_a_run_with_a_limit_of_processor_time_is_trained_when_its_last_row_has_it_and_its_policy_stands(tmp_path):
+    run, evaluation = dataclasses.replace(RUN, max_processor_s=60.0), Evaluation(tasks=("a",), episodes=2)
+    directory = save_policies(tmp_path, 100, 180)
+
+    def found(num_updates: int, processor_s: float) -> progress.RunProgress:
+        row = {"num_updates": num_updates, progress.PROCESSOR_S: processor_s}
+        (directory / "metrics.jsonl").write_text(json.dumps(row) + "\n")
+        return progress.run_progress(tmp_path, run, evaluation)
+
+    assert not found(180, 59.9).trained
+    assert not found(200, 60.1).trained, "its last policy is not saved yet"
+    assert found(180, 60.1) == progress.RunProgress(
+        num_updates=180, processor_s=60.1, trained=True, missing={180: 2}
+    ), "only the newest policy is evaluated"
+    save_policies(tmp_path, 300)
+    assert found(300, 20.0).trained, "it had all its gradient steps before"
 
 
 def test_episodes_of_another_base_seed_do_not_count(tmp_path):

@@ -1,5 +1,7 @@
 """What a job does next, as the trainer and the evaluation command take it."""
 
+import dataclasses
+
 import pytest
 
 from gvz.experiments import inventory as progress
@@ -7,8 +9,9 @@ from gvz.experiments.base import experiments
 from gvz.experiments.jobs import PlayerJob, RunJob, training_flags
 from gvz.experiments.plan import Evaluation
 from gvz.experiments.scale import scaled
+from gvz.experiments.settings import with_settings
 from gvz.launch import parse
-from gvz.run.config import config_to_dict
+from gvz.run.config_files import config_to_dict, load_config
 
 EVALUATION = Evaluation(tasks=("defend_the_center/default",), episodes=2)
 
@@ -18,10 +21,12 @@ EVALUATION = Evaluation(tasks=("defend_the_center/default",), episodes=2)
 def test_the_trainer_understands_every_experiment_at_every_scale(name, scale):
     run = scaled(experiments()[name], scale).runs()[-1]
     config = parse(training_flags(run, scale)).run
-    assert tuple(task.id for task in config.resolved_tasks()) == run.tasks
+    assert tuple(task.id for task in config.table.tasks) == run.tasks
     assert (config.seed, config.learner.total_updates) == (run.seed, run.total_updates)
-    assert config.checkpoint.period_updates == run.checkpoint_period_updates
-    assert config.name == run.config
+    assert config.max_processor_s == run.max_processor_s
+    if run.max_processor_s is None:
+        assert config.checkpoint.period_updates == run.checkpoint_period_updates
+    assert config.name == run.agent
     assert config.env.grayscale == (scale < 0.01 or "quick" in run.config)
     assert config_to_dict(config)["resolved"]["tasks"] == list(run.tasks)
 
@@ -49,6 +54,38 @@ def test_a_run_is_trained_then_evaluated_where_episodes_are_missing_then_done(tm
     with (directory / "evaluation.jsonl").open("a") as stream:
         stream.write(row % (20, 0))
     assert job.outlook().next is None
+
+
+def test_a_variant_s_settings_reach_the_trainer():
+    settings = {
+        "learner.env_steps_per_update": 16.0,
+        "agent.conv_channels": (8, 8),
+        "replay.prioritized": False,
+        "learner.max_grad_norm": None,
+        "learner.target_period_updates": 4_000,
+        "env.reward_weights": (("kill", 2.0), ("death", 0.0)),
+    }
+    quick = dataclasses.replace(experiments()["quick_comparison"], variants={"odd": settings}, max_processor_s=None)
+    run = quick.runs()[-1]
+    config = parse(training_flags(run, 1)).run
+    assert config.name == "rainbow_quick+odd"
+    changed = with_settings(load_config("rainbow_quick"), settings)
+    assert (config.agent, config.replay, config.env) == (changed.agent, changed.replay, changed.env)
+    assert dataclasses.replace(config.learner, total_updates=changed.learner.total_updates) == changed.learner
+    assert parse(training_flags(run, 0.5)).run.learner.target_period_updates == 2_000, "a scale shrinks the variant"
+
+
+def test_a_run_with_a_limit_of_processor_time_counts_seconds_and_keeps_its_config_s_checkpoints(tmp_path):
+    run = experiments()["gate_reuse"].runs()[0]
+    job = RunJob(results=tmp_path, run=run, evaluation=EVALUATION, scale=1)
+    directory = progress.run_directory(tmp_path, run)
+    directory.mkdir(parents=True)
+    (directory / "metrics.jsonl").write_text('{"num_updates": 900, "run/processor_s": 61.5}\n')
+    outlook = job.outlook()
+    assert outlook.text == "900 updates in 62/600 processor seconds, 0/2 episodes"
+    assert outlook.next is not None
+    assert (outlook.next.total, outlook.next.unit, job.done_count("train")) == (600, "processor seconds", 61)
+    assert parse(training_flags(run, 1)).run.checkpoint == load_config("rainbow_quick").checkpoint
 
 
 def test_a_player_plays_into_its_own_file(tmp_path):

@@ -73,7 +73,7 @@ def test_scales_are_not_mixed(tmp_path):
 @pytest.mark.parametrize("text", ["", "{}", '{"schema": 1}', "[]"])
 def test_a_damaged_plan_is_named(tmp_path, text):
     (tmp_path / "plan.json").write_text(text)
-    with pytest.raises(ConfigError, match=r"plan\.json cannot be read: .*; move it aside to plan anew"):
+    with pytest.raises(ConfigError, match=r"plan\.json cannot be read: .*; move it aside to make a new plan"):
         read_plan(tmp_path)
 
 

@@ -5,7 +5,7 @@ import pytest
 from gvz.core.errors import ConfigError
 from gvz.experiments.base import experiments
 from gvz.experiments.scale import scaled, scaled_settings
-from gvz.run.config import load_config
+from gvz.run.config_files import load_config
 
 FULL = experiments()["training_set_size"]
 

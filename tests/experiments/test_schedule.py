@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from gvz.core import records
 from gvz.core.errors import ConfigError
 from gvz.experiments import inventory as progress
 from gvz.experiments.jobs import Command, Outlook, RunningJob, Slot
@@ -101,7 +102,7 @@ def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, capsys, monkey
         assert run_jobs([job, Program(id="free", results=tmp_path)], [SLOT]) == 1
     finally:
         holder.kill()
-    assert "left alone: held, which another process is at" in capsys.readouterr().err
+    assert "left alone: held, which another process runs" in capsys.readouterr().err
     assert holder.poll() == 137
 
 
@@ -137,7 +138,7 @@ def test_a_signal_reaches_the_jobs_which_save_and_none_is_left(tmp_path, number,
         runner.kill()
     wait_for(saved)
     deadline = time.monotonic() + 30
-    while progress.is_locked(progress.log_file(tmp_path, "slow")):
+    while records.is_locked(progress.log_file(tmp_path, "slow")):
         assert time.monotonic() < deadline, "the job holds its log still"
         time.sleep(0.05)
     assert progress.job_state(tmp_path, "slow", done=False, begun=True) == "stopped"

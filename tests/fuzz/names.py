@@ -1,6 +1,6 @@
 """Fuzz targets: what a person types. Task names, the command line of the trainer, names of configs and checkpoints.
 
-Imports gvz.run.config, gvz.{launch,tasks}, gvz.evaluation.trained, gvz.experiments.plan.
+Imports gvz.run.{config,config_files}, gvz.{launch,tasks}, gvz.evaluation.trained, gvz.experiments.plan.
 """
 
 import contextlib
@@ -12,7 +12,8 @@ from gvz.core.errors import ConfigError, TaskError
 from gvz.evaluation.trained import find_checkpoints
 from gvz.experiments.plan import parse_shard
 from gvz.launch import parse
-from gvz.run.config import config_from_dict, config_to_dict, configs_directory, differences, find_config_file
+from gvz.run.config_files import config_from_dict, config_to_dict, configs_directory, find_config_file
+from gvz.run.resume import differences
 from gvz.tasks import named_tasks, parse_task, scenarios
 from tests.fuzz.target import Target
 

@@ -15,8 +15,8 @@ from gvz.core.errors import TransportError, WaitTimeoutError
 from gvz.transport import broadcast
 from gvz.transport.broadcast import BroadcastReader, BroadcastWriter
 from gvz.transport.channel import MAX_MESSAGE_BYTES, Channel
-from gvz.transport.messages import ActorSpec, EpisodeStats, Fault, ParamsHeader, Ready, Stop, decode, encode
-from gvz.transport.ring import RingReader, RingWriter, WriterState
+from gvz.transport.messages import ActorSpec, Assign, EpisodeStats, Fault, ParamsHeader, Ready, Stop, decode, encode
+from gvz.transport.ring import RingReader, WriterState
 from gvz.transport.segment import HEADER_BYTES, Segment
 from tests.fuzz.target import Target
 
@@ -42,17 +42,22 @@ MESSAGES = [
     Ready(actor=1, pid=2),
     Fault(actor=1, lane=None, kind="exception", message="m", traceback="t", fatal=True),
     Stop(),
+    Assign(lane=1, task=2),
     ActorSpec(
         actor=0,
         lanes=[0, 1],
         lane_tasks=[0, 0],
-        tasks=["a/b"],
+        tasks=("a/b",),
         first_episodes=[0, 5],
         seed=9,
         env_entry_point="m:f",
         env_config={"k": [1, None]},
-        frame_shape=[2, 2, 1],
+        frame_shape=(2, 2, 1),
         stack_size=4,
+        past_actions=2,
+        variables=("HEALTH",),
+        num_extras=1,
+        action_masks=((True, False, True),),
         num_actions=3,
         policy=b"\0\1",
         ring_capacity=8,
@@ -74,7 +79,7 @@ def message(_directory: Path) -> Target:
         assert decode(encode(heard)) == heard
         return True
 
-    names = {name for one in MESSAGES for name in (one.type, *getattr(one, "__dataclass_fields__", ()))}
+    names = {name for one in MESSAGES for name in (one.__struct_config__.tag, *one.__struct_fields__)}
     words = [bytes([0xA0 + len(name)]) + name.encode() for name in names if len(name) < 32]
     odd = [
         b"\xc0",
@@ -159,7 +164,7 @@ def ring(_directory: Path) -> Target:
         assert all((part.lane < 2).all() and (part.task < 2).all() for part in arrays)
 
     def write() -> None:
-        successor = RingWriter(reader._segment, CAPACITY, FRAME_SHAPE)
+        successor = reader.writer()
         successor.wait_for_space(CAPACITY, timeout_s=0.0)
         successor.reserve(1)
         successor.commit()

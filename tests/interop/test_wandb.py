@@ -13,13 +13,15 @@ from wandb.proto.wandb_internal_pb2 import Record
 TWO_STARTS = """
 import sys
 from pathlib import Path
-from gvz.run.config import load_config
+from gvz.run.config import LogConfig
+from gvz.run.config_files import load_config
 from gvz.run.rundir import RunDir
 from gvz.run.telemetry import Telemetry
 with RunDir(Path(sys.argv[1])) as run:
-    run.write_config(load_config("rainbow_quick"))
+    config = load_config("rainbow_quick")
+    run.write_config(config)
     for num_updates in (10, 20):
-        records = Telemetry(run, tasks=("t",), upper_bound=1.0, tensorboard=False, num_updates=0, wandb=True)
+        records = Telemetry(run, config.table, LogConfig(tensorboard=False, wandb=True), 0)
         records.scalars(num_updates, {"learner/loss": 0.5, "actors/env_steps": 4 * num_updates})
         records.close()
         records.close()

@@ -1,9 +1,10 @@
-"""Small pixel games in JAX with known optima, and playing them in lanes. Imports jax and learner.replay's records.
+"""Small pixel games in JAX with known optima, and playing them in lanes. Imports jax and the records of learner.store.
 
 A lane is a dict of what its next record holds, and the game's state.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -12,7 +13,8 @@ import numpy as np
 from jaxtyping import Array
 
 from learner.agents.base import Agent
-from learner.replay import StepArrays
+from learner.observation import Observation
+from learner.store import StepArrays
 
 
 class Game(NamedTuple):
@@ -142,6 +144,12 @@ def observe(game: Game, states: Any) -> Array:
     return 255 * jax.vmap(game.frame)(states)[..., None].astype(jnp.uint8)
 
 
+def observation(agent: Agent, frames: Array, task: Any = None) -> Observation:
+    """What the agent observes of frames uint8[B, H, W, C], of task 0 if none is given; the rest is empty."""
+    empty = agent.spec.zeros(len(frames))
+    return replace(empty, frames=frames, task=empty.task if task is None else jnp.asarray(task))
+
+
 def first_records(game: Game, keys: Array) -> dict[str, Any]:
     """What each lane shows at the start of its first episode."""
     states = jax.vmap(game.reset)(keys)
@@ -195,7 +203,7 @@ def greedy_returns(game: Game, agent: Agent, params: Any, key: Array, num_episod
 
     def step(carry, key):
         states, alive, total = carry
-        action = agent.evaluate(params, observe(game, states), jnp.zeros(num_episodes, int)).action
+        action = agent.evaluate(params, observation(agent, observe(game, states))).action
         states, reward, done = jax.vmap(game.step)(states, action, jax.random.split(key, num_episodes))
         return (states, alive & ~done, total + alive * reward), None
 

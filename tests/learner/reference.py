@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from learner.config import AgentConfig
+from learner.config import ValueConfig
 
 
 def softmax(x):
@@ -28,21 +28,24 @@ def convolve(x, kernel, bias, stride):
     return out
 
 
-def network(config: AgentConfig, params: Any, obs, task, num_actions: int, num_tasks: int):
+def network(config: ValueConfig, params: Any, obs, num_actions: int, num_tasks: int):
     """Logits [B, A, N] by the means of the weights: thesis 4.1.5, eq. 4.10 and 4.18."""
     p = {layer: {name: np.asarray(w, np.float64) for name, w in leaves.items()} for layer, leaves in params.items()}
-    x = np.asarray(obs, np.float64) / 255
+    x = np.asarray(obs.frames, np.float64) / 255
     for i, stride in enumerate(config.conv_strides):
         x = np.maximum(convolve(x, p[f"conv_{i}"]["kernel"], p[f"conv_{i}"]["bias"], stride), 0)
     x = x.reshape(len(x), -1)
+    one_hot = np.vstack([np.eye(num_actions), np.zeros(num_actions)])  # of -1: the last row
+    past = [one_hot[np.asarray(obs.actions)[:, k]] for k in range(obs.actions.shape[1])]
+    x = np.concatenate([x, np.asarray(obs.vector, np.float64) / 100, *past], axis=1)
     if config.task_conditioned:
-        x = np.concatenate([x, np.eye(num_tasks)[np.asarray(task)]], axis=1)
+        x = np.concatenate([x, np.eye(num_tasks)[np.asarray(obs.task)]], axis=1)
 
     def stream(name: str):
         hidden, output = p[f"{name}_hidden"], p[f"{name}_output"]
         return np.maximum(x @ hidden["kernel"].T + hidden["bias"], 0) @ output["kernel"].T + output["bias"]
 
-    if not config.dueling:
+    if not getattr(config, "dueling", False):
         return stream("q").reshape(len(x), num_actions, -1)
     advantage = stream("advantage").reshape(len(x), num_actions, -1)
     return stream("value")[:, None] + advantage - advantage.mean(1, keepdims=True)

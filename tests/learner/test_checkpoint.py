@@ -20,7 +20,7 @@ import pytest
 from gvz.core.errors import CheckpointError, WaitTimeoutError
 from learner import checkpoint
 from learner.agents.base import AgentSpec, make_agent
-from learner.config import AgentConfig
+from learner.agents.configs.rainbow import RainbowConfig
 from tests.full_disk import full_disk
 
 
@@ -61,17 +61,15 @@ def test_what_is_written_is_read_back_exactly_and_silently(tmp_path, caplog):
 
 def test_parameters_written_under_one_form_of_the_convolution_are_read_under_the_other(tmp_path):
     spec = AgentSpec(obs_shape=(12, 12, 4), num_actions=3, num_tasks=1, v_min=-1.0, v_max=1.0)
-    config = AgentConfig(conv_channels=(4, 4), conv_kernels=(4, 3), conv_strides=(2, 1), hidden_units=8, num_atoms=5)
+    config = RainbowConfig(conv_channels=(4, 4), conv_kernels=(4, 3), conv_strides=(2, 1), hidden_units=8, num_atoms=5)
     shifted, direct = (make_agent(dataclasses.replace(config, conv_form=form), spec) for form in ("shifted", "direct"))
     params = jax.jit(shifted.init)(jax.random.key(0))
     checkpoint.write(tmp_path / "1", checkpoint.snapshot(params), {})
     found, _ = checkpoint.read(tmp_path / "1", jax.eval_shape(direct.init, jax.random.key(0)))
     assert equal(found, params)
-    obs = np.random.default_rng(0).integers(0, 256, (5, 12, 12, 4), dtype=np.uint8)
-    before, after = (
-        jax.jit(agent.evaluate)(tree, obs, np.zeros(5, np.int32))
-        for agent, tree in ((shifted, params), (direct, found))
-    )
+    frames = jnp.asarray(np.random.default_rng(0).integers(0, 256, (5, 12, 12, 4), dtype=np.uint8))
+    obs = dataclasses.replace(spec.zeros(5), frames=frames)
+    before, after = (jax.jit(agent.evaluate)(tree, obs) for agent, tree in ((shifted, params), (direct, found)))
     np.testing.assert_allclose(before.q_values, after.q_values, rtol=1e-5, atol=1e-6)
 
 

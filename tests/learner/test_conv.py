@@ -56,7 +56,7 @@ def test_forms_agree_to_float32_rounding_forward_and_backward(layer: tuple[int, 
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-6 * np.abs(a).max(), err_msg=name)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(
     size=st.integers(3, 14),
     k=st.integers(1, 6),

@@ -7,12 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from actors.preprocess import ObservationBatch
 from learner.agents.base import AgentSpec, make_agent
-from learner.config import AgentConfig
+from learner.agents.configs.rainbow import RainbowConfig
 from learner.export import export_policy, flatten_params, layout_hash
+from learner.observation import Observation
 
-SPEC = AgentSpec(obs_shape=(12, 12, 4), num_actions=3, num_tasks=2, v_min=-1.0, v_max=1.0)
-CONFIG = AgentConfig(
+SPEC = AgentSpec(obs_shape=(12, 12, 4), num_actions=3, num_tasks=2, v_min=-1.0, v_max=1.0, num_past_actions=2)
+CONFIG = RainbowConfig(
     conv_channels=(4,), conv_kernels=(4,), conv_strides=(2,), hidden_units=8, num_atoms=5, noisy_sigma=2.0
 )
 B = 4
@@ -31,13 +33,18 @@ def test_exported_function_acts_as_the_agent_does(agent_and_params):
     exported = jax.export.deserialize(bytearray(serialized))
     assert exported.platforms == ("cpu",)
     call, act = jax.jit(exported.call), jax.jit(agent.act)
-    task, leaves = np.array([0, 1, 1, 0], np.int32), jax.tree.leaves(params)
+    leaves = jax.tree.leaves(params)
     for i in range(5):
-        obs = np.random.default_rng(i).integers(0, 256, (B, *SPEC.obs_shape), dtype=np.uint8)
+        rng, observed = np.random.default_rng(i), ObservationBatch(B, (12, 12, 1), 4, past_actions=2)
+        for game in range(B):
+            observed.begin(game, game % 2, rng.integers(0, 256, (12, 12, 1), dtype=np.uint8), {})
+            observed.push(game, i % 3, rng.integers(0, 256, (12, 12, 1), dtype=np.uint8), {})
+        obs = observed.arrays
         key = jax.random.key(i)
-        action = call(leaves, obs, task, np.asarray(jax.random.key_data(key)), np.float32(0.25))
+        action, extras = call(leaves, obs, np.asarray(jax.random.key_data(key)), np.float32(0.25))
         assert action.dtype == jnp.int32
-        np.testing.assert_array_equal(action, act(params, key, obs, task, jnp.float32(0.25)))
+        assert extras.shape == (B, 0)
+        np.testing.assert_array_equal(action, act(params, key, Observation(**obs), jnp.float32(0.25))[0])
 
 
 def test_flat_parameters_are_the_leaves_in_tree_order(agent_and_params):

@@ -22,7 +22,8 @@ from jaxtyping import Array
 
 from learner import replay, train_step
 from learner.agents.base import Agent, AgentSpec, make_agent
-from learner.config import AgentConfig, LearnerConfig, ReplayConfig
+from learner.agents.configs.rainbow import RainbowConfig
+from learner.config import LearnerConfig, ReplayConfig, ValueConfig, change_agent
 from learner.replay import ReplaySpec
 from tests.learner.games import (
     Game,
@@ -32,6 +33,7 @@ from tests.learner.games import (
     greedy_returns,
     lottery,
     noisy_rewards,
+    observation,
     observe,
     play,
     rare_door,
@@ -49,7 +51,7 @@ def record_property(record_property: Callable[[str, object], None]) -> Callable[
 
 
 LANES = 4
-OFF = AgentConfig(
+OFF = RainbowConfig(
     double=False,
     dueling=False,
     noisy="off",
@@ -64,7 +66,7 @@ OFF = AgentConfig(
     num_atoms=21,
     epsilon_end=0.05,
 )
-DQN = replace(OFF, name="dqn")
+DQN = change_agent(OFF, "dqn")
 RAINBOW = replace(OFF, double=True, dueling=True, noisy="factorized", distributional=True, n_steps=3)
 LEARNER = LearnerConfig(learning_rate=2e-3, adam_eps=1e-5, target_period_updates=50)
 UNIFORM = ReplayConfig(prioritized=False)
@@ -86,7 +88,7 @@ class Training:
     """One compiled training loop; call it with a seed."""
 
     game: Game
-    config: AgentConfig
+    config: ValueConfig
     num_updates: int
     learner: LearnerConfig = LEARNER
     replay: ReplayConfig = UNIFORM
@@ -121,7 +123,7 @@ class Training:
 
     def epsilon(self, round_: Array) -> Array:
         """Linear from start to end over the first half of the updates; 0 with noise."""
-        if self.config.noisy != "off":
+        if self.config.epsilon(0) == 0.0:
             return jnp.zeros(())
         progress = jnp.clip((round_ - self.warmup) / (0.5 * self.num_updates), 0.0, 1.0)
         return self.config.epsilon_start + progress * (self.config.epsilon_end - self.config.epsilon_start)
@@ -155,7 +157,7 @@ def train(training: Training, key: Array) -> tuple[Any, Array]:
     def round_(carry, i):
         learner, stored, lanes = carry
         key_act, key_lanes = jax.random.split(jax.random.fold_in(key_play, i))
-        action = agent.act(learner.params, key_act, lanes["frame"], jnp.zeros(LANES, int), training.epsilon(i))
+        action, _ = agent.act(learner.params, key_act, observation(agent, lanes["frame"]), training.epsilon(i))
         if training.random_warmup:
             chance = jax.random.randint(jax.random.fold_in(key_act, 1), (LANES,), 0, game.num_actions)
             action = jnp.where(i < training.warmup, chance, action)
@@ -178,7 +180,7 @@ def train(training: Training, key: Array) -> tuple[Any, Array]:
 def q_values(result: Trained, game: Game, **state: int) -> np.ndarray:
     """Q of every action in the given state of a game."""
     frames = observe(game, {name: jnp.asarray(value)[None] for name, value in state.items()})
-    return np.asarray(result.agent.evaluate(result.params, frames, jnp.zeros(1, int)).q_values[0])
+    return np.asarray(result.agent.evaluate(result.params, observation(result.agent, frames)).q_values[0])
 
 
 # --- the optimum is reached ---------------------------------------------------------------------------------------
@@ -246,7 +248,7 @@ def test_double_q_learning_overestimates_less(learning_seed, record_property):
 DELAYED = umbrella(10, num_actions=16)
 
 
-def value_error(seed: int, config: AgentConfig) -> float:
+def value_error(seed: int, config: ValueConfig) -> float:
     """Mean distance of Q from the known value, over all states after the first step and all actions."""
     result = Training(DELAYED, config, 1200)(seed)
     errors = [
@@ -288,7 +290,7 @@ def test_the_distributional_loss_learns_what_a_stochastic_reward_is_worth(learni
     result = lottery_training(distributional=True)(learning_seed)
     ticket, safe = q_values(result, LOTTERY, t=0)
     frames = observe(LOTTERY, {"t": jnp.zeros(1, int)})
-    evaluation = result.agent.evaluate(result.params, frames, jnp.zeros(1, int))
+    evaluation = result.agent.evaluate(result.params, observation(result.agent, frames))
     masses = np.asarray(evaluation.probabilities)[0, 0]
     won, lost = (masses[np.isclose(evaluation.atoms, value, atol=1e-6)].item() for value in (8.0, 0.0))
     for name, value in {"ticket": ticket, "safe": safe, "won": won, "lost": lost}.items():

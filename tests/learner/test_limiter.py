@@ -33,7 +33,7 @@ def lead(limiter: RateLimiter, ratio: float, warmup: int) -> Fraction:
     return state["env_steps"] - warmup - Fraction(str(ratio)) * state["updates"]
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=300, derandomize=True)
 @given(**PARAMETERS, seed=st.integers(0, 2**31))
 def test_some_side_can_always_go(ratio, warmup, tolerance, per_call, seed):
     limiter, rng = RateLimiter(ratio, warmup, tolerance, per_call), np.random.default_rng(seed)
@@ -42,7 +42,7 @@ def test_some_side_can_always_go(ratio, warmup, tolerance, per_call, seed):
         play(limiter, rng, 1, per_call, max_block=10**7)
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=300, derandomize=True)
 @given(**PARAMETERS, seed=st.integers(0, 2**31))
 def test_the_ratio_holds_over_long_random_schedules(ratio, warmup, tolerance, per_call, seed):
     """No update is done before its decisions came; decisions lead by the window, rounded up to a whole one."""
@@ -91,7 +91,7 @@ def test_a_tenth_of_a_decision_for_each_update_is_exactly_that():
         limiter.update(10)
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=100, derandomize=True)
 @given(**PARAMETERS, seed=st.integers(0, 2**31))
 def test_a_restored_limiter_goes_on_as_the_first(ratio, warmup, tolerance, per_call, seed):
     first = RateLimiter(ratio, warmup, tolerance, per_call)

@@ -103,7 +103,7 @@ def test_projection_of_hand_worked_examples():
 
 
 @pytest.mark.isa
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 2**31),
     r=st.floats(-30, 30, width=32),

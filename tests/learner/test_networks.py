@@ -8,21 +8,27 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gvz.core.errors import ConfigError
-from learner.config import AgentConfig
-from learner.networks import NoisyDense, QNetwork, add_noise, check_fits, draw_noise, initial_logits
+from learner.agents.base import AgentSpec
+from learner.agents.configs.rainbow import RainbowConfig
+from learner.agents.rainbow import Rainbow
+from learner.networks import NoisyDense, add_noise, draw_noise, initial_logits
+from learner.observation import Observation
 
-DQN = AgentConfig(name="dqn", double=False, dueling=False, noisy="off", distributional=False)
+FLAT = RainbowConfig(double=False, dueling=False, noisy="off", distributional=False)
 TINY = replace(
-    DQN, conv_channels=(3,), conv_kernels=(4,), conv_strides=(2,), hidden_units=6, num_atoms=5, noisy_sigma=0.5
+    FLAT, conv_channels=(3,), conv_kernels=(4,), conv_strides=(2,), hidden_units=6, num_atoms=5, noisy_sigma=0.5
 )
 OBS = (10, 10, 2)
 
 
-def shapes(config: AgentConfig, obs_shape: tuple[int, ...] = (84, 84, 12), num_tasks: int = 1) -> dict[str, dict]:
-    network = QNetwork(config, num_actions=3, num_tasks=num_tasks, value_range=(-1.0, 1.0))
-    obs, task = jax.ShapeDtypeStruct((1, *obs_shape), jnp.uint8), jax.ShapeDtypeStruct((1,), jnp.int32)
-    params = jax.eval_shape(network.init, jax.random.key(0), obs, task)["params"]
+def spec(obs_shape: tuple[int, int, int], num_tasks: int) -> AgentSpec:
+    return AgentSpec(obs_shape=obs_shape, num_actions=3, num_tasks=num_tasks, v_min=-1.0, v_max=1.0)
+
+
+def shapes(
+    config: RainbowConfig, obs_shape: tuple[int, int, int] = (84, 84, 12), num_tasks: int = 1
+) -> dict[str, dict]:
+    params = jax.eval_shape(Rainbow(config, spec(obs_shape, num_tasks)).init, jax.random.key(0))["params"]
     return {layer: {name: leaf.shape for name, leaf in leaves.items()} for layer, leaves in params.items()}
 
 
@@ -31,20 +37,23 @@ def count(tree: dict[str, dict]) -> int:
 
 
 @cache
-def tiny(config: AgentConfig):
-    """A small network: made-up parameters, apply(params, obs, task, noise=None), observations and tasks."""
+def tiny(config: RainbowConfig):
+    """A small network: made-up parameters, apply(params, obs, noise=None), an observation of two tasks."""
     rng = np.random.default_rng(0)
-    network = QNetwork(config, num_actions=3, num_tasks=2, value_range=(-1.0, 1.0))
-    obs = rng.integers(0, 256, (4, *OBS), dtype=np.uint8)
-    task = np.array([0, 1, 0, 1])
-    shapes = jax.eval_shape(network.init, jax.random.key(0), obs, task)
+    agent = Rainbow(config, spec(OBS, 2))
+    frames = jnp.asarray(rng.integers(0, 256, (4, *OBS), dtype=np.uint8))
+    shapes = jax.eval_shape(agent.init, jax.random.key(0))
     params = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(0, 0.3, leaf.shape), leaf.dtype), shapes)
-    return params, jax.jit(network.apply), obs, task
+    return params, jax.jit(agent.outputs), replace(agent.spec.zeros(4), frames=frames, task=jnp.array([0, 1, 0, 1]))
+
+
+def of_task(obs: Observation, task: int) -> Observation:
+    return replace(obs, task=jnp.full(4, task))
 
 
 def test_dqn_has_the_thesis_layers():
     # 4.1.5: three convolutions with a falling kernel size, flattened to 7 * 7 * 64, one hidden layer, one output each.
-    assert shapes(DQN) == {
+    assert shapes(FLAT) == {
         "conv_0": {"kernel": (8, 8, 12, 32), "bias": (32,)},
         "conv_1": {"kernel": (4, 4, 32, 64), "bias": (64,)},
         "conv_2": {"kernel": (3, 3, 64, 64), "bias": (64,)},
@@ -56,16 +65,16 @@ def test_dqn_has_the_thesis_layers():
 @pytest.mark.parametrize(
     ("config", "wanted"),
     [
-        (DQN, 94_368 + 1_606_144 + 1_539),
-        (replace(DQN, hidden_units=4096), 94_368 + 12_849_152 + 12_291),
-        (replace(DQN, dueling=True), 94_368 + 2 * 1_606_144 + 1_539 + 513),
-        (replace(DQN, noisy="factorized"), 94_368 + 2 * (1_606_144 + 1_539)),
-        (replace(DQN, distributional=True), 94_368 + 1_606_144 + 51 * 1_539),
-        (AgentConfig(), 94_368 + 2 * (2 * 1_606_144 + 51 * (1_539 + 513))),
+        (FLAT, 94_368 + 1_606_144 + 1_539),
+        (replace(FLAT, hidden_units=4096), 94_368 + 12_849_152 + 12_291),
+        (replace(FLAT, dueling=True), 94_368 + 2 * 1_606_144 + 1_539 + 513),
+        (replace(FLAT, noisy="factorized"), 94_368 + 2 * (1_606_144 + 1_539)),
+        (replace(FLAT, distributional=True), 94_368 + 1_606_144 + 51 * 1_539),
+        (RainbowConfig(), 94_368 + 2 * (2 * 1_606_144 + 51 * (1_539 + 513))),
     ],
     ids=["dqn", "hidden 4096", "dueling", "noisy", "distributional", "rainbow"],
 )
-def test_parameter_counts_are_the_sums_worked_by_hand(config: AgentConfig, wanted: int):
+def test_parameter_counts_are_the_sums_worked_by_hand(config: RainbowConfig, wanted: int):
     # Convolutions have 24,608 + 32,832 + 36,928 = 94,368, the hidden layer 3136 * 512 + 512 = 1,606,144 parameters.
     assert count(shapes(config)) == wanted
 
@@ -73,23 +82,22 @@ def test_parameter_counts_are_the_sums_worked_by_hand(config: AgentConfig, wante
 def test_task_conditioning_appends_a_one_hot_of_the_task():
     config = replace(TINY, task_conditioned=True)
     assert shapes(config, OBS, num_tasks=2)["q_hidden"]["kernel"] == (6, 4 * 4 * 3 + 2)
-    params, apply, obs, _ = tiny(config)
-    plain = [apply(params, obs, jnp.full(4, z)) for z in (0, 1)]
+    params, apply, obs = tiny(config)
+    plain = [apply(params, of_task(obs, z)) for z in (0, 1)]
     assert float(jnp.abs(plain[0] - plain[1]).max()) > 1e-4
     # Without the rows that the one-hot selects, the task makes no difference.
     hidden = params["params"]["q_hidden"]
     deaf = params["params"] | {"q_hidden": hidden | {"kernel": hidden["kernel"].at[:, -2:].set(0.0)}}
-    np.testing.assert_array_equal(*[apply({"params": deaf}, obs, jnp.full(4, z)) for z in (0, 1)])
+    np.testing.assert_array_equal(*[apply({"params": deaf}, of_task(obs, z)) for z in (0, 1)])
 
 
 def test_without_task_conditioning_the_task_is_ignored():
-    params, apply, obs, _ = tiny(TINY)
-    np.testing.assert_array_equal(apply(params, obs, jnp.zeros(4, int)), apply(params, obs, jnp.ones(4, int)))
+    params, apply, obs = tiny(TINY)
+    np.testing.assert_array_equal(apply(params, of_task(obs, 0)), apply(params, of_task(obs, 1)))
 
 
 def test_weights_start_he_uniform_and_biases_zero_below_the_output():
-    obs = jnp.zeros((1, 84, 84, 12), jnp.uint8)
-    params = jax.jit(QNetwork(DQN, 3, 1).init)(jax.random.key(0), obs, jnp.zeros(1, int))
+    params = jax.jit(Rainbow(FLAT, spec((84, 84, 12), 1)).init)(jax.random.key(0))
     for name, fan_in in (("conv_0", 768), ("conv_1", 512), ("conv_2", 576), ("q_hidden", 3136)):
         kernel, bound = np.asarray(params["params"][name]["kernel"]), np.sqrt(6 / fan_in)
         assert np.abs(kernel).max() <= bound
@@ -116,36 +124,30 @@ def test_two_atoms_share_the_mass_by_the_mean():
     assert high / (low + high) == pytest.approx(0.25)
 
 
-def test_a_distributional_network_without_a_range_is_refused():
-    network, obs = QNetwork(replace(TINY, distributional=True), 3, 1), jnp.zeros((1, *OBS), jnp.uint8)
-    with pytest.raises(ValueError, match=r"QNetwork\.value_range: got None, want \(v_min, v_max\)"):
-        jax.eval_shape(network.init, jax.random.key(0), obs, jnp.zeros(1, int))
-
-
 def test_dueling_takes_off_the_mean_advantage():
     config = replace(TINY, dueling=True, distributional=True)
-    params, apply, obs, task = tiny(config)
-    logits = apply(params, obs, task)
+    params, apply, obs = tiny(config)
+    logits = apply(params, obs)
     assert logits.shape == (4, 3, 5)
     # The mean over actions of V + A - mean A is V: no advantage can change it, and no value a difference of actions.
     p = params["params"]
     louder = p | {"advantage_output": jax.tree.map(lambda w: 3 * w, p["advantage_output"])}
-    changed = apply({"params": louder}, obs, task)
+    changed = apply({"params": louder}, obs)
     assert float(jnp.abs(changed - logits).max()) > 0.01
     np.testing.assert_allclose(changed.mean(1), logits.mean(1), rtol=1e-4, atol=1e-5)
     higher = p | {"value_output": p["value_output"] | {"bias": p["value_output"]["bias"] + 2}}
-    np.testing.assert_allclose(apply({"params": higher}, obs, task), logits + 2, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(apply({"params": higher}, obs), logits + 2, rtol=1e-5, atol=1e-5)
 
 
 def test_pixels_are_scaled_to_one():
-    params, apply, _, task = tiny(TINY)
+    params, apply, obs = tiny(TINY)
     p = jax.tree.map(np.asarray, params["params"])
     # A white image is all ones, and its convolution the kernel's sum at each of 4 x 4 positions.
     features = np.tile(np.maximum(p["conv_0"]["kernel"].sum(axis=(0, 1, 2)) + p["conv_0"]["bias"], 0), 16)
     hidden = np.maximum(p["q_hidden"]["kernel"] @ features + p["q_hidden"]["bias"], 0)
     q = p["q_output"]["kernel"] @ hidden + p["q_output"]["bias"]
-    white = jnp.full((4, *OBS), 255, jnp.uint8)
-    np.testing.assert_allclose(apply(params, white, task)[0, :, 0], q, rtol=1e-4, atol=1e-5)
+    white = replace(obs, frames=jnp.full((4, *OBS), 255, jnp.uint8))
+    np.testing.assert_allclose(apply(params, white)[0, :, 0], q, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("noisy", ["factorized", "independent"])
@@ -174,7 +176,7 @@ def test_noise_moves_weights_by_sigma_times_epsilon(noisy):
 
 
 def test_noise_per_row_is_eq_4_14_row_by_row():
-    layer = NoisyDense(7, noisy=True, sigma=0.3)
+    layer = NoisyDense(7, sigma=0.3)
     x = np.random.default_rng(0).normal(size=(3, 5)).astype(np.float32)
     variables = jax.jit(layer.init)(jax.random.key(1), x)
     noise = np.random.default_rng(1).normal(size=(3, 5 + 7)).astype(np.float32)
@@ -187,40 +189,33 @@ def test_noise_per_row_is_eq_4_14_row_by_row():
 
 
 def test_a_row_of_noise_is_the_noise_that_moves_the_parameters():
-    params, apply, obs, task = tiny(replace(TINY, noisy="factorized", dueling=True))
+    params, apply, obs = tiny(replace(TINY, noisy="factorized", dueling=True))
     key = jax.random.key(0)
     noise = {
         name: jnp.repeat(e, 4, axis=0) for name, e in jax.jit(draw_noise, static_argnums=2)(params, key, 1).items()
     }
     moved = jax.jit(add_noise, static_argnums=2)(params, key, "factorized")
-    np.testing.assert_allclose(apply(params, obs, task, noise), apply(moved, obs, task), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(apply(params, obs, noise), apply(moved, obs), rtol=1e-4, atol=1e-5)
 
 
 def test_noise_is_different_for_every_key_and_row_and_nothing_without_sigma():
-    params, apply, obs, task = tiny(replace(TINY, noisy="factorized", dueling=True))
+    params, apply, obs = tiny(replace(TINY, noisy="factorized", dueling=True))
     draw = jax.jit(draw_noise, static_argnums=2)
     one, other = draw(params, jax.random.key(0), 4), draw(params, jax.random.key(1), 4)
     assert set(one) == {"value_hidden", "value_output", "advantage_hidden", "advantage_output"}
     drawn = np.concatenate([np.concatenate([np.asarray(e).ravel() for e in noise.values()]) for noise in (one, other)])
     assert len(np.unique(drawn)) == len(drawn)
     quiet = jax.tree_util.tree_map_with_path(lambda path, w: w * ("sigma" not in jax.tree_util.keystr(path)), params)
-    np.testing.assert_allclose(apply(quiet, obs, task, one), apply(params, obs, task), atol=1e-6)
-    assert float(np.abs(np.asarray(apply(params, obs, task, one)) - apply(params, obs, task, other)).max()) > 1e-3
+    np.testing.assert_allclose(apply(quiet, obs, one), apply(params, obs), atol=1e-6)
+    assert float(np.abs(np.asarray(apply(params, obs, one)) - apply(params, obs, other)).max()) > 1e-3
 
 
 def test_bfloat16_activations_keep_float32_parameters_and_outputs():
     config = replace(TINY, dueling=True, noisy="factorized", distributional=True)
-    params, apply, obs, task = tiny(config)
-    half_params, half_apply, _, _ = tiny(replace(config, activation_dtype="bfloat16"))
+    params, apply, obs = tiny(config)
+    half_params, half_apply, _ = tiny(replace(config, activation_dtype="bfloat16"))
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(half_params))
-    logits = half_apply(params, obs, task)
+    logits = half_apply(params, obs)
     assert logits.dtype == jnp.float32
-    np.testing.assert_allclose(logits, apply(params, obs, task), atol=0.05)
-    assert float(jnp.abs(logits - apply(params, obs, task)).max()) > 0
-
-
-def test_frames_too_small_for_the_convolutions_are_refused():
-    check_fits(DQN, 84, 84)
-    check_fits(DQN, 36, 36)
-    with pytest.raises(ConfigError, match=r"conv_kernels\[2\]: got 3, want at most 2, .* 2x3 image"):
-        check_fits(DQN, 35, 36)
+    np.testing.assert_allclose(logits, apply(params, obs), atol=0.05)
+    assert float(jnp.abs(logits - apply(params, obs)).max()) > 0

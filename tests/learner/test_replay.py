@@ -12,11 +12,12 @@ from scipy import stats
 
 from gvz.core.errors import ConfigError
 from gvz.transport.messages import StepBlock
-from learner import replay, sum_tree
+from learner import replay, store, sum_tree
 from learner.ingest import Ingest
 from learner.limiter import RateLimiter
 from learner.replay import ReplaySpec
-from tests.oracles import Record, ReplayOracle, play, step_block
+from tests.learner.sum_trees import check_valid
+from tests.oracles import Record, ReplayOracle, check_batch, play, step_block
 
 FRAME_SHAPE = (4, 5, 3)
 DEFAULTS = {
@@ -91,8 +92,9 @@ def record(lane: int = 0, *, reward=0.0, first=False, terminated=False, truncate
         ({"n_steps": 1, "stack_size": 1, "num_lanes": 1, "capacity": 17, "prioritized": False}, 2, 4_000),
         ({"n_steps": 7, "stack_size": 3, "num_lanes": 2, "capacity": 61, "num_newest": 5}, 5, 6_000),
         ({"stack_size": 2, "num_lanes": 5, "capacity": 2_000, "discount": 0.5}, 40, 5_000),
+        ({"num_past_actions": 6, "num_variables": 3, "num_extras": 2}, 7, 5_000),
     ],
-    ids=["rainbow", "dqn", "long windows", "long episodes"],
+    ids=["rainbow", "dqn", "long windows", "long episodes", "past actions and variables"],
 )
 def test_every_sample_is_what_the_actor_saw_and_the_oracle_says(changes, mean_steps, num_records):
     """Thousands of random episodes in random blocks: every drawable slot, stack, return and discount."""
@@ -109,25 +111,22 @@ def test_every_sample_is_what_the_actor_saw_and_the_oracle_says(changes, mean_st
         leaves = replayed.leaves()
         if round_ % 10 == 0:
             assert set(np.flatnonzero(leaves)) == oracle.drawable()
-            sum_tree.check_valid(replayed.state.tree)
+            check_valid(replayed.state.tree)
         if not leaves.any():
             continue
         batch, info = replayed.sample(seed=round_)
         assert (leaves[info.slots] > 0).all()
         want = [oracle.transition(slot) for slot in info.slots.tolist()]
-        for name in ("obs_tm1", "a_tm1", "obs_t", "task"):
-            np.testing.assert_array_equal(getattr(batch, name), [getattr(one, name) for one in want])
-        np.testing.assert_array_equal(batch.discount_t, np.float32([one.discount_t for one in want]))
-        np.testing.assert_allclose(batch.r_t, [one.r_t for one in want], rtol=1e-5, atol=1e-6)
+        check_batch(batch, want)
         num_drawn += len(want)
         if 0 < spec.num_newest <= len(oracle.completed):
             assert set(info.slots[-spec.num_newest :].tolist()) == set(oracle.completed[-spec.num_newest :])
         replayed.update(info.slots, rng.normal(size=len(info.slots)))
     assert num_drawn > num_records / 2
-    assert (np.asarray(replayed.state.heads) == [len(s) % spec.lane_capacity for s in oracle.streams]).all()
+    assert (np.asarray(replayed.state.store.heads) == [len(s) % spec.lane_capacity for s in oracle.streams]).all()
     stored = [r.task for s in oracle.streams for r in s[-spec.lane_capacity :]]
     np.testing.assert_array_equal(
-        replay.records_per_task(spec, replayed.state), np.bincount(stored, minlength=spec.num_tasks)
+        store.records_per_task(spec, replayed.state.store), np.bincount(stored, minlength=spec.num_tasks)
     )
 
 
@@ -179,9 +178,9 @@ def test_returns_and_discounts_by_hand():
     np.testing.assert_array_equal(batch.discount_t, [1 / 8, 0, 0, 0] + [1 / 8, 1 / 8, 1 / 4, 1 / 2] * 2)
     np.testing.assert_array_equal(batch.a_tm1, [0, 1, 2, 3] * 3)
     np.testing.assert_array_equal(
-        batch.obs_tm1[:4, 0, 0, ::3], [[0] * 4, [0, 0, 0, 10], [0, 0, 10, 20], [0, 10, 20, 30]]
+        batch.obs_tm1.frames[:4, 0, 0, ::3], [[0] * 4, [0, 0, 0, 10], [0, 0, 10, 20], [0, 10, 20, 30]]
     )
-    np.testing.assert_array_equal(batch.obs_t[:4, 0, 0, ::3], [[0, 10, 20, 30]] + [[10, 20, 30, 40]] * 3)
+    np.testing.assert_array_equal(batch.obs_t.frames[:4, 0, 0, ::3], [[0, 10, 20, 30]] + [[10, 20, 30, 40]] * 3)
     assert set(np.flatnonzero(replayed.leaves())) == set(slots.tolist())
 
 
@@ -322,7 +321,7 @@ def test_insertion_and_updates_are_done_in_place():
     replayed = Replay(make_spec())
 
     def addresses():
-        return {leaf.unsafe_buffer_pointer() for leaf in (replayed.state.frames, replayed.state.tree.nodes)}
+        return {leaf.unsafe_buffer_pointer() for leaf in (replayed.state.store.frames, replayed.state.tree.nodes)}
 
     replayed.add([record(first=True)])
     before = addresses()
@@ -351,13 +350,14 @@ def test_more_frame_bytes_than_int32_can_count():
     """2200 frames of 1 MiB: offsets into them pass 2^31."""
     spec = make_spec(num_lanes=1, capacity=2200, frame_shape=(1024, 1024, 1), stack_size=1, n_steps=1)
     replayed = Replay(spec, block_size=1, batch_size=2)
-    replayed.state = replace(replayed.state, heads=jnp.array([2197], jnp.int32))
+    heads = jnp.array([2197], jnp.int32)
+    replayed.state = replace(replayed.state, store=replace(replayed.state.store, heads=heads))
     frames = [np.full(spec.frame_shape, value, np.uint8) for value in (7, 8, 9)]
     replayed.add([Record(f, f, 0, 0.0, 0, 0, 0, t == 0, False, False) for t, f in enumerate(frames)])
     batch, info = replayed.sample()
     np.testing.assert_array_equal(info.slots, [2197, 2198])
-    np.testing.assert_array_equal(batch.obs_tm1, np.stack(frames[:2]))
-    np.testing.assert_array_equal(batch.obs_t, np.stack(frames[1:]))
+    np.testing.assert_array_equal(batch.obs_tm1.frames, np.stack(frames[:2]))
+    np.testing.assert_array_equal(batch.obs_t.frames, np.stack(frames[1:]))
 
 
 def test_what_does_not_fit_is_refused():
@@ -365,7 +365,7 @@ def test_what_does_not_fit_is_refused():
         make_spec(capacity=20)
     spec = make_spec(capacity=30)
     (block,) = Ingest(make_spec(), 5).arrays([step_block([record(first=True)] * 5)], params_version=0)
-    message = r"replay.add: got a block of 5 records, want at most 4 with 10 slots a game, stacks of 4 and windows of 3"
+    message = r"replay.add: got a block of 5 records, want at most 4 with 10 slots a game, observations of 4 records"
     with pytest.raises(ValueError, match=message):
         replay.add(spec, replay.init(spec), block)
     newest = make_spec(num_newest=8)

@@ -12,14 +12,16 @@ import pytest
 from gvz.core.errors import NonFiniteError
 from learner import losses, replay, sum_tree, train_step
 from learner.agents.base import AgentLoss, AgentSpec, Evaluation, make_agent
-from learner.config import AgentConfig, LearnerConfig, ReplayConfig
+from learner.agents.configs.rainbow import RainbowConfig
+from learner.config import LearnerConfig, ReplayConfig
 from learner.replay import ReplaySpec, ReplayState
+from learner.store import StepArrays
 
 pytestmark = pytest.mark.isa
 
 LANES, TASKS, B = 2, 2, 8
 SPEC = AgentSpec(obs_shape=(8, 8, 2), num_actions=3, num_tasks=TASKS, v_min=-3.0, v_max=3.0)
-RAINBOW = AgentConfig(conv_channels=(3,), conv_kernels=(4,), conv_strides=(2,), hidden_units=6, num_atoms=5)
+RAINBOW = RainbowConfig(conv_channels=(3,), conv_kernels=(4,), conv_strides=(2,), hidden_units=6, num_atoms=5)
 AGENT = make_agent(RAINBOW, SPEC)
 REPLAY = ReplaySpec(
     num_lanes=LANES,
@@ -50,13 +52,17 @@ class OneWeight:
         del key
         return {"w": jnp.ones(())}
 
-    def act(self, params, key, obs, task, epsilon):
-        del params, key, task, epsilon
-        return jnp.zeros(obs.shape[0], jnp.int32)
+    def epsilon(self, env_steps):
+        del env_steps
+        return 0.0
 
-    def evaluate(self, params, obs, task):
-        del task
-        return Evaluation(jnp.zeros(obs.shape[0], jnp.int32), params["w"] * jnp.ones((obs.shape[0], 3)))
+    def act(self, params, key, obs, epsilon):
+        del params, key, epsilon
+        return jnp.zeros(B, jnp.int32), jnp.zeros((B, 0))
+
+    def evaluate(self, params, obs):
+        del obs
+        return Evaluation(jnp.zeros(B, jnp.int32), params["w"] * jnp.ones((B, 3)))
 
     def loss(self, online_params, target_params, key, batch):
         del key
@@ -75,15 +81,19 @@ class LinearQ:
         return {"w": jax.random.normal(key, (3, 3))}
 
     def q_values(self, params, obs):
-        pixels = obs[:, 2, 5].astype(jnp.float32) / 255  # of the two stacked frames
-        return jnp.concatenate([pixels, jnp.ones((len(obs), 1))], axis=1) @ params["w"].T
+        pixels = obs.frames[:, 2, 5].astype(jnp.float32) / 255  # of the two stacked frames
+        return jnp.concatenate([pixels, jnp.ones((len(pixels), 1))], axis=1) @ params["w"].T
 
-    def act(self, params, key, obs, task, epsilon):
-        del key, task, epsilon
-        return self.q_values(params, obs).argmax(1).astype(jnp.int32)
+    def epsilon(self, env_steps):
+        del env_steps
+        return 0.0
 
-    def evaluate(self, params, obs, task):
-        del task
+    def act(self, params, key, obs, epsilon):
+        del key, epsilon
+        action = self.q_values(params, obs).argmax(1).astype(jnp.int32)
+        return action, jnp.zeros((len(action), 0))
+
+    def evaluate(self, params, obs):
         q = self.q_values(params, obs)
         return Evaluation(q.argmax(1), q)
 
@@ -100,7 +110,7 @@ def filled_replay() -> dict[str, np.ndarray]:
     """50 records a lane: lane 0 plays task 0, lane 1 plays task 1; episodes of 10."""
     rng, N = np.random.default_rng(0), 100
     t = np.arange(N) // LANES
-    block = replay.StepArrays(
+    block = StepArrays(
         frames=jnp.asarray(rng.integers(0, 256, (N, 8, 8, 1), dtype=np.uint8)),
         action=jnp.asarray(rng.integers(0, 3, N), jnp.int32),
         reward=jnp.asarray(rng.normal(size=N), jnp.float32),
@@ -116,7 +126,11 @@ def filled_replay() -> dict[str, np.ndarray]:
 
 
 def fresh_replay(**changes) -> ReplayState:
-    return jax.tree.map(jnp.array, replace(filled_replay(), **changes))
+    """The filled replay with other fields of its own, or of its store."""
+    filled = filled_replay()
+    own = {name: value for name, value in changes.items() if hasattr(filled, name)}
+    stored = replace(filled.store, **{name: value for name, value in changes.items() if name not in own})
+    return jax.tree.map(jnp.array, replace(filled, store=stored, **own))
 
 
 def fresh_state(agent=AGENT, config: LearnerConfig = LEARNER) -> train_step.LearnerState:
@@ -150,14 +164,15 @@ DRAWN = {3: 1.0, 17: 3.0, LANE_SLOTS + 8: 2.0, LANE_SLOTS + 20: 2.0}
 class Float64Learner:
     """What a learner of `LinearQ` must be after each update, in float64, from the papers' equations alone."""
 
-    def __init__(self, w: np.ndarray, task_weights: np.ndarray):
-        self.w, self.target, self.task_weights = w.astype(np.float64), w.astype(np.float64), task_weights
+    def __init__(self, w: np.ndarray, task_weights: np.ndarray, config: LearnerConfig):
+        self.w, self.target, self.average = (w.astype(np.float64) for _ in range(3))
+        self.task_weights, self.config = task_weights, config
         self.mean, self.square, self.num_updates = np.zeros_like(self.w), np.zeros_like(self.w), 0
         self.max_priority = 1.0
         slots = np.array(list(DRAWN))
         self.slots = np.repeat(slots, [int(share) for share in DRAWN.values()])
         lane, t = self.slots // LANE_SLOTS, self.slots % LANE_SLOTS
-        stored = filled_replay()
+        stored = filled_replay().store
         pixel = stored.frames.reshape(-1, 8, 8)[:, 2, 5] / 255.0
 
         def features(t):
@@ -195,9 +210,14 @@ class Float64Learner:
         k = self.num_updates
         self.mean = 0.9 * self.mean + 0.1 * clipped  # Kingma and Ba 2015, Algorithm 1
         self.square = 0.999 * self.square + 0.001 * clipped**2
-        self.w = self.w - 0.1 * (self.mean / (1 - 0.9**k)) / (np.sqrt(self.square / (1 - 0.999**k)) + 1e-7)
-        if k % 3 == 0:
+        step = (self.mean / (1 - 0.9**k)) / (np.sqrt(self.square / (1 - 0.999**k)) + 1e-7)
+        self.w = self.w - 0.1 * (step + self.config.weight_decay * self.w)  # Loshchilov and Hutter 2019, Algorithm 2
+        if (ema := self.config.target_ema) is not None:
+            self.target = ema * self.target + (1 - ema) * self.w
+        elif k % 3 == 0:
             self.target = self.w.copy()
+        if (ema := self.config.average_ema) is not None:
+            self.average = ema * self.average + (1 - ema) * self.w
         self.leaves = np.zeros(REPLAY.num_slots)
         self.leaves[self.slots] = (np.abs(td) + 0.01) ** 0.6  # eq. 4.11, 4.12
         self.max_priority = max(self.max_priority, self.leaves.max())
@@ -205,11 +225,12 @@ class Float64Learner:
         return {"loss": loss, "mean": mean_loss, "td": td, "q": q_tm1, "norm": norm, "importance": importance}
 
 
-def test_updates_are_those_of_the_equations_in_float64(tmp_path: Path):
+@pytest.mark.parametrize("changes", [{}, {"target_ema": 0.7, "average_ema": 0.9, "weight_decay": 0.2}])
+def test_updates_are_those_of_the_equations_in_float64(tmp_path: Path, changes: dict):
     """Batch, n-step return, importance and task weights, Huber loss, clipping, Adam, target, priorities, metrics."""
-    task_weights, agent, config = np.float32([1.0, 2.5]), LinearQ(), replace(LEARNER, learning_rate=0.1)
+    task_weights, agent, config = np.float32([1.0, 2.5]), LinearQ(), replace(LEARNER, learning_rate=0.1, **changes)
     state, updates = fresh_state(agent, config), 7
-    oracle, seen = Float64Learner(np.asarray(state.params["w"]), task_weights), []
+    oracle, seen = Float64Learner(np.asarray(state.params["w"]), task_weights, config), []
     slots, priorities = np.array(list(DRAWN)), np.float32(list(DRAWN.values()))
     tree = jax.device_get(sum_tree.set(sum_tree.init(REPLAY.num_slots), slots, priorities))
     max_priority = np.float32(1.0)
@@ -220,6 +241,8 @@ def test_updates_are_those_of_the_equations_in_float64(tmp_path: Path):
         seen.append(oracle.update())
         np.testing.assert_allclose(state.params["w"], oracle.w, rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(state.target_params["w"], oracle.target, rtol=1e-4, atol=1e-5)
+        if state.average_params is not None:
+            np.testing.assert_allclose(state.average_params["w"], oracle.average, rtol=1e-4, atol=1e-5)
         leaves = np.asarray(sum_tree.get(stored.tree, np.arange(REPLAY.num_slots)))
         np.testing.assert_allclose(leaves, oracle.leaves, rtol=1e-3, atol=1e-5)
         np.testing.assert_allclose(max_priority, oracle.max_priority, rtol=1e-4)
@@ -248,7 +271,8 @@ def test_updates_are_those_of_the_equations_in_float64(tmp_path: Path):
     assert metrics.keys() == wanted.keys()
     for name, value in wanted.items():
         np.testing.assert_allclose(metrics[name], value, rtol=1e-3, atol=1e-5, err_msg=name)
-    assert not any(np.any(leaf) for leaf in jax.tree.leaves(replace(state.metrics, q_max=jnp.zeros(()))))
+    zero = jnp.zeros(())
+    assert not any(np.any(leaf) for leaf in jax.tree.leaves(replace(state.metrics, q_max=zero, grad_norm_max=zero)))
 
 
 def test_one_call_of_many_updates_equals_many_calls_of_one():
@@ -302,10 +326,10 @@ def test_nothing_compiles_and_nothing_is_transferred_after_the_first_call():
 
 def test_states_are_donated():
     state, stored = fresh_state(), fresh_replay()
-    frames = stored.frames.unsafe_buffer_pointer()
+    frames = stored.store.frames.unsafe_buffer_pointer()
     new_state, new_stored = compiled()(state, stored, ONES)
     assert all(leaf.is_deleted() for leaf in jax.tree.leaves((state, stored)))
-    assert new_stored.frames.unsafe_buffer_pointer() == frames, "frames stay where they are"
+    assert new_stored.store.frames.unsafe_buffer_pointer() == frames, "frames stay where they are"
     assert int(new_state.num_updates) == 1
 
 
@@ -317,7 +341,7 @@ def test_tasks_of_weight_zero_change_nothing():
 
 
 def test_a_non_finite_loss_is_skipped_saved_and_raised(tmp_path: Path):
-    rewards = filled_replay().reward.copy()
+    rewards = filled_replay().store.reward.copy()
     rewards[:40] = np.nan
     state, stored = fresh_state(), fresh_replay(reward=rewards)
     before = raw((state.params, state.opt_state, state.target_params))
@@ -332,11 +356,13 @@ def test_a_non_finite_loss_is_skipped_saved_and_raised(tmp_path: Path):
     with pytest.raises(NonFiniteError, match=r"update 1: \d of 8 losses are NaN or infinite; 3 updates were skipped"):
         train_step.read_metrics(state, NAMES, tmp_path)
     with np.load(file) as saved:
-        assert set(saved) == {"loss", "weights", "obs_tm1", "a_tm1", "r_t", "discount_t", "obs_t", "task"}
+        assert set(saved) == {"loss", "weights", "a_tm1", "r_t", "discount_t"} | {
+            f"{obs}.{name}" for obs in ("obs_tm1", "obs_t") for name in ("frames", "vector", "actions", "task")
+        }
         assert np.isnan(saved["r_t"]).any()
         np.testing.assert_array_equal(np.isnan(saved["r_t"]), np.isnan(saved["loss"]))
-        assert saved["obs_t"].shape == (B, 8, 8, 2)
-        assert saved["obs_t"].any()
+        assert saved["obs_t.frames"].shape == (B, 8, 8, 2)
+        assert saved["obs_t.frames"].any()
 
 
 def test_a_non_finite_gradient_of_a_finite_loss_is_caught_too(tmp_path: Path):

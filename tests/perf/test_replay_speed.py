@@ -9,7 +9,8 @@ import pytest
 
 from learner import replay, sum_tree
 from learner.ingest import BLOCK_SIZE
-from learner.replay import ReplaySpec, ReplayState, StepArrays
+from learner.replay import ReplaySpec, ReplayState
+from learner.store import StepArrays
 
 STEPS_PER_CALL = 100
 

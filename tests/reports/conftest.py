@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import pytest
 
 from gvz.experiments.base import TrainingRun
-from gvz.experiments.inventory import run_directory
+from gvz.experiments.inventory import PROCESSOR_S, run_directory
 from gvz.experiments.plan import Plan, write_plan
-from gvz.run.config import config_to_dict, load_config
+from gvz.run.config_files import config_to_dict
 from gvz.tasks import parse_task
 
 MISSING = "rainbow_4task/defend_the_center/train8/seed_1111"
@@ -58,15 +58,16 @@ def evaluation_row(player: str, task: str, episode: int, percent: float, **more:
 def write_training(results: Path, run: TrainingRun, *, until: int | None = None) -> Path:
     """Config and records of training, up to a gradient step."""
     directory = run_directory(results, run)
-    config = load_config(run.config)
+    config = run.run_config
     learner = dataclasses.replace(config.learner, total_updates=run.total_updates)
-    config = dataclasses.replace(config, learner=learner, seed=run.seed, tasks=run.tasks)
+    config = dataclasses.replace(config, learner=learner, seed=run.seed, tasks=run.tasks, name=run.agent)
+    config = dataclasses.replace(config, max_processor_s=run.max_processor_s)
     end = run.total_updates if until is None else until
     steps = [end * n // 20 for n in range(1, 21)]
     rates = {"learner/updates_per_s": 50.0, "actors/decisions_per_s": 200.0, "actors/frames_per_s": 800.0}
     write_rows(
         directory / "metrics.jsonl",
-        [{"num_updates": s, "time_s": s / 50, "actors/env_steps": 4 * s, **rates} for s in steps],
+        [{"num_updates": s, "time_s": s / 50, "actors/env_steps": 4 * s, PROCESSOR_S: s / 50, **rates} for s in steps],
     )
     write_rows(
         directory / "episodes.jsonl",
@@ -96,14 +97,14 @@ def write_training(results: Path, run: TrainingRun, *, until: int | None = None)
 
 
 def write_evaluation(results: Path, run: TrainingRun, tasks: tuple[str, ...], episodes: int, score: Score) -> None:
-    name = f"{run.config}/seed_{run.seed}"
+    name = f"{run.agent}/seed_{run.seed}"
     rows = [
         evaluation_row(
             f"{name}@{updates}",
             task,
             n,
             score(Played(run, task, updates, n)),
-            run=run.config,
+            run=run.agent,
             run_seed=run.seed,
             num_updates=updates,
             params="0",

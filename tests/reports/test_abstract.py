@@ -33,4 +33,4 @@ def test_what_cannot_be_told_apart_is_said(tmp_path):
         rows = [{"player": player, "task": task, "episode": n, "seed": n, "score": float(n)} for n in range(9)]
         (tmp_path / f"{player}.jsonl").write_text("".join(json.dumps({"schema": 1, **row}) + "\n" for row in rows))
     (sentence,) = what_beats_what(read_results([tmp_path]))
-    assert sentence.startswith("Seek and Kill, default: idle and random are not told apart (difference 0.0 [")
+    assert sentence.startswith("Seek and Kill, default: no difference shown between idle and random (0.0 [")

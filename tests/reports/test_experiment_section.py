@@ -6,7 +6,7 @@ import pytest
 
 from gvz.experiments.base import experiment_named
 from gvz.experiments.plan import Plan
-from gvz.reports.experiment_section import aggregate_table, comparison_table, result_table
+from gvz.reports.experiment_section import aggregate_table, comparison_table, experiment_section, result_table
 from gvz.reports.results import PlannedExperiment, read_results
 from gvz.tasks import parse_task
 
@@ -70,6 +70,30 @@ def test_published_numbers_stand_below_ours_and_in_no_mean_of_ours(tmp_path, exp
     assert {cell.kind for row in rows for cell in row[2:] if row[1].text == "thesis"} == {"theirs"}
     assert [cell.estimate.value for cell in rows[4][2:] if cell.estimate] == [1.0, 4.0, 8.0]
     assert [cell.text for cell in rows[5][2:]] == ["27.63", "34.50", "28.41"]  # (27.92 + 27.34) / 2, ...
+
+
+def test_a_gate_has_a_table_over_its_gate_tasks_and_one_over_the_tasks_of_training(tmp_path, experiments_writer):
+    def score(played) -> float:
+        decisions = float(played.run.agent.rpartition("_")[2])
+        return decisions + (50.0 if played.task in played.run.tasks else 0.0) + SEEDS[played.run.seed]
+
+    experiments_writer(tmp_path, Plan(names=("gate_reuse",), scale=0.2), score)
+    results = read_results([tmp_path])
+    (asked,) = results.asked
+    gate, training = result_table(results, asked), result_table(results, asked, trained=True)
+    names = tuple(f"rainbow_quick+decisions_{n}" for n in (4, 8, 16, 32))
+    assert gate.columns == training.columns == ("scenario", "numbers", *names)
+    assert [[cell.estimate.value for cell in row[2:] if cell.estimate] for row in gate.rows] == [
+        [5.5, 9.5, 17.5, 33.5]  # mean of seeds 0 and 3
+    ] * 3
+    assert [cell.estimate.value for cell in training.rows[0][2:] if cell.estimate] == [55.5, 59.5, 67.5, 83.5]
+    assert "on the gate tasks" in gate.caption
+    assert "on the tasks of training" in training.caption
+    section = experiment_section(results, asked, tmp_path)
+    assert "120 seconds of processor time, at most 12,000 gradient steps" in section.blocks[0].text[1]
+    assert section.blocks[1].text == ("Runs that end by their processor time are evaluated once: there are no curves.",)
+    assert all(run.ended for run in results.runs), "the records have 240 seconds"
+    assert {run.processor_s for run in results.runs} == {240.0}
 
 
 def test_a_level_is_the_mean_of_its_tasks_each_trained_alone(tmp_path, experiments_writer):

@@ -11,15 +11,11 @@ import pytest
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError
 from gvz.launch import main, parse
-from gvz.run.config import (
-    RunConfig,
-    config_from_dict,
-    config_to_dict,
-    configs_directory,
-    differences,
-    find_config_file,
-    load_config,
-)
+from gvz.run.config import RunConfig
+from gvz.run.config_files import config_from_dict, config_to_dict, configs_directory, find_config_file, load_config
+from gvz.run.resume import differences
+from learner.agents.configs.ppo import PPOConfig
+from learner.config import LearnerConfig, OnPolicyConfig, ReplayConfig
 
 ALL_CONFIGS = sorted(p.stem for p in configs_directory().glob("*.py") if p.stem != "__init__")
 
@@ -33,7 +29,7 @@ def test_every_config_loads_and_survives_json(name):
 
 
 def test_the_main_config_plays_the_four_tasks():
-    assert [t.id for t in load_config("rainbow_4task.py").resolved_tasks()] == [
+    assert list(load_config("rainbow_4task.py").table.ids) == [
         "defend_the_center/default",
         "defend_the_center/gore",
         "defend_the_center/stone_wall",
@@ -89,9 +85,7 @@ def test_flags_override_every_field():
     assert (str(run.run_dir), run.seed, run.mode, run.scenario) == ("out", 2222, "sync", "seek_and_kill")
     assert (run.learner.total_updates, run.learner.batch_size, run.replay.capacity) == (7, 16, 1000)
     assert (run.agent.noisy, run.learner.max_grad_norm, run.checkpoint.period_updates) == ("off", 10.0, 5)
-    assert [t.id for t in run.resolved_tasks()] == [
-        f"seek_and_kill/{a}" for a in ("default", "red", "obstacles", "mixed_enemies")
-    ]
+    assert list(run.table.ids) == [f"seek_and_kill/{a}" for a in ("default", "red", "obstacles", "mixed_enemies")]
 
 
 def test_reward_weights_are_one_field_in_every_form():
@@ -113,7 +107,7 @@ def test_the_fewest_warmup_decisions_are_n_steps_a_game():
 
 def test_tasks_may_be_named():
     run = parse(["--tasks", "defend_the_center/gore", "defend_the_center/gore+mossy_bricks"]).run
-    assert [t.id for t in run.resolved_tasks()] == ["defend_the_center/gore", "defend_the_center/gore+mossy_bricks"]
+    assert list(run.table.ids) == ["defend_the_center/gore", "defend_the_center/gore+mossy_bricks"]
 
 
 BAD = {
@@ -187,7 +181,7 @@ def test_help_lists_flags_units_and_defaults():
 def test_a_saved_configuration_with_an_unknown_key_is_refused():
     saved = config_to_dict(load_config("rainbow_4task"))
     saved["config"]["learner"]["batchsize"] = 3
-    with pytest.raises(ConfigError, match=r"config.learner.batchsize: unknown key, did you mean batch_size\?"):
+    with pytest.raises(ConfigError, match=r"config.learner.batchsize: unknown key \(did you mean 'batch_size'\?\)"):
         config_from_dict(saved)
 
 
@@ -245,8 +239,23 @@ def test_a_name_that_no_file_can_have_is_refused():
 
 
 def test_another_schema_is_refused():
-    with pytest.raises(ConfigError, match="schema 1"):
-        config_from_dict({"schema": 2})
+    with pytest.raises(ConfigError, match="want a map with schema 2"):
+        config_from_dict({"schema": 3})
+
+
+def test_a_configuration_of_the_schema_before_keeps_what_its_agent_has():
+    for name in ("rainbow_4task", "dqn_4task"):
+        config = load_config(name)
+        saved = config_to_dict(config)
+        saved["config"]["agent"] = {
+            **config_to_dict(RunConfig(name="x"))["config"]["agent"],
+            **saved["config"]["agent"],
+        }
+        for field in ("past_actions", "game_variables", "encoder"):
+            del saved["config"]["agent"][field]
+        support = saved["resolved"].pop("support")
+        old = {**saved, "schema": 1, "resolved": {**saved["resolved"], "value_range": support}}
+        assert differences(config_from_dict(old), config) == []
 
 
 def test_sync_mode_plays_the_same_games_in_one_place():
@@ -259,5 +268,57 @@ def test_derived_numbers_are_saved_explicitly():
     config = RunConfig(name="x")
     saved = config_from_dict(config_to_dict(config))
     assert saved.actors.num_actors == config.num_actors
-    assert (saved.agent.v_min, saved.agent.v_max) == config.value_range()
+    assert (saved.agent.v_min, saved.agent.v_max) == config.support
     assert dataclasses.replace(saved, actors=config.actors, agent=config.agent) == config
+
+
+def test_an_agent_that_learns_on_policy_brings_its_kind_of_learner():
+    run = parse("--agent.name ppo --learner.rollout-steps 64 --agent.clip 0.1 --learner.total-updates 7".split()).run
+    assert (run.learner, run.replay) == (OnPolicyConfig(rollout_steps=64, total_updates=7), None)
+    assert run.agent == PPOConfig(clip=0.1)
+    back = parse("--config pqn_quick --agent.name dqn".split()).run
+    assert (back.learner, back.replay) == (LearnerConfig(total_updates=5_000), ReplayConfig())
+
+
+def test_help_shows_the_options_of_the_runs_learner_alone(capsys):
+    for config, theirs, others in (
+        ("ppo_quick", "--learner.rollout-steps", "--replay.capacity"),
+        ("rainbow_quick", "--replay.capacity", "--learner.rollout-steps"),
+    ):
+        with pytest.raises(SystemExit):
+            parse(["--config", config, "--help"])
+        text = capsys.readouterr().out
+        assert theirs in text
+        assert others not in text
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"agent": PPOConfig()}, "got LearnerConfig and a replay for agent.name 'ppo', which learns on-policy"),
+        ({"agent": PPOConfig(), "replay": None}, "got LearnerConfig and no replay for agent.name 'ppo'"),
+        (
+            {"learner": OnPolicyConfig()},
+            "got OnPolicyConfig and a replay for agent.name 'rainbow', which learns from a",
+        ),
+        ({"replay": None}, "got LearnerConfig and no replay for agent.name 'rainbow'"),
+        (
+            {
+                "agent": PPOConfig(),
+                "replay": None,
+                "learner": OnPolicyConfig(rollout_steps=5, num_minibatches=3),
+                "mode": "sync",
+            },
+            "learner.num_minibatches: got 3, want a divisor of the 20 steps of a rollout, which are "
+            "learner.rollout_steps 5 for each of 4 games",
+        ),
+    ],
+)
+def test_an_agent_with_another_agents_learner_is_refused(fields, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        RunConfig(name="x", **fields)
+
+
+def test_decisions_for_a_gradient_step_follow_from_the_learner():
+    assert load_config("rainbow_4task").env_steps_per_update == 4.0
+    assert load_config("ppo_quick").env_steps_per_update == 8 * 32 / (3 * 4)

@@ -3,12 +3,15 @@
 import json
 import os
 import subprocess
+import sys
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
 from gvz.run import machine
+
+PIPES = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
 
 
 def git(directory: Path, *arguments: str) -> str:
@@ -53,6 +56,22 @@ def test_all_of_it_is_json_and_of_this_machine():
 )
 def test_the_instruction_set_is_the_largest_that_xla_knows_and_its_cap_is_told(cpuinfo, xla_flags, wanted):
     assert machine.instruction_set(cpuinfo, xla_flags) == wanted
+
+
+def test_processor_time_is_that_of_this_process_of_living_children_and_of_those_waited_for():
+    before_s = machine.processor_s()
+    burn = "import time\nwhile time.process_time() < 0.5: pass"
+    subprocess.run([sys.executable, "-c", burn], check=True)
+    ended_s = machine.processor_s()
+    assert ended_s >= before_s + 0.45
+    living = subprocess.Popen([sys.executable, "-c", f"{burn}\nprint(flush=True)\ninput()"], **PIPES)
+    try:
+        assert living.stdout is not None
+        living.stdout.readline()
+        assert machine.processor_s() >= ended_s + 0.45
+    finally:
+        living.communicate("\n")
+    assert machine.processor_s() >= ended_s + 0.45
 
 
 def test_packages_that_are_not_installed_have_no_version():

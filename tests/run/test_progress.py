@@ -1,26 +1,28 @@
 """What a person sees: every number on the panel and in the plain line, on a terminal and off it."""
 
 import io
+import time
 
 import pytest
 from rich.console import Console
 
-from gvz.run.progress import Progress, Status, TaskStatus, format_duration, plain_line
+from gvz.run.progress import PLAIN_PERIOD_S, Progress, Status, TaskStatus, format_duration, plain_line
 
 STATUS = Status(
     phase="training",
     num_updates=5_000,
     total_updates=20_000,
-    env_steps=30_000,
-    updates_per_s=50.0,
-    steps_per_s=800.0,
-    frames_per_s=3_200.0,
-    replay_fill=0.5,
-    learner_wait=0.25,
-    actor_wait=0.1,
+    row={
+        "learner/updates_per_s": 50.0,
+        "actors/decisions_per_s": 800.0,
+        "actors/frames_per_s": 3_200.0,
+        "replay/fill_share": 0.5,
+        "learner/wait_share": 0.25,
+        "actors/wait_share": 0.1,
+        "actors/restarts": 2,
+    },
     staleness_updates=12.0,
     loss=1.5,
-    restarts=2,
     tasks=(
         TaskStatus(task="defend_the_center/gore", episodes=7, score=550.0, upper_bound=1100.0),
         TaskStatus(task="defend_the_center/default", episodes=0, score=float("nan"), upper_bound=1100.0),
@@ -36,13 +38,15 @@ def test_the_plain_line_has_every_number():
     assert "nan" not in line
 
 
-def test_off_a_terminal_lines_are_printed_rarely():
+def test_off_a_terminal_lines_are_printed_rarely(monkeypatch):
     out = io.StringIO()
     with Progress(Console(file=out, width=300)) as progress:
         progress.show(STATUS)
         progress.show(STATUS)
         progress.say("checkpoint written")
-        progress.show(STATUS, force=True)
+        now_s = time.monotonic()
+        monkeypatch.setattr(time, "monotonic", lambda: now_s + PLAIN_PERIOD_S)
+        progress.show(STATUS)
     lines = out.getvalue().splitlines()
     assert len(lines) == 3
     assert lines[1] == "checkpoint written"

@@ -7,10 +7,10 @@ import stat
 
 import pytest
 
+from gvz.core import records
 from gvz.core.errors import ConfigError, GvzError, ResumeError
-from gvz.run import rundir
-from gvz.run.config import load_config
-from gvz.run.rundir import RunDir, move_aside, read_records
+from gvz.run.config_files import load_config
+from gvz.run.rundir import RunDir, move_aside
 from tests.full_disk import full_disk
 
 CONFIG = load_config("rainbow_4task")
@@ -36,7 +36,7 @@ def test_the_saved_configuration_comes_back(tmp_path):
         run.write_config(CONFIG)
         saved = run.saved_config()
         assert saved is not None
-        assert saved.agent == CONFIG.with_value_range(*CONFIG.value_range()).agent
+        assert saved.agent == CONFIG.with_support(CONFIG.support).agent
         assert saved.num_lanes == CONFIG.num_lanes
         run.check_resumable(CONFIG)
 
@@ -61,20 +61,30 @@ def test_a_change_of_meaning_is_refused_field_by_field(tmp_path):
     assert "log." not in text
 
 
-@pytest.mark.parametrize("value_range", [(-6.9, 14.1), None])
-def test_a_run_that_began_with_other_atoms_goes_on_with_those_alone(tmp_path, value_range):
+@pytest.mark.parametrize("support", [(-6.9, 14.1), None])
+def test_a_run_that_began_with_other_atoms_goes_on_with_those_alone(tmp_path, support):
     """Of another version of this package, or of one that did not note them."""
     with RunDir(tmp_path) as run:
         run.write_config(CONFIG)
         file = tmp_path / "config.json"
         saved = json.loads(file.read_text())
-        saved["resolved"]["value_range"] = value_range
+        saved["resolved"]["support"] = support
         file.write_text(json.dumps(saved))
-        low, _ = CONFIG.value_range()
-        with pytest.raises(ResumeError, match=f"agent.v_min: {value_range and value_range[0]} -> {low}"):
+        low, _ = CONFIG.support
+        with pytest.raises(ResumeError, match=f"agent.v_min: {support and support[0]} -> {low}"):
             run.check_resumable(CONFIG)
-        if value_range is not None:
-            run.check_resumable(CONFIG.with_value_range(*value_range))
+        if support is not None:
+            run.check_resumable(CONFIG.with_support(support))
+
+
+def test_a_run_of_an_earlier_version_cannot_be_resumed(tmp_path):
+    with RunDir(tmp_path) as run:
+        run.write_config(CONFIG)
+        file = tmp_path / "config.json"
+        saved = json.loads(file.read_text())
+        file.write_text(json.dumps({**saved, "schema": 1}))
+        with pytest.raises(ResumeError, match="is a run of an earlier version"):
+            run.check_resumable(CONFIG)
 
 
 def test_total_updates_may_not_shrink(tmp_path):
@@ -100,7 +110,7 @@ def test_records_are_cut_to_what_a_checkpoint_vouches_for(tmp_path):
         run.append("episodes.jsonl", {"episode": 1})
         assert run.truncate_records(lengths) > 0
         assert run.truncate_records(lengths) == 0
-    rows, problems = read_records(tmp_path / "episodes.jsonl")
+    rows, problems = records.read(tmp_path / "episodes.jsonl")
     assert ([row["episode"] for row in rows], problems) == ([0], [])
     assert json.loads((tmp_path / "discarded" / "episodes.jsonl").read_text())["episode"] == 1
 
@@ -108,7 +118,7 @@ def test_records_are_cut_to_what_a_checkpoint_vouches_for(tmp_path):
 def test_everything_readable_of_a_damaged_record_is_read(tmp_path):
     file = tmp_path / "episodes.jsonl"
     file.write_text('{"schema": 1, "a": 1}\nnonsense\n{"schema": 9}\n[1]\n{"schema": 1, "a": 2}\n{"schema": 1, "a')
-    rows, problems = read_records(file)
+    rows, problems = records.read(file)
     assert [row["a"] for row in rows] == [1, 2]
     assert [p.split(": ", 1)[1] for p in problems] == [
         "not JSON (half-written?)",
@@ -122,21 +132,21 @@ def test_a_small_file_that_unpacks_to_a_huge_line_is_not_read_on(tmp_path):
     file = tmp_path / "episodes.jsonl.gz"
     file.write_bytes(gzip.compress(b'{"schema": 1}\n' + b" " * 50_000_000))
     assert file.stat().st_size < 100_000
-    rows, (problem,) = read_records(file)
+    rows, (problem,) = records.read(file)
     assert rows == [{"schema": 1}]
     assert "line 2: not read on; want lines shorter than 1048576 characters, and at most 4194304 of them" in problem
 
 
 def test_more_lines_than_any_run_writes_are_not_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(rundir, "MAX_LINES", 2)
+    monkeypatch.setattr(records, "MAX_LINES", 2)
     (tmp_path / "episodes.jsonl").write_text('{"schema": 1}\n' * 5)
-    rows, problems = read_records(tmp_path / "episodes.jsonl")
+    rows, problems = records.read(tmp_path / "episodes.jsonl")
     assert (len(rows), len(problems)) == (2, 1)
 
 
 def test_a_missing_record_file_is_an_error(tmp_path):
     with pytest.raises(GvzError, match="no such record file"):
-        read_records(tmp_path / "episodes.jsonl")
+        records.read(tmp_path / "episodes.jsonl")
 
 
 def test_fresh_moves_an_old_run_aside(tmp_path):
@@ -173,9 +183,9 @@ def test_rows_wait_for_room_on_a_full_disk_and_none_is_lost_or_torn(tmp_path):
         for row in wanted[90:]:
             run.append("metrics.jsonl", row)
         assert run.record_lengths()["metrics.jsonl"] == (tmp_path / "metrics.jsonl").stat().st_size
-    rows, problems = read_records(tmp_path / "metrics.jsonl")
+    rows, problems = records.read(tmp_path / "metrics.jsonl")
     assert problems == []
-    assert rows == [{"schema": rundir.RECORDS_SCHEMA, **row} for row in wanted]
+    assert rows == [{"schema": records.SCHEMA, **row} for row in wanted]
 
 
 def test_rows_that_wait_are_written_at_the_end_or_said_to_be_lost(tmp_path):
@@ -183,7 +193,7 @@ def test_rows_that_wait_are_written_at_the_end_or_said_to_be_lost(tmp_path):
         with full_disk(0):
             run.append("metrics.jsonl", {})
         assert (tmp_path / "late" / "metrics.jsonl").stat().st_size == 0
-    assert len(read_records(tmp_path / "late" / "metrics.jsonl")[0]) == 1
+    assert len(records.read(tmp_path / "late" / "metrics.jsonl")[0]) == 1
     run = RunDir(tmp_path / "lost")
     with full_disk(0):
         run.append("metrics.jsonl", {})
@@ -196,7 +206,7 @@ def test_rows_that_wait_are_written_at_the_end_or_said_to_be_lost(tmp_path):
 
 
 def test_rows_do_not_wait_without_bound(tmp_path, monkeypatch):
-    monkeypatch.setattr(rundir, "MAX_WAITING_BYTES", 1000)
+    monkeypatch.setattr(records, "MAX_WAITING_BYTES", 1000)
     with RunDir(tmp_path) as run, full_disk(0):
         for _ in range(71):
             run.append("metrics.jsonl", {})

@@ -1,5 +1,6 @@
 """The training loop in this process, on real Doom: what a resumed run goes on with, and the last row of its metrics."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,12 +8,16 @@ import numpy as np
 import pytest
 
 from actors.config import ActorsConfig
+from gvz.core import records
 from gvz.core.env_config import EnvConfig
 from gvz.core.stop import StopRequest
 from gvz.run.config import LogConfig, RunConfig
-from gvz.run.rundir import RunDir, read_records
+from gvz.run.rundir import RunDir
 from gvz.run.train import train
-from learner.config import AgentConfig, LearnerConfig, ReplayConfig
+from learner.agents.configs.dqn import DQNConfig
+from learner.agents.configs.ppo import PPOConfig
+from learner.agents.configs.pqn import PQNConfig
+from learner.config import LearnerConfig, OnPolicyConfig, ReplayConfig
 from tests.e2e.command import arrays_of
 
 pytestmark = pytest.mark.engine
@@ -23,13 +28,7 @@ DQN = RunConfig(
     mode="sync",
     env=EnvConfig(frame_height=24, frame_width=32, render_width=160, render_height=120, grayscale=True, frame_skip=10),
     actors=ActorsConfig(num_actors=1, games_per_actor=2),
-    agent=AgentConfig(
-        name="dqn",
-        double=False,
-        dueling=False,
-        noisy="off",
-        distributional=False,
-        n_steps=1,
+    agent=DQNConfig(
         conv_channels=(4,),
         conv_kernels=(8,),
         conv_strides=(4,),
@@ -49,9 +48,24 @@ def go_on(path: Path, config: RunConfig, total_updates: int) -> None:
         assert train(config, run, StopRequest()) == 0
 
 
+def test_a_run_ends_when_its_processor_time_is_used_up_and_is_then_done_until_it_gets_more(tmp_path):
+    limited = replace(DQN, max_processor_s=0.01)
+    go_on(tmp_path, limited, 40)
+    assert logged_updates(tmp_path) == [20], "it looks at its first row of metrics"
+    (row,) = records.read(tmp_path / "metrics.jsonl")[0]
+    assert row["run/processor_s"] >= 0.01
+    assert [p.name for p in (tmp_path / "policies").iterdir()] == ["20"]
+    go_on(tmp_path, limited, 40)
+    assert logged_updates(tmp_path) == [20], "nothing is left to do"
+    go_on(tmp_path, DQN, 40)
+    assert logged_updates(tmp_path) == [20, 40]
+    last = records.read(tmp_path / "metrics.jsonl")[0][-1]
+    assert last["run/processor_s"] > row["run/processor_s"], "the time of all starts together"
+
+
 def logged_updates(path: Path) -> list[int]:
     """Of every row of metrics, each of which must have rates."""
-    rows, problems = read_records(path / "metrics.jsonl")
+    rows, problems = records.read(path / "metrics.jsonl")
     assert problems == []
     assert all(row["learner/updates_per_s"] > 0 for row in rows)
     return [row["num_updates"] for row in rows]
@@ -65,8 +79,40 @@ def test_a_run_that_explores_by_epsilon_goes_on_bit_for_bit_between_two_publicat
     assert logged_updates(tmp_path / "cut") == [50], "a run that ends before its log period leaves a row"
     go_on(tmp_path / "cut", DQN, 80)
     whole, cut = (arrays_of(tmp_path / name / "checkpoints" / "80") for name in ("whole", "cut"))
-    assert len(np.unique(whole["['replay'].action"])) > 1
+    assert len(np.unique(whole["['replay'].store.action"])) > 1
     assert [name for name in whole if not np.array_equal(whole[name], cut[name])] == []
     assert (tmp_path / "whole" / "episodes.jsonl").read_bytes() == (tmp_path / "cut" / "episodes.jsonl").read_bytes()
     assert logged_updates(tmp_path / "whole") == [20, 40, 60, 80]
     assert logged_updates(tmp_path / "cut") == [50, 60, 80]
+
+
+NETWORK = {"conv_channels": (4,), "conv_kernels": (8,), "conv_strides": (4,), "hidden_units": 16, "past_actions": 2}
+ON_POLICY = OnPolicyConfig(rollout_steps=12, num_epochs=2, num_minibatches=3)
+"""6 gradient steps for each rollout of 24 steps"""
+
+
+@pytest.mark.parametrize("agent", [PPOConfig(**NETWORK), PQNConfig(**NETWORK)], ids=["ppo", "pqn"])
+def test_an_on_policy_run_goes_on_bit_for_bit_between_two_rollouts(tmp_path, agent):
+    """The cut lies in both games' episodes; the windows after it begin with records from before it."""
+    config = replace(DQN, name="on_policy", agent=agent, replay=None, learner=ON_POLICY)
+    go_on(tmp_path / "whole", config, 36)
+    rarely = replace(config, log=replace(config.log, period_updates=1_000))
+    go_on(tmp_path / "cut", rarely, 18)
+    go_on(tmp_path / "cut", config, 36)
+    whole, cut = (arrays_of(tmp_path / name / "checkpoints" / "36") for name in ("whole", "cut"))
+    assert [name for name in whole if not np.array_equal(whole[name], cut[name])] == []
+    assert (tmp_path / "whole" / "episodes.jsonl").read_bytes() == (tmp_path / "cut" / "episodes.jsonl").read_bytes()
+    rows, _ = records.read(tmp_path / "whole" / "metrics.jsonl")
+    assert [row["num_updates"] for row in rows] == [24, 36], "at the end of the rollout in which the log period ends"
+    assert rows[-1]["actors/env_steps"] > 100
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "metrics.md").read_text()
+    everyones, own = (
+        re.findall(rf"^\| `([^`]+/[^`]+)` \| {agents}", page, re.MULTILINE) for agents in ("", f"(?:both|{agent.name})")
+    )
+    for row in rows:
+        written = {re.sub("|".join(DQN.tasks or ()), "<task>", name) for name in row if "/" in name}
+        assert written <= set(everyones)
+        assert set(own) <= written
+        assert row["rollout/age_max_versions"] == 1
+        assert row["rollout/age_mean_versions"] < 0.2, "only a window's first action is of the parameters before"
+        assert row["learner/loss"] == row["learner/loss"]

@@ -10,10 +10,11 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from gvz.core.env_config import EnvConfig, Profile, SimplePlayer
+from gvz.core.env_config import EnvConfig, Profile
 from gvz.core.errors import ConfigError
 from gvz.env import DoomEnv
-from gvz.evaluation.players import SIMPLE_PLAYERS, player_env
+from gvz.evaluation.players import CLASSES
+from gvz.evaluation.simple import player_env
 from gvz.scenarios.base import Scenario
 from gvz.scenarios.rewards import Pace, Reward, living, return_range
 from gvz.tasks import scenario_named, scenarios
@@ -188,7 +189,7 @@ def test_the_page_says_which_ranges_there_are_and_how_wide_an_atom_is():
         wanted[scenario.id] = (low, high, (high - low) / 50)
     assert said == {name: pytest.approx(numbers, abs=0.005) for name, numbers in wanted.items()}
     low, high = scenario_named("seek_and_kill").return_range(EnvConfig(reward_weights=(("moved", 0.0),)), 0.99)
-    assert f"the range is {low:.2f} to {high:.2f}\nand an atom is {(high - low) / 50:.2f} wide" in page
+    assert f"the range is {low:.2f} to {high:.2f} and an atom is {(high - low) / 50:.2f} wide" in " ".join(page.split())
 
 
 def test_an_atom_is_half_a_main_event_at_most_but_in_seek_and_kill_it_is_wider_than_a_kill():
@@ -230,7 +231,7 @@ discounts no return left its range. The ranges of living and death alone are exa
 """
 
 
-def events_of(player: SimplePlayer, env: EnvConfig, scenario: Scenario, seed: int = 1) -> np.ndarray:
+def events_of(player: str, env: EnvConfig, scenario: Scenario, seed: int = 1) -> np.ndarray:
     """f64[decisions, components]: what came of each component's event, in an episode of a real game."""
     config = player_env(
         player, dataclasses.replace(env, reward_weights=tuple((name, 1.0) for name in scenario.rewards))
@@ -238,7 +239,7 @@ def events_of(player: SimplePlayer, env: EnvConfig, scenario: Scenario, seed: in
     rows = []
     with closing(DoomEnv(f"{scenario.id}/{TASKS[scenario.id][player]}", config, recycle_episodes=0)) as game:
         observation, info = game.reset(options={"episode_seed": seed})
-        playing = SIMPLE_PLAYERS[player]()
+        playing = CLASSES[player]()
         playing.begin(game, observation, info, seed)
         over = False
         while not over and len(rows) < PLAYED_STEPS:

@@ -128,7 +128,7 @@ def test_an_epsilon_that_is_no_probability_is_found(writer: BroadcastWriter, rea
         reader.read()
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(count=st.integers(1, 2**64 - 1))
 def test_publications_that_never_were_are_found(count: int):
     writer = BroadcastWriter.create("gvz-test", NUM_PARAMS, LAYOUT)

@@ -82,7 +82,7 @@ def test_an_absurd_length_is_refused():
     channel.close()
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(data=st.binary(max_size=200), cut=st.integers(0, 200))
 def test_any_bytes_give_messages_or_a_named_error(data: bytes, cut: int):
     left, right = socket.socketpair()

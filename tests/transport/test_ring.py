@@ -127,7 +127,7 @@ class RingMachine(RuleBasedStateMachine):
 
 
 TestRingMachine = RingMachine.TestCase
-TestRingMachine.settings = settings(max_examples=40, stateful_step_count=40, deadline=None)
+TestRingMachine.settings = settings(max_examples=40, stateful_step_count=40)
 
 
 def test_blocks_are_copies(reader: RingReader, writer: RingWriter):
@@ -236,7 +236,7 @@ def test_a_lost_repeated_or_torn_record_is_found(reader: RingReader, writer: Rin
         reader.read(5)  # and it stays found
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(published=st.integers(0, 2**64 - 1), consumed=st.integers(0, 2**64 - 1))
 @example(published=2**64 - 1, consumed=2**64 - 1)
 def test_impossible_indices_are_found(published: int, consumed: int):

@@ -136,7 +136,7 @@ def test_attach_wants_the_right_header(segment: Segment, word: int, field: str):
         attach(segment)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(header=st.binary(min_size=32, max_size=32))
 def test_random_headers_are_refused(header: bytes):
     segment = Segment.create("gvz-test", PAYLOAD, layout_hash=LAYOUT)

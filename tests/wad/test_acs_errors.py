@@ -50,7 +50,7 @@ def error_of(source: str, **options) -> AcsError:
         ("script 1 OPEN { Log(x:1); }", 1, 21, "got name 'x', want 's' or 'd' or 'i' or 'c' or 'f'"),
         ("script 1 OPEN { case 1: ; }", 1, 17, "got name 'case', want a statement"),
         # names
-        ("script 1 OPEN { Dely(1); }", 1, 17, "undeclared name 'dely', want a declared one; did you mean 'delay'?"),
+        ("script 1 OPEN { Dely(1); }", 1, 17, "undeclared name 'dely' (did you mean 'delay'?), want a declared one"),
         ("script 1 OPEN { zzqq = 1; }", 1, 17, "got the undeclared name 'zzqq', want a declared one"),
         ("int x; int X;", 1, 12, "got 'x' again, want a name that is not yet in use"),
         ("int x; script 1 OPEN { int x; }", 1, 28, "got 'x' again"),

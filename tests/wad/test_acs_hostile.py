@@ -38,19 +38,19 @@ def compile_or_refuse(source: str) -> bool:
     return False
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.text(max_size=200))
 def test_any_text_compiles_or_is_refused(source: str):
     compile_or_refuse(source)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.lists(st.sampled_from(WORDS), max_size=60))
 def test_any_words_compile_or_are_refused(words: list[str]):
     compile_or_refuse(" ".join(words))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.lists(st.sampled_from(WORDS), max_size=40))
 def test_any_statements_compile_or_are_refused(words: list[str]):
     compile_or_refuse("global int 0:reward; int newid; script 1 OPEN { int i; " + " ".join(words) + " }")

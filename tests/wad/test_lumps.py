@@ -108,12 +108,12 @@ def test_a_map_within_a_map_is_part_of_it():
 
 
 def test_a_map_wad_has_its_lumps_in_the_fixed_order():
-    data = write_map_wad(textmap="t", behavior=b"b", scripts="s\u00e9", decorate="d", mapinfo="m")
+    data = write_map_wad(textmap="t", behavior=b"b", scripts="s\u00e9", decorate="d")
     assert read_wad(data) == [
-        Lump("DECORATE", b"d"), Lump("MAPINFO", b"m"), Lump("MAP01", b""), Lump("TEXTMAP", b"t"),
+        Lump("DECORATE", b"d"), Lump("MAP01", b""), Lump("TEXTMAP", b"t"),
         Lump("BEHAVIOR", b"b"), Lump("SCRIPTS", b"s\xe9"), Lump("ENDMAP", b""),
     ]  # fmt: skip
-    assert data == write_map_wad(textmap="t", behavior=b"b", scripts="s\u00e9", decorate="d", mapinfo="m")
+    assert data == write_map_wad(textmap="t", behavior=b"b", scripts="s\u00e9", decorate="d")
 
 
 def test_a_map_wad_has_no_lumps_for_empty_texts():

@@ -75,7 +75,7 @@ def test_an_unknown_texture_is_refused_with_its_place_and_the_nearest_name():
     with pytest.raises(WadError) as caught:
         check_textures(walls_and_floor("BRICK12", "LAVAA1"), stock_textures())
     assert str(caught.value) == (
-        "sector 0 texturefloor: got the unknown texture 'LAVAA1', want a wall texture or flat; did you mean 'LAVA1'?"
+        "sector 0 texturefloor: got the unknown texture 'LAVAA1' (did you mean 'LAVA1'?), want a wall texture or flat"
     )
 
 

@@ -1,7 +1,8 @@
-"""ACS source text to BEHAVIOR bytecode, byte for byte the hybrid object file that ACC writes.
+"""Compiles ACS source text to BEHAVIOR bytecode, byte for byte the hybrid object file that ACC writes.
 
-lexer -> parser (syntax trees) -> codegen (checks, instructions) -> behavior (object file). `compile_acs` is the
-whole public interface.
+lexer -> parser (syntax trees) -> codegen (checks, instructions) -> behavior (object file). `compile_acs` is the only
+public name. Where a function of these modules finds something else than its docstring says, it raises an AcsError with
+the place in the source.
 """
 
 from gvz.wad.acs.codegen import compile_acs

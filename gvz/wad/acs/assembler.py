@@ -5,21 +5,21 @@ import struct
 PUSH_NUMBER, PUSH_BYTE, PUSH_BYTES, PUSH_2_BYTES = 3, 167, 175, 176
 CASE_GOTO_SORTED = 256
 MAX_RUN = 255
-"""constants one PUSH_BYTES can hold"""
+"""constants that one PUSH_BYTES can hold"""
 
 
 class Label:
-    """A place in the code that jumps may name before it is known."""
+    """A target of jumps, whose address may still be unknown when a jump is emitted."""
 
     def __init__(self) -> None:
         self.address: int | None = None
 
 
 class Assembler:
-    """The code of one object file as it grows. Lives as long as one compilation.
+    """The code of one object file during its compilation.
 
-    Constants from 0 to 255 that are pushed one after the other become one instruction, so they are held back
-    until something else follows.
+    Consecutive pushes of constants from 0 to 255 become one instruction, so they are kept until another instruction
+    follows.
     """
 
     def __init__(self) -> None:
@@ -27,7 +27,7 @@ class Assembler:
         self._run: list[int] = []
         self._jumps: list[tuple[int, Label]] = []
         self.last_opcode = 0
-        """opcode of the last instruction, or 0 where a jump may arrive behind it"""
+        """opcode of the last instruction; 0 if the next instruction can be the target of a jump"""
 
     @property
     def address(self) -> int:
@@ -73,16 +73,16 @@ class Assembler:
             self._reference(target)
 
     def begin_body(self) -> None:
-        """What comes next has no instruction before it."""
+        """Begins a body: its first instruction has no instruction before it."""
         self.last_opcode = 0
 
     def place(self, label: Label) -> None:
-        """Lets `label` mean the next instruction."""
+        """Sets the address of `label` to the next instruction."""
         label.address = self.address
         self.last_opcode = 0
 
     def finish(self) -> bytes:
-        """The whole code, header space included, with all jumps filled in."""
+        """The complete code with the header's space and all jump addresses."""
         self._flush()
         for position, label in self._jumps:
             assert label.address is not None

@@ -1,6 +1,6 @@
-"""The compiled object file: the layout of a BEHAVIOR lump as ACC's hybrid format has it.
+"""The compiled object file: the layout of a BEHAVIOR lump in ACC's hybrid format.
 
-Hybrid means that old tools see a file without strings whose scripts do nothing, and the engine finds the real tables as
+Hybrid means: for old tools the file has no strings and its scripts do nothing; the engine finds the real tables as
 chunks before the old directory.
 """
 
@@ -13,7 +13,7 @@ MAX_PLAIN_LOCALS = 20
 
 @dataclass(frozen=True, slots=True)
 class ScriptEntry:
-    """A compiled script. `num_locals` counts its parameters too; `array_sizes` are of its local arrays."""
+    """A compiled script. `num_locals` includes its parameters; `array_sizes` are the sizes of its local arrays."""
 
     number: int
     type: int
@@ -25,7 +25,7 @@ class ScriptEntry:
 
 @dataclass(frozen=True, slots=True)
 class FunctionEntry:
-    """A compiled function. `num_locals` leaves its parameters out."""
+    """A compiled function. `num_locals` does not include its parameters."""
 
     name: str
     returns: bool
@@ -37,7 +37,7 @@ class FunctionEntry:
 
 @dataclass(frozen=True, slots=True)
 class MapVariableEntry:
-    """A variable of the map: its start value, or as an array (`size` > 0) its start values."""
+    """A variable of the map: its initial value, or the initial values of an array (`size` > 0)."""
 
     size: int
     values: tuple[int, ...]
@@ -111,7 +111,7 @@ def _append_string_chunk(out: bytearray, name: bytes, strings: list[bytes], *, h
         offsets += struct.pack("<I", offset)
         offset += len(string) + 1
     data = head + offsets + b"".join(string + b"\0" for string in strings)
-    # The next chunk starts at a file address divisible by 4, which after an array chunk is not the chunk's size.
+    # The next chunk starts at a file address divisible by 4; after an array chunk this is not the end of its data.
     data += bytes(-(len(out) + 8 + len(data)) % 4)
     _append_chunk(out, name, data)
 

@@ -1,7 +1,7 @@
-"""Which string literals end up as the name of an actor class, followed through variables and functions.
+"""Finds the string literals that can become the name of an actor class, also through variables and functions.
 
-The engine says nothing about a class it does not know: Spawn returns 0, and a script that spawns until it
-succeeds is killed after two million instructions. So the compiler looks.
+The engine does not report an unknown class: Spawn returns 0, and a script that spawns until it succeeds is killed after
+two million instructions. So the compiler checks the names.
 """
 
 import difflib
@@ -11,11 +11,11 @@ from collections.abc import Collection, Hashable
 from gvz.wad.acs.lexer import Position, error
 
 USED_AS_CLASS = "used as class"
-"""the place where every class argument of a built-in flows to"""
+"""the target of every class argument of a built-in"""
 
 
 class ClassFlow:
-    """Who takes values from whom: variables, arrays, parameters and functions' results. Lives one compilation."""
+    """The flow of values between variables, arrays, parameters and functions' results in one compilation."""
 
     def __init__(self) -> None:
         self._sources: defaultdict[Hashable, list[Hashable]] = defaultdict(list)
@@ -30,11 +30,7 @@ class ClassFlow:
         self._sources[target].append(source)
 
     def check(self, classes: Collection[str]) -> None:
-        """Refuses a class name that is not in `classes` (compared without regard to case).
-
-        Raises:
-            AcsError: at the first unknown class name of the source.
-        """
+        """Refuses the first class name of the source that is not in `classes` (case is ignored)."""
         known = {name.lower(): name for name in classes}
         reached: set[Hashable] = {USED_AS_CLASS}
         pending: list[Hashable] = [USED_AS_CLASS]

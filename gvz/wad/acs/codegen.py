@@ -2,6 +2,7 @@
 
 from collections.abc import Collection
 
+from gvz.wad.acs import syntax
 from gvz.wad.acs.behavior import FunctionEntry, MapVariableEntry, ScriptEntry, write_behavior
 from gvz.wad.acs.constant_expressions import constant, constant_number
 from gvz.wad.acs.expressions import flow
@@ -16,16 +17,6 @@ from gvz.wad.acs.statements import (
     initial_values,
 )
 from gvz.wad.acs.symbols import FunctionSymbol, Unit, VariableSymbol
-from gvz.wad.acs.syntax import (
-    Declaration,
-    Declare,
-    Define,
-    Expression,
-    Function,
-    GlobalVariable,
-    Script,
-    Variable,
-)
 from gvz.wad.stock import stock_actors
 
 SCRIPT_TYPE_NUMBERS = {"": 0, "open": 1, "respawn": 2, "death": 3, "enter": 4, "disconnect": 14}
@@ -41,17 +32,16 @@ def compile_acs(source: str, *, actor_classes: Collection[str] = ()) -> bytes:
 
     Args:
         source: text of a SCRIPTS lump.
-        actor_classes: names of actor classes there are besides the engine's own for Doom (from the WAD's DECORATE).
+        actor_classes: names of actor classes besides the engine's own for Doom (from the WAD's DECORATE).
 
     Raises:
-        AcsError: the source is outside the supported subset of ACS, or would be accepted by the engine only to
-            fail silently in the game: an unknown actor class, a script that is not there, a wrong number or type
-            of arguments.
+        AcsError: the source is outside the supported subset of ACS, or it would fail silently in the game: an
+            unknown actor class, a missing script, a wrong number or type of arguments.
     """
     unit = Unit()
     declarations = parse(source)
-    # Functions may be used before they stand.
-    functions = (declaration for declaration in declarations if isinstance(declaration, Function))
+    # Functions may be used before their definition.
+    functions = (declaration for declaration in declarations if isinstance(declaration, syntax.Function))
     for number, function in enumerate(functions):
         _declare_function(unit, function, number)
     # In source order, which is the order in which ACC numbers variables and strings.
@@ -63,7 +53,7 @@ def compile_acs(source: str, *, actor_classes: Collection[str] = ()) -> bytes:
     return write_behavior(unit.code.finish(), unit.scripts, unit.functions, strings, unit.variables)
 
 
-def _declare_function(unit: Unit, function: Function, number: int) -> None:
+def _declare_function(unit: Unit, function: syntax.Function, number: int) -> None:
     if number == MAX_FUNCTIONS:
         raise error(function.at, f"got more than {MAX_FUNCTIONS} functions, want fewer")
     parameters = tuple(VariableSymbol("script", i, p.type) for i, p in enumerate(function.parameters))
@@ -76,23 +66,23 @@ def _check_started_scripts(unit: Unit) -> None:
             raise error(at, f"got script {number}, which is not there, want one of {sorted(unit.script_numbers)}")
 
 
-def _emit_declaration(unit: Unit, declaration: Declaration) -> None:
+def _emit_declaration(unit: Unit, declaration: syntax.Declaration) -> None:
     match declaration:
-        case Define():
+        case syntax.Define():
             value = constant(unit, declaration.value, f"#define {declaration.name}")
             unit.declare(declaration.name, value, declaration.at)
-        case Declare():
+        case syntax.Declare():
             for variable in declaration.variables:
                 _add_map_variable(unit, variable)
-        case GlobalVariable():
+        case syntax.GlobalVariable():
             _declare_global_variable(unit, declaration)
-        case Script():
+        case syntax.Script():
             _emit_script(unit, declaration)
-        case Function():
+        case syntax.Function():
             _emit_function(unit, declaration)
 
 
-def _declare_global_variable(unit: Unit, variable: GlobalVariable) -> None:
+def _declare_global_variable(unit: Unit, variable: syntax.GlobalVariable) -> None:
     if variable.number >= MAX_GLOBAL_VARIABLES:
         raise error(
             variable.at,
@@ -101,7 +91,7 @@ def _declare_global_variable(unit: Unit, variable: GlobalVariable) -> None:
     unit.declare(variable.name, VariableSymbol("global", variable.number, variable.type), variable.at)
 
 
-def _add_map_variable(unit: Unit, variable: Variable) -> None:
+def _add_map_variable(unit: Unit, variable: syntax.Variable) -> None:
     index = len(unit.variables)
     if index == MAX_MAP_VARIABLES:
         raise error(variable.at, f"got more than {MAX_MAP_VARIABLES} map variables, want fewer")
@@ -113,7 +103,7 @@ def _add_map_variable(unit: Unit, variable: Variable) -> None:
     unit.variables.append(MapVariableEntry(size, values if size else values or (0,)))
 
 
-def _initial_constant(unit: Unit, node: Expression, symbol: VariableSymbol, name: str) -> int:
+def _initial_constant(unit: Unit, node: syntax.Expression, symbol: VariableSymbol, name: str) -> int:
     value = constant(unit, node, f"start value of {name!r}")
     if value.text is None and symbol.type == "str":
         raise error(node.at, f"start value of {name!r}: got a number, want a string")
@@ -121,7 +111,7 @@ def _initial_constant(unit: Unit, node: Expression, symbol: VariableSymbol, name
     return value.value & 0xFFFFFFFF
 
 
-def _emit_script(unit: Unit, script: Script) -> None:
+def _emit_script(unit: Unit, script: syntax.Script) -> None:
     number = constant_number(unit, script.number, "script number")
     if not 1 <= number <= MAX_SCRIPT_NUMBER:
         raise error(script.at, f"script number: got {number}, want 1 to {MAX_SCRIPT_NUMBER}")
@@ -147,7 +137,7 @@ def _emit_script(unit: Unit, script: Script) -> None:
     unit.forget_locals()
 
 
-def _emit_function(unit: Unit, function: Function) -> None:
+def _emit_function(unit: Unit, function: syntax.Function) -> None:
     symbol = unit.names[function.name]
     assert isinstance(symbol, FunctionSymbol)
     address = unit.code.address

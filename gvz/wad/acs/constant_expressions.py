@@ -7,11 +7,7 @@ from gvz.wad.acs.syntax import Binary, Expression, Name, Number, String, Unary
 
 
 def constant(unit: Unit, node: Expression, what: str) -> ConstantSymbol:
-    """The value of an expression that must be known now, as a signed 32-bit number or a string.
-
-    Raises:
-        AcsError: it is not constant, adds up strings, or divides by zero.
-    """
+    """The value of a constant expression, as a signed 32-bit number or a string; strings cannot be added up."""
     match node:
         case Number():
             return ConstantSymbol(_signed(node.value), is_integer=not node.is_fixed)
@@ -52,7 +48,7 @@ def _number(result: ConstantSymbol, node: Expression, what: str) -> int:
 
 
 def number_if_constant(unit: Unit, node: Expression) -> int | None:
-    """The value of an expression whose code is emitted already; None if only the running script knows it."""
+    """The value of an expression whose code is already emitted; None if it is not constant."""
     try:
         return constant_number(unit, node, "")
     except AcsError:
@@ -60,15 +56,9 @@ def number_if_constant(unit: Unit, node: Expression) -> int | None:
 
 
 def refuse_zero_divisor(unit: Unit, operator: str, node: Expression) -> None:
-    """Refuses to divide by the constant 0, where the engine would end the script.
+    """Refuses a division by the constant 0, at which the engine would end the script.
 
-    Args:
-        unit: the source.
-        operator: of an expression or an assignment.
-        node: what is on its right, with its code emitted already.
-
-    Raises:
-        AcsError: `operator` divides, and `node` is 0.
+    `operator` is that of an expression or an assignment; `node` is on its right, with its code emitted already.
     """
     if operator.removesuffix("=") in ("/", "%") and number_if_constant(unit, node) == 0:
         raise error(node.at, f"got a division by zero on the right of {operator!r}, want another number")

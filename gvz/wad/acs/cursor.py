@@ -7,7 +7,7 @@ from gvz.core.errors import AcsError
 from gvz.wad.acs.lexer import Position, Token, error
 
 MAX_NESTING = 64
-"""statements and operands inside each other; keeps every recursion over a tree far from Python's limit"""
+"""nested statements and operands; keeps every recursion over a tree far from Python's limit"""
 
 TYPES = ("int", "str", "bool")
 SCRIPT_TYPES = ("open", "enter", "respawn", "death", "disconnect")
@@ -20,13 +20,13 @@ KEYWORDS = frozenset(
         *("print", "printbold", "log"),
     )
 )
-"""words that cannot name anything"""
+"""words that cannot be names"""
 
 T = TypeVar("T")
 
 
 class Cursor:
-    """The place a parser has come to in its tokens."""
+    """A parser's position in its tokens."""
 
     def __init__(self, tokens: list[Token]):
         self._tokens = tokens
@@ -35,7 +35,7 @@ class Cursor:
 
     @property
     def token(self) -> Token:
-        """The token to be read next."""
+        """The token that is read next."""
         return self._tokens[self._next]
 
     @property
@@ -53,7 +53,7 @@ class Cursor:
         return following.kind == "symbol" and following.text == "("
 
     def advance(self) -> Token:
-        """Reads a token; at the end stays there."""
+        """Reads a token; stays at the end token."""
         token = self.token
         if token.kind != "end":
             self._next += 1
@@ -68,21 +68,13 @@ class Cursor:
         return self.advance() if self.sees(*texts) else None
 
     def expect(self, *texts: str) -> Token:
-        """Reads one of these words or symbols.
-
-        Raises:
-            AcsError: something else comes next.
-        """
+        """Reads one of these words or symbols, which must come next."""
         if not self.sees(*texts):
             raise self.unexpected(" or ".join(repr(text) for text in texts))
         return self.advance()
 
     def identifier(self, what: str) -> Token:
-        """Reads the name of a `what`.
-
-        Raises:
-            AcsError: no name comes next, or a keyword.
-        """
+        """Reads the name of a `what`, which is no keyword."""
         if self.token.kind != "name":
             raise self.unexpected(f"the name of a {what}")
         if self.token.text in KEYWORDS:
@@ -90,7 +82,7 @@ class Cursor:
         return self.advance()
 
     def unexpected(self, wanted: str) -> AcsError:
-        """The error that something else than `wanted` comes next."""
+        """The error that the next token is not `wanted`."""
         return error(self.at, f"got {self.token}, want {wanted}")
 
     def comma_list(self, item: Callable[["Cursor"], T]) -> tuple[T, ...]:
@@ -101,11 +93,7 @@ class Cursor:
         return tuple(items)
 
     def descend(self) -> None:
-        """Notes that what follows stands inside something; `ascend` ends it.
-
-        Raises:
-            AcsError: too many things stand inside each other.
-        """
+        """Enters a level of nesting, at most MAX_NESTING; `ascend` leaves it."""
         self._depth += 1
         if self._depth > MAX_NESTING:
             raise error(self.at, f"nested too deeply: got {self._depth} levels, want at most {MAX_NESTING}")

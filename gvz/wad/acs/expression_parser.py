@@ -14,11 +14,7 @@ PRECEDENCE = {
 
 
 def parse_expression(cursor: Cursor, lowest: int = 1) -> Expression:
-    """Reads an expression whose binary operators are of level `lowest` and above, by precedence climbing.
-
-    Raises:
-        AcsError: no expression comes next, or it is nested too deeply.
-    """
+    """Reads an expression whose binary operators are of level `lowest` and above, by precedence climbing."""
     cursor.descend()
     left = _parse_unary(cursor)
     while cursor.token.kind == "symbol" and PRECEDENCE.get(cursor.token.text, 0) >= lowest:

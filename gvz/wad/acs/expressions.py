@@ -18,7 +18,7 @@ VARIABLE_OPCODES: dict[str, dict[str, int]] = {
         "script array": (365, 364, 366, 367, 368, 369, 370, 371, 372),
     }.items()
 }
-"""by where a variable lives, then by what is done to it"""
+"""by the scope of a variable, then by the operation"""
 
 _BINARY = "+ 14 - 15 * 16 / 17 % 18 == 19 != 20 < 21 > 22 <= 23 >= 24 && 70 || 71 & 72 | 73 ^ 74 << 76 >> 77".split()
 BINARY_OPCODES: dict[str, int] = dict(zip(_BINARY[::2], map(int, _BINARY[1::2]), strict=True))
@@ -29,11 +29,7 @@ MAX_SPECIAL_ARGUMENTS = 5
 
 
 def emit_value(unit: Unit, node: Expression, kind: Kind, what: str) -> None:
-    """Emits `node` where a value of `kind` is wanted, named `what` in errors.
-
-    Raises:
-        AcsError: its type is known and another, or it uses names or operators wrongly.
-    """
+    """Emits `node` where a value of `kind` is wanted, named `what` in errors; its type may be unknown."""
     if kind == "class":
         flow(unit, node, USED_AS_CLASS)
     type_name = emit_expression(unit, node)
@@ -50,7 +46,7 @@ def emit_value(unit: Unit, node: Expression, kind: Kind, what: str) -> None:
 
 
 def _refuse_integer(unit: Unit, node: Expression, what: str) -> None:
-    """Refuses an integer literal, or a constant defined by one, where a fixed-point number is wanted; 0 is both."""
+    """Refuses an integer literal, or a constant defined by one, for a fixed-point number; 0 is valid for both."""
     literal = node.operand if isinstance(node, Unary) else node
     if isinstance(literal, Number):
         value = 0 if literal.is_fixed else literal.value
@@ -63,7 +59,7 @@ def _refuse_integer(unit: Unit, node: Expression, what: str) -> None:
 
 def _note_script(unit: Unit, node: Expression) -> None:
     value = node if isinstance(node, Number) else _named_constant(unit, node)
-    if value is not None:  # else only the running engine knows
+    if value is not None:  # else it is known only when the script runs
         unit.started_scripts.append((value.value, node.at))
 
 
@@ -73,7 +69,7 @@ def _named_constant(unit: Unit, node: Expression) -> ConstantSymbol | None:
 
 
 def emit_expression(unit: Unit, node: Expression) -> Type:
-    """Emits instructions that leave the value of `node` on the stack; returns what is known of its type."""
+    """Emits instructions that leave the value of `node` on the stack; returns its type as far as it is known."""
     match node:
         case Number():
             unit.code.push(node.value)
@@ -96,12 +92,12 @@ def emit_expression(unit: Unit, node: Expression) -> Type:
 
 
 def _emit_binary(unit: Unit, node: Binary) -> Type:
-    # A long chain a + b + c ... is deep on the left: walked in a loop, so that its length costs no recursion.
+    # A long chain a + b + c ... is deep on the left: a loop walks it without recursion.
     chain = [node]
     while isinstance(node.left, Binary):
         node = node.left
         chain.append(node)
-    # Strings may be compared: equal texts have equal numbers.
+    # Strings can be compared: equal texts have equal numbers.
     kinds: list[Kind] = ["any" if n.operator in ("==", "!=") else "int" for n in chain]
     emit_value(unit, node.left, kinds[-1], f"left of {node.operator!r}")
     for link, kind in zip(reversed(chain), reversed(kinds), strict=True):
@@ -188,18 +184,18 @@ def emit_assign(unit: Unit, node: Assign) -> None:
 
 
 def emit_stored_value(unit: Unit, node: Expression, symbol: VariableSymbol, name: str) -> None:
-    """Emits a value that will be kept in the variable `name`."""
+    """Emits a value that is stored in the variable `name`."""
     flow(unit, node, symbol)
     emit_value(unit, node, stored_kind(symbol.type), f"value of {name!r}")
 
 
 def stored_kind(declared: str) -> Kind:
-    """What a variable, parameter or result declared with this type takes."""
+    """The kind of value that a variable, parameter or result with this declared type accepts."""
     return "str" if declared == "str" else "any"
 
 
 def emit_call(unit: Unit, node: Call, *, discard: bool) -> Type:
-    """Emits a call; with `discard` its result is dropped, and the type returned means nothing."""
+    """Emits a call; `discard` drops its result, and then the returned type has no meaning."""
     symbol = unit.lookup(node.name, node.at)
     if isinstance(symbol, FunctionSymbol):
         return _emit_function_call(unit, node, symbol, discard)
@@ -252,7 +248,7 @@ def _check_count(node: Call, name: str, least: int, most: int) -> None:
 
 
 def _argument_kinds(unit: Unit, node: Call, symbol: Intrinsic) -> tuple[Kind, ...]:
-    """What the arguments of a built-in must be, where an argument decides on the kind of the next one."""
+    """The kinds of a built-in's arguments, if one argument decides the kind of the next."""
     kinds = symbol.parameters
     if node.name == "setactorproperty":
         constant_symbol = _named_constant(unit, node.arguments[1])
@@ -278,4 +274,4 @@ def flow(unit: Unit, node: Expression, target: object) -> None:
             elif isinstance(symbol, VariableSymbol | FunctionSymbol):
                 unit.flow.add(symbol, target)
         case _:
-            pass  # numbers: no class name
+            pass  # a number is not a class name

@@ -1,9 +1,9 @@
-"""What ACS offers by itself: built-in functions, line specials and named constants. Data and its reading only.
+"""ACS's built-in functions, line specials and named constants: tables, and the functions that read them.
 
-Numbers are those of the engine (ZDoom's p_acs.h, actionspecials.h) and of zcommon.acs; only what scenarios may
-need is listed. A parameter is described by its kind:
+The numbers are those of the engine (ZDoom's p_acs.h, actionspecials.h) and of zcommon.acs. The tables list only what
+scenarios may need. A parameter has a kind:
 
-* `int`: a number; `fixed`: a fixed-point number, where a bare integer is almost surely a slip (1.0 is 65536);
+* `int`: a number; `fixed`: a fixed-point number, where a plain integer is almost surely an error (1.0 is 65536);
 * `script`: the number of a script of the same source;
 * `str`: a string; `class`: a string that names an actor class; `any`: a number or a string.
 
@@ -16,7 +16,7 @@ from typing import Literal, cast
 
 Kind = Literal["int", "fixed", "script", "str", "class", "any"]
 Type = Literal["int", "str", "any", "void"]
-"""what a value is known to be; `any` where only the running engine knows"""
+"""the type of a value; `any` if it is known only when the script runs"""
 Form = Literal["instruction", "function", "special"]
 
 INSTRUCTIONS = """
@@ -166,7 +166,7 @@ FIXED_PROPERTIES = frozenset((1, 3, 12, 15, 24, 29, 30, 38, 39, 40, 42, 43))
 """actor properties whose value is a fixed-point number (Speed, Alpha, JumpZ, Gravity, DamageFactor, ...)"""
 
 LATENT = frozenset(("delay",))
-"""built-ins that suspend the script and therefore cannot stand in a function"""
+"""built-ins that suspend the script and so are not allowed in a function"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,17 +185,9 @@ class Intrinsic:
 @cache
 def intrinsics() -> dict[str, Intrinsic]:
     """All built-ins by lower-case name."""
-    tables: tuple[tuple[Form, str], ...] = (
-        ("instruction", INSTRUCTIONS),
-        ("function", FUNCTIONS),
-        ("special", SPECIALS),
-    )
-    return {
-        intrinsic.name.lower(): intrinsic
-        for form, table in tables
-        for line in table.strip().splitlines()
-        for intrinsic in (_read(form, line),)
-    }
+    tables: dict[Form, str] = {"instruction": INSTRUCTIONS, "function": FUNCTIONS, "special": SPECIALS}
+    found = [_read(form, line) for form, table in tables.items() for line in table.strip().splitlines()]
+    return {intrinsic.name.lower(): intrinsic for intrinsic in found}
 
 
 def _read(form: Form, line: str) -> Intrinsic:

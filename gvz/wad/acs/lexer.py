@@ -1,4 +1,4 @@
-"""ACS source text cut into tokens, each with its line and column."""
+"""Splits ACS source text into tokens, each with its line and column."""
 
 import re
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from gvz.core.errors import AcsError
 TokenKind = Literal["name", "number", "string", "symbol", "end"]
 
 MAX_NUMBER_LENGTH = 16
-"""characters of a number literal; a longer one cannot be a 32-bit value"""
+"""maximum characters of a number literal; a longer one is not a 32-bit value"""
 
 _PATTERN = re.compile(
     r"""(?P<blank>[\x00-\x20]+|//[^\n]*|/\*.*?\*/)
@@ -24,7 +24,7 @@ _PATTERN = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """1-based place in the source text."""
+    """1-based position in the source text."""
 
     line: int
     column: int
@@ -45,16 +45,15 @@ class Token:
 
 
 def error(at: Position, message: str) -> AcsError:
-    """The error to raise for something wrong at `at`."""
+    """An error at the position `at`."""
     return AcsError(message, line=at.line, column=at.column)
 
 
 def tokenize(source: str) -> list[Token]:
-    """Cuts ACS source into tokens; the last one has kind `end`.
+    """Splits ACS source into tokens; the last one has kind `end`.
 
-    Raises:
-        AcsError: a character ACS does not know, an unterminated string or comment, a number beyond 32 bits,
-            or a string that the engine's one-byte character set cannot hold.
+    Refuses a character ACS does not know, an unterminated string or comment, a number beyond 32 bits, and a string that
+    the engine's one-byte character set cannot hold.
     """
     tokens: list[Token] = []
     offset, line, line_start = 0, 1, 0
@@ -97,7 +96,7 @@ def _number(text: str, at: Position) -> int:
     if text[:2].lower() == "0x":
         value, highest = int(text, 16), 0xFFFFFFFF
     elif "." in text:
-        # ACC truncates the fraction; doing it in whole numbers gives the same bits without rounding.
+        # ACC truncates the fraction; integer arithmetic gives the same bits without rounding.
         whole, fraction = text.split(".")
         value = (int(whole) << 16) + ((int(fraction or "0") << 16) // 10 ** len(fraction))
         highest = 0x7FFFFFFF

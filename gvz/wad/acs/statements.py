@@ -1,5 +1,6 @@
 """Statements to instructions."""
 
+from gvz.wad.acs import syntax
 from gvz.wad.acs.assembler import Label
 from gvz.wad.acs.constant_expressions import constant, constant_number
 from gvz.wad.acs.expressions import (
@@ -14,24 +15,6 @@ from gvz.wad.acs.expressions import (
 )
 from gvz.wad.acs.lexer import error
 from gvz.wad.acs.symbols import Unit
-from gvz.wad.acs.syntax import (
-    Assign,
-    Block,
-    Call,
-    Case,
-    Declare,
-    Expression,
-    For,
-    If,
-    Increment,
-    Jump,
-    Loop,
-    Print,
-    Return,
-    Statement,
-    Switch,
-    Variable,
-)
 
 TERMINATE, SUSPEND, RESTART = 1, 2, 69
 GOTO, IF_GOTO, DROP, IF_NOT_GOTO = 52, 53, 54, 79
@@ -40,45 +23,41 @@ BEGIN_PRINT = 85
 END_PRINT = {"print": 86, "printbold": 101, "log": 270}
 PRINT_PART = {"s": 87, "d": 88, "i": 88, "c": 89, "f": 157}
 MAX_ARRAY_SIZE = 65536
-"""far above any need; a huge array would make the engine allocate it"""
+"""far more than any script needs; the engine would allocate a huge array"""
 
 
-def emit_statement(unit: Unit, node: Statement) -> None:
-    """Emits one statement.
-
-    Raises:
-        AcsError: it makes no sense where it stands, or misuses a name or a value.
-    """
+def emit_statement(unit: Unit, node: syntax.Statement) -> None:
+    """Emits one statement, which must make sense where it stands."""
     match node:
-        case Declare():
+        case syntax.Declare():
             for variable in node.variables:
                 _emit_local_variable(unit, variable)
-        case Assign():
+        case syntax.Assign():
             emit_assign(unit, node)
-        case Increment():
+        case syntax.Increment():
             emit_increment(unit, node)
-        case Call():
+        case syntax.Call():
             emit_call(unit, node, discard=True)
-        case Print():
+        case syntax.Print():
             _emit_print(unit, node)
-        case Block():
+        case syntax.Block():
             for statement in node.statements:
                 emit_statement(unit, statement)
-        case If():
+        case syntax.If():
             _emit_if(unit, node)
-        case Loop():
+        case syntax.Loop():
             _emit_loop(unit, node)
-        case For():
+        case syntax.For():
             _emit_for(unit, node)
-        case Switch():
+        case syntax.Switch():
             _emit_switch(unit, node)
-        case Jump():
+        case syntax.Jump():
             _emit_jump(unit, node)
-        case Return():
+        case syntax.Return():
             _emit_return(unit, node)
 
 
-def _emit_local_variable(unit: Unit, variable: Variable) -> None:
+def _emit_local_variable(unit: Unit, variable: syntax.Variable) -> None:
     size = array_size(unit, variable)
     symbol = unit.declare_local(variable.name, variable.type, variable.at, size)
     opcode = VARIABLE_OPCODES[symbol.storage]["="]
@@ -89,8 +68,8 @@ def _emit_local_variable(unit: Unit, variable: Variable) -> None:
         unit.code.emit(opcode, symbol.index)
 
 
-def array_size(unit: Unit, variable: Variable) -> int:
-    """Number of elements of a declared variable; 0 for what is no array."""
+def array_size(unit: Unit, variable: syntax.Variable) -> int:
+    """Number of elements of a declared variable; 0 if it is not an array."""
     if variable.size is None:
         return 0
     size = constant_number(unit, variable.size, f"size of {variable.name!r}")
@@ -99,8 +78,8 @@ def array_size(unit: Unit, variable: Variable) -> int:
     return size
 
 
-def initial_values(variable: Variable, size: int) -> tuple[Expression, ...]:
-    """The values a variable or array of `size` elements is declared with; none if it starts at zero."""
+def initial_values(variable: syntax.Variable, size: int) -> tuple[syntax.Expression, ...]:
+    """The initial values of a declared variable or array of `size` elements; none if it starts at zero."""
     if variable.initial is None:
         return ()
     if not isinstance(variable.initial, tuple):
@@ -110,7 +89,7 @@ def initial_values(variable: Variable, size: int) -> tuple[Expression, ...]:
     return variable.initial
 
 
-def _emit_print(unit: Unit, node: Print) -> None:
+def _emit_print(unit: Unit, node: syntax.Print) -> None:
     unit.code.emit(BEGIN_PRINT)
     for letter, value in node.parts:
         emit_value(unit, value, "str" if letter == "s" else "int", f"{node.function} of {letter!r}")
@@ -118,12 +97,12 @@ def _emit_print(unit: Unit, node: Print) -> None:
     unit.code.emit(END_PRINT[node.function])
 
 
-def _emit_condition(unit: Unit, node: Expression, opcode: int, target: Label) -> None:
+def _emit_condition(unit: Unit, node: syntax.Expression, opcode: int, target: Label) -> None:
     emit_value(unit, node, "int", "condition")
     unit.code.jump(opcode, target)
 
 
-def _emit_if(unit: Unit, node: If) -> None:
+def _emit_if(unit: Unit, node: syntax.If) -> None:
     end = Label()
     for i, (condition, body) in enumerate(node.branches):
         skip = Label()
@@ -137,7 +116,7 @@ def _emit_if(unit: Unit, node: If) -> None:
     unit.code.place(end)
 
 
-def _emit_loop(unit: Unit, node: Loop) -> None:
+def _emit_loop(unit: Unit, node: syntax.Loop) -> None:
     code, top, test, end = unit.code, Label(), Label(), Label()
     code.place(top)
     if node.test_first:
@@ -151,7 +130,7 @@ def _emit_loop(unit: Unit, node: Loop) -> None:
     code.place(end)
 
 
-def _emit_for(unit: Unit, node: For) -> None:
+def _emit_for(unit: Unit, node: syntax.For) -> None:
     code, test, step, body, end = unit.code, Label(), Label(), Label(), Label()
     emit_statement(unit, node.initial)
     code.place(test)
@@ -166,7 +145,7 @@ def _emit_for(unit: Unit, node: For) -> None:
     code.place(end)
 
 
-def _emit_body(unit: Unit, node: Statement, *, breaks: Label, continues: Label) -> None:
+def _emit_body(unit: Unit, node: syntax.Statement, *, breaks: Label, continues: Label) -> None:
     unit.breaks.append(breaks)
     unit.continues.append(continues)
     emit_statement(unit, node)
@@ -174,7 +153,7 @@ def _emit_body(unit: Unit, node: Statement, *, breaks: Label, continues: Label) 
     unit.continues.pop()
 
 
-def _emit_switch(unit: Unit, node: Switch) -> None:
+def _emit_switch(unit: Unit, node: syntax.Switch) -> None:
     code, table, end = unit.code, Label(), Label()
     emit_value(unit, node.value, "any", "value of switch")
     code.jump(GOTO, table)
@@ -182,7 +161,7 @@ def _emit_switch(unit: Unit, node: Switch) -> None:
     default: Label | None = None
     unit.breaks.append(end)
     for item in node.body:
-        if not isinstance(item, Case):
+        if not isinstance(item, syntax.Case):
             emit_statement(unit, item)
             continue
         label = Label()
@@ -207,7 +186,7 @@ def _emit_switch(unit: Unit, node: Switch) -> None:
     code.place(end)
 
 
-def _emit_jump(unit: Unit, node: Jump) -> None:
+def _emit_jump(unit: Unit, node: syntax.Jump) -> None:
     if node.keyword in ("break", "continue"):
         targets = unit.breaks if node.keyword == "break" else unit.continues
         if not targets:
@@ -219,7 +198,7 @@ def _emit_jump(unit: Unit, node: Jump) -> None:
     unit.code.emit({"terminate": TERMINATE, "suspend": SUSPEND, "restart": RESTART}[node.keyword])
 
 
-def _emit_return(unit: Unit, node: Return) -> None:
+def _emit_return(unit: Unit, node: syntax.Return) -> None:
     function = unit.function
     if function is None:
         raise error(node.at, "got 'return' in a script, want 'terminate'")

@@ -1,63 +1,55 @@
-"""Syntax trees of the ACS subset that scenarios use. Every node knows where it stands. Data only."""
+"""Syntax trees of the ACS subset that scenarios use. Data only."""
 
-from dataclasses import dataclass
+from msgspec import Struct
 
 from gvz.wad.acs.lexer import Position
 
 
-@dataclass(frozen=True, slots=True)
-class Number:
-    """A literal; `is_fixed` when written with a point."""
+class Node(Struct, frozen=True):
+    """Every node has its position."""
 
     at: Position
+
+
+class Number(Node, frozen=True):
+    """A literal; `is_fixed` if it is written with a point."""
+
     value: int
     is_fixed: bool
 
 
-@dataclass(frozen=True, slots=True)
-class String:
-    at: Position
+class String(Node, frozen=True):
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class Name:
+class Name(Node, frozen=True):
     """A variable, constant or line special; with `index` an element of an array."""
 
-    at: Position
     name: str
     index: "Expression | None" = None
 
 
-@dataclass(frozen=True, slots=True)
-class Call:
+class Call(Node, frozen=True):
     """A function, built-in or line special that is executed."""
 
-    at: Position
     name: str
     arguments: "tuple[Expression, ...]"
 
 
-@dataclass(frozen=True, slots=True)
-class Unary:
-    at: Position
+class Unary(Node, frozen=True):
     operator: str
     operand: "Expression"
 
 
-@dataclass(frozen=True, slots=True)
-class Binary:
-    at: Position
+class Binary(Node, frozen=True):
     operator: str
     left: "Expression"
     right: "Expression"
 
 
-@dataclass(frozen=True, slots=True)
-class Increment:
+class Increment(Node, frozen=True):
     """`++x`, `x++`, `--x` or `x--`, as an expression or a statement."""
 
-    at: Position
     operator: str
     target: Name
     is_prefix: bool
@@ -66,146 +58,112 @@ class Increment:
 Expression = Number | String | Name | Call | Unary | Binary | Increment
 
 
-@dataclass(frozen=True, slots=True)
-class Variable:
+class Variable(Node, frozen=True):
     """A declared variable of a script, a function or the map. `size` makes it an array."""
 
-    at: Position
     type: str
     name: str
     size: Expression | None
     initial: Expression | tuple[Expression, ...] | None
 
 
-@dataclass(frozen=True, slots=True)
-class Declare:
-    at: Position
+class Declare(Node, frozen=True):
     variables: tuple[Variable, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Assign:
-    at: Position
+class Assign(Node, frozen=True):
     target: Name
     operator: str
     value: Expression
 
 
-@dataclass(frozen=True, slots=True)
-class Print:
+class Print(Node, frozen=True):
     """`Print` or `Log`; parts are (format letter, value)."""
 
-    at: Position
     function: str
     parts: tuple[tuple[str, Expression], ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Block:
-    at: Position
+class Block(Node, frozen=True):
     statements: "tuple[Statement, ...]"
 
 
-@dataclass(frozen=True, slots=True)
-class If:
+class If(Node, frozen=True):
     """`if ... else if ... else ...`: (condition, body) of each branch, and the last `else`."""
 
-    at: Position
     branches: "tuple[tuple[Expression, Statement], ...]"
     otherwise: "Statement | None"
 
 
-@dataclass(frozen=True, slots=True)
-class Loop:
+class Loop(Node, frozen=True):
     """`while` or `until`, with the test before the body, or after it (`do`)."""
 
-    at: Position
     condition: Expression
     body: "Statement"
     is_until: bool
     test_first: bool
 
 
-@dataclass(frozen=True, slots=True)
-class For:
-    at: Position
+class For(Node, frozen=True):
     initial: "Statement"
     condition: Expression
     step: "Statement"
     body: "Statement"
 
 
-@dataclass(frozen=True, slots=True)
-class Case:
+class Case(Node, frozen=True):
     """A label in a switch; `value` is None for `default`."""
 
-    at: Position
     value: Expression | None
 
 
-@dataclass(frozen=True, slots=True)
-class Switch:
-    at: Position
+class Switch(Node, frozen=True):
     value: Expression
     body: "tuple[Statement | Case, ...]"
 
 
-@dataclass(frozen=True, slots=True)
-class Jump:
+class Jump(Node, frozen=True):
     """`break`, `continue`, `terminate`, `suspend` or `restart`."""
 
-    at: Position
     keyword: str
 
 
-@dataclass(frozen=True, slots=True)
-class Return:
-    at: Position
+class Return(Node, frozen=True):
     value: Expression | None
 
 
 Statement = Declare | Assign | Increment | Call | Print | Block | If | Loop | For | Switch | Jump | Return
 
 
-@dataclass(frozen=True, slots=True)
-class Define:
+class Define(Node, frozen=True):
     """`#define NAME value`."""
 
-    at: Position
     name: str
     value: Expression
 
 
-@dataclass(frozen=True, slots=True)
-class GlobalVariable:
+class GlobalVariable(Node, frozen=True):
     """`global int N:name`, shared by all maps; ViZDoom shows number N as USER variable N."""
 
-    at: Position
     type: str
     number: int
     name: str
 
 
-@dataclass(frozen=True, slots=True)
-class Parameter:
-    at: Position
+class Parameter(Node, frozen=True):
     type: str
     name: str
 
 
-@dataclass(frozen=True, slots=True)
-class Script:
-    at: Position
+class Script(Node, frozen=True):
     number: Expression
     type: str
-    """event that starts it, lower case; empty for a script that is called"""
+    """event that starts the script, lower case; empty for a script that is called"""
     parameters: tuple[Parameter, ...]
     body: Statement
 
 
-@dataclass(frozen=True, slots=True)
-class Function:
-    at: Position
+class Function(Node, frozen=True):
     returns: str
     """int, bool, str or void"""
     name: str

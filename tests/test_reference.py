@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 
+from benchmarks.reference import PAGE, PLAYERS, estimate, pack, read_reference, tables, write_page
 from gvz.core.errors import ConfigError
 from gvz.evaluation.play import episode_seed
-from gvz.evaluation.reference import PAGE, PLAYERS, estimate, pack, read_reference, tables, with_tables
 from gvz.experiments.base import experiment_named
 from gvz.tasks import named_tasks, scenarios
 
@@ -38,7 +38,7 @@ def test_no_score_is_above_its_bound():
 
 def test_the_tables_of_the_page_are_what_the_records_give():
     page = PAGE.read_text()
-    assert with_tables(page, tables(SCORES)) == page
+    assert write_page(page, tables(SCORES)) == page
 
 
 def mean(player: str, task: str, column: str = "score") -> float:
@@ -65,11 +65,11 @@ def test_the_page_says_what_a_player_without_sight_reaches():
     test_tasks = [task.id for task in named_tasks(dp, split="test")]
     for told in (
         f"firing reaches {percent('sweep', dtc):.0f} % in `default`",
-        f"who is told where enemies are {percent('scripted', dtc):.0f} %. What is above",
+        f"that is told where enemies are reaches {percent('scripted', dtc):.0f} %",
         f"{percent('sweep', hg + '/default'):.0f} % in `default`, {percent('sweep', hg + '/lava'):.0f} % in `lava`",
         f"({percent('sweep', hg + '/supreme'):.0f} % and {percent('sweep', hg + '/poison'):.0f} %)",
         f"kills {mean('sweep', sk):.1f} of 20 in `default`",
-        f"who is told where enemies are {mean('scripted', sk):.1f}.",
+        f"that is told where enemies are kills {mean('scripted', sk):.1f}.",
         f"reaches {percent('sweep', dp + '/default'):.0f} % in `default` and",
         f"and {percent('sweep', *test_tasks):.0f} % of the bound on the test set",
     ):
@@ -185,5 +185,5 @@ def test_what_is_no_reference_record_is_refused(tmp_path):
 
 
 def test_a_page_without_its_markers_is_an_error():
-    with pytest.raises(ConfigError, match="are missing; the tables go between them"):
-        with_tables("# The benchmark", "tables")
+    with pytest.raises(ConfigError, match="are missing; what is measured goes between them"):
+        write_page("# The benchmark", "tables")

@@ -1,8 +1,8 @@
-"""How much enemies stand out from what is round them, in the frames that an agent sees.
+"""How much enemies differ from their surroundings in the frames that an agent sees.
 
-    python -m gvz.evaluation.contrast
+    python -m benchmarks.contrast
 
-measures it for Seek and Kill's `default` and for `complete` with each of its textures, and writes
+measures this for Seek and Kill's `default` and for `complete` with each of its textures, and writes
 results/reference/contrast.json.
 """
 
@@ -12,9 +12,9 @@ from contextlib import closing
 import cv2
 import numpy as np
 
+from benchmarks.reference import RECORDS
 from gvz.core.env_config import LABEL_CLASSES, EnvConfig
 from gvz.env import DoomEnv
-from gvz.evaluation.reference import RECORDS
 from gvz.scenarios.base import Task
 from gvz.tasks import scenario_named
 
@@ -22,19 +22,19 @@ FILE = RECORDS / "contrast.json"
 ENEMY = LABEL_CLASSES.index("enemy")
 NUM_EPISODES = 40
 DECISIONS = 120
-"""of an episode; every LOOK_PERIODth frame is looked at"""
+"""of an episode; every LOOK_PERIODth frame is measured"""
 LOOK_PERIOD = 6
 MIN_PIXELS = 12
-"""of an enemy and of what is round it, in the agent's frame; less is not measured"""
+"""least size of an enemy and of its surroundings in the agent's frame; smaller ones are not measured"""
 RING_PIXELS = 4
-"""width of what counts as round an enemy"""
+"""width of the ring round an enemy that counts as its surroundings"""
 STATUS_BAR_ROW = 70
 """of 84; below it is the status bar"""
 LUMINANCE = (0.299, 0.587, 0.114)
 
 
 def contrast(pixels: np.ndarray, around: np.ndarray) -> float:
-    """Distance of the mean luminances in standard deviations of the luminance around.
+    """Distance of the mean luminances in standard deviations of the surroundings' luminance.
 
     Args:
         pixels: of the thing, [N, 3].
@@ -45,7 +45,7 @@ def contrast(pixels: np.ndarray, around: np.ndarray) -> float:
 
 
 def separation(pixels: np.ndarray, around: np.ndarray) -> float:
-    """Fisher's distance of the mean colours: the contrast in the mixture of red, green and blue that shows most.
+    """Fisher's distance of the mean colours: the contrast in the mixture of red, green and blue that separates best.
 
     Args:
         pixels: of the thing, [N, 3].
@@ -55,7 +55,7 @@ def separation(pixels: np.ndarray, around: np.ndarray) -> float:
     return float(np.sqrt(gap @ np.linalg.solve(np.cov(around.T) + np.eye(3), gap)))
 
 
-def measure(task: Task, num_episodes: int = NUM_EPISODES) -> dict[str, float]:
+def measure_contrast(task: Task, num_episodes: int = NUM_EPISODES) -> dict[str, float]:
     """Medians over the enemies that a randomly walking agent meets.
 
     Returns: num_enemies (sightings), contrast, separation.
@@ -104,8 +104,8 @@ def main() -> None:
     textures = [a.name for a in scenario.attributes if "textures" in a.groups]
     rest = tuple(name for name in scenario.complete if name not in textures)
     sets = {"default": (), **{f"complete with {name}": (name, *rest) for name in textures}}
-    rows = {name: measure(Task(scenario, attributes)) for name, attributes in sets.items()}
-    FILE.write_text(json.dumps({"command": "python -m gvz.evaluation.contrast", "rows": rows}, indent=1) + "\n")
+    rows = {name: measure_contrast(Task(scenario, attributes)) for name, attributes in sets.items()}
+    FILE.write_text(json.dumps({"command": "python -m benchmarks.contrast", "rows": rows}, indent=1) + "\n")
     print(FILE.read_text())
 
 

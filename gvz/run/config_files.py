@@ -1,0 +1,181 @@
+"""The files of configurations: a Python file in configs/ or elsewhere, and the JSON of a run directory."""
+
+import dataclasses
+import importlib.util
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, get_args, get_type_hints
+
+from gvz.core.env_config import typed
+from gvz.core.errors import ConfigError, nearest
+from gvz.run.config import RunConfig
+from learner.config import AgentConfig, LearnerConfig, OnPolicyConfig, agent_config_class
+
+CONFIG_SCHEMA = 2
+"""Raised by one whenever a saved config.json can no longer be read as before."""
+
+
+def configs_directory() -> Path:
+    """The installed configs package: beside gvz in a checkout and in a wheel."""
+    spec = importlib.util.find_spec("configs")
+    if spec is None or not spec.submodule_search_locations:
+        raise ConfigError("configs: the package of config files is not installed beside gvz; reinstall gvizdoom")
+    return Path(next(iter(spec.submodule_search_locations)))
+
+
+def find_config_file(text: str) -> Path:
+    """A bare name is found in configs/ (with or without .py); anything with a separator is a path.
+
+    Raises:
+        ConfigError: no such file; names the nearest.
+    """
+    path = Path(text)
+    is_name = path.name == text
+    if is_name:
+        path = configs_directory() / (text if text.endswith(".py") else f"{text}.py")
+    try:
+        if path.is_file():
+            return path
+    except OSError as error:  # a name too long, a directory that may not be entered
+        raise ConfigError(f"--config: {text!r} cannot be read: {error.strerror}") from error
+    if not is_name:
+        raise ConfigError(f"--config: no file {text!r} here ({Path.cwd()})")
+    names = sorted(p.stem for p in configs_directory().glob("*.py") if p.stem != "__init__")
+    hint = nearest(Path(text).stem, names)
+    raise ConfigError(f"--config: no config {text!r}{hint}; there are {', '.join(names)} (or give a path: ./{text})")
+
+
+def load_config(text: str) -> RunConfig:
+    """Runs a config file and returns its `CONFIG`.
+
+    Raises:
+        ConfigError: no such file, it fails, or it does not define `CONFIG: RunConfig`.
+    """
+    path = find_config_file(text)
+    namespace: dict[str, Any] = {"__name__": f"configs.{path.stem}", "__file__": str(path)}
+    try:
+        exec(compile(path.read_text(), str(path), "exec"), namespace)
+        config = namespace.get("CONFIG")
+        if not isinstance(config, RunConfig):
+            raise ConfigError(f"got {type(config).__name__} for CONFIG, want `CONFIG = RunConfig(...)`")
+        return build_config(dataclasses.asdict(config), "CONFIG", type(config.agent))  # checks the types
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    except Exception as error:  # a config file is the user's own program: anything may come out of it
+        raise ConfigError(f"{path}: {type(error).__name__}: {error}") from error
+
+
+def config_to_dict(config: RunConfig) -> dict[str, Any]:
+    """The configuration with its derived values, as plain JSON types."""
+
+    def plain(value: Any) -> Any:
+        if dataclasses.is_dataclass(value):
+            return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        if isinstance(value, tuple):
+            return [plain(v) for v in value]
+        return str(value) if isinstance(value, Path) else value
+
+    return {
+        "schema": CONFIG_SCHEMA,
+        "config": plain(config),
+        "resolved": {
+            "tasks": list(config.table.ids),
+            "num_actors": config.num_actors,
+            "games_per_actor": config.games_per_actor,
+            "support": config.support,
+        },
+    }
+
+
+def config_from_dict(saved: Any, agent_file: Path | None = None) -> RunConfig:
+    """The configuration that `config_to_dict` wrote, with the derived numbers it ran with made explicit.
+
+    Args:
+        saved: what was written, by this version or by one before it.
+        agent_file: the Python file of the run's agent, if it has one; it is executed. The path that `saved` has is not.
+
+    Raises:
+        ConfigError: another schema, an unknown or missing key, a wrong type or value, or an agent's file is missing.
+    """
+    if isinstance(saved, dict) and saved.get("schema") == 1:
+        saved = _from_schema_1(saved)
+    if not isinstance(saved, dict) or saved.get("schema") != CONFIG_SCHEMA:
+        raise ConfigError(f"saved configuration: want a map with schema {CONFIG_SCHEMA}")
+    plain, kind = saved.get("config"), AgentConfig
+    match plain:
+        case {"agent": {"name": str(name), **agent}}:
+            if name.endswith(".py"):
+                if agent_file is None:
+                    raise ConfigError(
+                        f"its agent is a Python file ({name}), which is never executed only because a run directory "
+                        f"names it; if you trust that file, name it: --agent {name}"
+                    )
+                name = str(agent_file)
+                plain = {**plain, "agent": {**agent, "name": name}}
+            kind = agent_config_class(name)
+        case _:  # what is wrong is said below
+            pass
+    config = build_config(plain, "config", kind)
+    resolved = _from_plain(_Resolved, saved.get("resolved"), "resolved")
+    if resolved.tasks != (tasks := config.table.ids):
+        raise ConfigError(f"resolved.tasks: got {list(resolved.tasks)}, but the configuration has {list(tasks)}")
+    config = config.with_support(resolved.support)
+    if config.mode == "sync":
+        return config
+    numbers = {"num_actors": resolved.num_actors, "games_per_actor": resolved.games_per_actor}
+    return dataclasses.replace(config, actors=dataclasses.replace(config.actors, **numbers))
+
+
+def build_config(plain: Any, where: str, agent: type[AgentConfig]) -> RunConfig:
+    """A RunConfig from a map of JSON types, whose agent is of this class.
+
+    Raises:
+        ConfigError: an unknown or missing key, or a wrong type or value; names the field behind `where`.
+    """
+    learner = OnPolicyConfig if agent.on_policy else LearnerConfig
+    return _from_plain(RunConfig, plain, where, {"agent": agent, "learner": learner})
+
+
+def _from_schema_1(saved: dict[str, Any]) -> dict[str, Any]:
+    """What a version before this one wrote: every agent had the fields of Rainbow, those it did not use included."""
+    match saved:
+        case {"config": {"agent": {**agent}, **plain}, "resolved": {**resolved}}:
+            if agent.get("name") == "dqn":
+                fields = {f.name for f in dataclasses.fields(agent_config_class("dqn"))}
+                agent = {name: value for name, value in agent.items() if name in fields}
+            resolved = {"support" if name == "value_range" else name: value for name, value in resolved.items()}
+            return {"schema": CONFIG_SCHEMA, "config": {**plain, "agent": agent}, "resolved": resolved}
+        case _:
+            return saved
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Resolved:
+    """What a run derived from its configuration and its machine."""
+
+    tasks: tuple[str, ...]
+    num_actors: int
+    games_per_actor: int
+    support: tuple[float, float] | None = None
+    """missing in runs of older versions"""
+
+
+def _from_plain(kind: Any, value: Any, where: str, kinds: Mapping[str, Any] = MappingProxyType({})) -> Any:
+    """Builds a value of type `kind` from JSON types, strictly. `kinds`: the classes of fields that may have several."""
+    if type(None) in get_args(kind):
+        if value is None:
+            return None
+        kind = next(arg for arg in get_args(kind) if arg is not type(None))
+    if not dataclasses.is_dataclass(kind) or not isinstance(kind, type):
+        return typed(kind, value, where)
+    if not isinstance(value, dict):
+        raise ConfigError(f"{where}: got {type(value).__name__}, want a map")
+    hints = {**get_type_hints(kind), **kinds}
+    if unknown := sorted(value.keys() - hints.keys()):
+        raise ConfigError(f"{where}.{unknown[0]}: unknown key{nearest(unknown[0], hints)}")
+    needed = {f.name for f in dataclasses.fields(kind) if f.default is f.default_factory is dataclasses.MISSING}
+    if missing := sorted(needed - value.keys()):
+        raise ConfigError(f"{where}.{missing[0]}: missing")
+    return kind(**{key: _from_plain(hints[key], item, f"{where}.{key}") for key, item in value.items()})

@@ -1,0 +1,55 @@
+"""What may change in the configuration of a run that is resumed."""
+
+from typing import Any
+
+from gvz.core.env_config import leaves
+from gvz.run.config import RunConfig
+
+_MAY_CHANGE = (
+    "run_dir",
+    "name",
+    "max_processor_s",
+    "learner.total_updates",
+    "actors.ring_capacity",
+    "actors.start_timeout_s",
+    "actors.heartbeat_timeout_s",
+    "actors.max_restarts",
+    "actors.restart_window_s",
+    "actors.recycle_episodes",
+    "learner.num_updates_per_call",
+    "agent.conv_form",
+    "checkpoint.*",
+    "log.*",
+)
+"""Fields that leave a run what it was. Everything else changes its meaning."""
+
+
+def differences(old: RunConfig, new: RunConfig) -> list[str]:
+    """`field: old -> new` for every difference that would change the meaning of a run that goes on.
+
+    Args:
+        old: as it was saved, with the range of its atoms (`config_from_dict`).
+        new: as it was given: an open range is what it is derived to be now.
+    """
+
+    def may_change(name: str) -> bool:
+        return name in _MAY_CHANGE or f"{name.split('.')[0]}.*" in _MAY_CHANGE
+
+    before, after = _values(old), _values(new.with_support(new.support))
+    names = [name for name in {**before, **after} if not may_change(name)]
+    changed = [f"{k}: {before.get(k)} -> {after.get(k)}" for k in names if before.get(k) != after.get(k)]
+    if new.learner.total_updates < old.learner.total_updates:
+        changed.append(
+            f"learner.total_updates: {old.learner.total_updates} -> {new.learner.total_updates} (it may only grow)"
+        )
+    return changed
+
+
+def _values(config: RunConfig) -> dict[str, Any]:
+    """Every field by its dotted name, with the tasks and sizes that follow from the fields."""
+    derived = {
+        "tasks": config.table.ids,
+        "actors.num_actors": config.num_actors,
+        "actors.games_per_actor": config.games_per_actor,
+    }
+    return {k: v for k, v in {**dict(leaves(config)), **derived}.items() if k not in ("scenario", "training_set")}

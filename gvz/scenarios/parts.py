@@ -1,0 +1,27 @@
+"""Parts of content that several scenarios have."""
+
+from collections.abc import Iterable, Mapping
+
+from gvz.scenarios.base import Attribute, Content, Textures, Thing, Uniform
+
+RESIZED = Content(entity={"ScaleX": Uniform(0.3, 3.0), "ScaleY": Uniform(0.3, 3.0)})
+"""enemies or kits of any width and height"""
+COUNTED_MARINE = {"MarineChainsawVzd": "ACTOR MarineChainsawVzd : MarineChainsaw\n{\n  +COUNTKILL\n}\n"}
+"""class name -> definition: a marine with a chainsaw whose death counts as a kill"""
+_MAP_SPOT = 9001
+"""editor number of a place that scripts find by its tid"""
+
+
+def retextured(name: str, wall: str, floor: str, ceiling: str) -> Attribute:
+    """An attribute that changes all textures."""
+    return Attribute(name=name, groups=("textures",), content=Content(textures=Textures(wall, floor, ceiling)))
+
+
+def things_at(places: Mapping[int, Iterable[tuple[float, float]]]) -> tuple[Thing, ...]:
+    """Things by editor number at these places, map units."""
+    return tuple(Thing(number, x, y) for number, spots in places.items() for x, y in spots)
+
+
+def starts_at(places: Iterable[tuple[float, float]], first_tid: int) -> tuple[Thing, ...]:
+    """Places for the agent to start at, map units; their tids are consecutive."""
+    return tuple(Thing(_MAP_SPOT, x, y, tid) for tid, (x, y) in enumerate(places, first_tid))

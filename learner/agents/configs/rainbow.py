@@ -1,0 +1,82 @@
+"""What can be set of Rainbow."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Annotated, Literal, Self
+
+from gvz.core.errors import ConfigError
+from learner.config import Range, Share, ValueConfig
+
+Noisy = Literal["off", "factorized", "independent"]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RainbowConfig(ValueConfig):
+    """Rainbow (thesis 4.2). Each of its parts is one switch; with all of them off it is DQN.
+
+    Source: thesis Tables 5.1 and 5.2.
+    """
+
+    name: str = "rainbow"
+    """module in learner/agents, or the path of a Python file (docs/AGENTS.md)"""
+    double: bool = True
+    """double Q-learning (thesis eq. 4.9)"""
+    dueling: bool = True
+    """dueling streams (eq. 4.10)"""
+    noisy: Noisy = "factorized"
+    """noisy linear layers (eq. 4.14); off explores by epsilon"""
+    distributional: bool = True
+    """categorical distributional loss (eq. 4.17); off uses the Huber loss"""
+    n_steps: int = 3
+    """n of the n-step return (eq. 4.15); 1 switches it off"""
+    num_atoms: Annotated[int, Range(2, 1001)] = 51
+    """atoms of the return distribution"""
+    num_quantiles: Annotated[int, Range(0, 1000)] = 0
+    """quantiles of the return distribution in place of atoms: quantile regression needs no range; 0: atoms"""
+    munchausen: bool = False
+    """add the clipped log-probability of the action to the reward, and bootstrap softly (not with atoms)"""
+    munchausen_alpha: Share = 0.9
+    """scale of that bonus"""
+    munchausen_temperature: Annotated[float, Range(1e-6, 100.0)] = 0.03
+    """temperature of the softmax policy, in units of the return"""
+    v_min: float | None = None
+    """smallest atom; default from the scenario's reward range"""
+    v_max: float | None = None
+    """largest atom; default from the scenario's reward range"""
+    noisy_sigma: Annotated[float, Range(0.0, 10.0)] = 0.017
+    """initial sigma of the noisy layers"""
+    noisy_epsilon: Share = 0.0
+    """probability of a uniformly random action beside the noise"""
+
+    def __post_init__(self) -> None:
+        ValueConfig.__post_init__(self)  # super() knows no class with slots
+        if self.num_quantiles and not self.distributional:
+            raise ConfigError("agent.num_quantiles: got quantiles of no distribution; want agent.distributional True")
+        if self.munchausen and self.has_atoms:
+            raise ConfigError(
+                "agent.munchausen: got True with atoms, for which no form is published; set agent.num_quantiles, or "
+                "agent.distributional False"
+            )
+        if self.v_min is not None and self.v_max is not None and not self.v_min < self.v_max:
+            raise ConfigError(f"agent.v_min, v_max: got {self.v_min}, {self.v_max}, want v_min < v_max")
+
+    @property
+    def has_atoms(self) -> bool:
+        """The return distribution is categorical."""
+        return self.distributional and self.num_quantiles == 0
+
+    def value_range(self, v_min: float, v_max: float) -> tuple[float, float]:
+        """(v_min, v_max) as configured; what is left open is the given one, that of the run's returns."""
+        return v_min if self.v_min is None else self.v_min, v_max if self.v_max is None else self.v_max
+
+    def support(self, v_min: float, v_max: float) -> tuple[float, float] | None:
+        return self.value_range(v_min, v_max) if self.has_atoms else None
+
+    def with_support(self, v_min: float, v_max: float) -> Self:
+        return dataclasses.replace(self, v_min=v_min, v_max=v_max) if self.has_atoms else self
+
+    def epsilon(self, env_steps: int) -> float:
+        return ValueConfig.epsilon(self, env_steps) if self.noisy == "off" else self.noisy_epsilon
+
+
+CONFIG = RainbowConfig

@@ -1,0 +1,365 @@
+"""Varied maps: what is drawn, what never is; the same map everywhere; the game of the default task."""
+
+import dataclasses
+import hashlib
+import os
+import re
+import subprocess
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
+from math import dist, hypot
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gvz.core.env_config import EnvConfig
+from gvz.core.errors import EngineError, ResourceError
+from gvz.engine.engine import Engine
+from gvz.engine.probe import _faults
+from gvz.env import DoomEnv
+from gvz.evaluation import gallery
+from gvz.evaluation.play import play_episode
+from gvz.evaluation.players import ScriptedPlayer
+from gvz.evaluation.simple import player_env
+from gvz.run.config import RunConfig
+from gvz.scenarios import varied
+from gvz.scenarios.base import BOOKKEEPING, Content, Scenario, Task
+from gvz.scenarios.compiler import CompiledTask, compile_task, map_source, task_content
+from gvz.scenarios.varied import FLATS, LOOSE, SOLID, STYLES, WALLS
+from gvz.tasks import named_tasks, parse_task, scenarios
+from gvz.wad.lumps import read_maps, read_wad
+from gvz.wad.stock import stock_editor_numbers, stock_textures
+from gvz.wad.udmf import UdmfMap, is_inside, parse_textmap
+from tests.episodes import fingerprint
+from tests.scenarios.pictures import colours, moving, picture, thumbnail
+
+SCENARIOS = list(scenarios().values())
+LEAST_DIFFERENCE = 6.0
+"""of two 16x16 thumbnails, 0 to 255, on average: FLOOR0_6 and FLOOR0_5 differ by 0.3, STONE3 and STONE2 by 5.2"""
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path / "maps"))
+    return tmp_path / "maps"
+
+
+def contents() -> list[Content]:
+    """What all named tasks hold, in both profiles."""
+    return [task_content(task, profile) for task in named_tasks() for profile in ("thesis", "levdoom")]
+
+
+def named_textures() -> set[str]:
+    textures = [content.textures for content in contents()]
+    return {name for one in textures if one is not None for name in (one.wall, one.floor, one.ceiling)}
+
+
+def drawn_map(scenario: Scenario, number: int) -> UdmfMap:
+    return parse_textmap(map_source(Task(scenario, num_maps=50), "thesis", number).textmap)
+
+
+def look(scenario: Scenario, number: int) -> Content:
+    """The content of a drawn map."""
+    return varied.draw_look(scenario, task_content(Task(scenario), "thesis"), drawn_map(scenario, number), number)
+
+
+# --------------------------------------------------------------------------------------------- what never is drawn
+
+
+def test_no_texture_of_a_named_task_is_drawn_and_no_near_copy_of_one():
+    used = named_textures()
+    assert len(used) == 38
+    assert not used & {*WALLS, *FLATS}
+    for name in (*WALLS, *FLATS):
+        for other in used:
+            difference = np.abs(thumbnail(name) - thumbnail(other)).mean()
+            assert difference >= LEAST_DIFFERENCE, f"{name} looks like {other}"
+
+
+def test_no_decoration_of_a_named_task_is_drawn():
+    used = {thing.type for content in contents() for things in content.things.values() for thing in things}
+    assert {26, 28, 29, 30, 32, 36, 42, 44, 45, 46} <= used
+    assert not used & {*SOLID, *LOOSE}
+    assert {*SOLID, *LOOSE} <= stock_editor_numbers()
+
+
+def test_no_render_style_of_a_named_task_is_drawn():
+    used = {content.entity.get("RenderStyle") for content in contents()}
+    assert used == {None, "STYLE_Fuzzy", "STYLE_Shaded", "STYLE_Shadow"}
+    assert not used & set(STYLES)
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=str)
+def test_maps_hold_nothing_but_what_is_in_the_pools(scenario: Scenario):
+    default = parse_textmap(map_source(Task(scenario), "thesis").textmap)
+    own = {thing["type"] for thing in default.things}
+    extra = {*SOLID, *LOOSE} if scenario.variety.solid else {*LOOSE, *(19000 + kind for kind in SOLID)}
+    counts = []
+    for number in range(50):
+        room = drawn_map(scenario, number)
+        walls = {side["texturemiddle"] for side in room.sidedefs if "texturemiddle" in side}
+        planes = {sector[name] for sector in room.sectors for name in ("texturefloor", "textureceiling")}
+        assert walls | planes <= {*WALLS, *FLATS}
+        assert len(walls) <= 3
+        kinds = {thing["type"] for thing in room.things} - own
+        assert kinds <= extra
+        assert len(kinds) <= 4
+        counts.append(len(room.things) - len(default.things))
+        assert {sector["lightlevel"] for sector in room.sectors} <= set(range(192, 256))
+        content = look(scenario, number)
+        assert content.entity.get("RenderStyle") in (None, *STYLES)
+        assert content.entity.get("ScaleX") == content.entity.get("ScaleY")
+        assert 0.8 <= content.entity.get("ScaleX", 1.0) <= 1.25
+    assert min(counts) <= 2
+    assert scenario.variety.max_decorations / 2 < max(counts) <= scenario.variety.max_decorations
+
+
+def test_textures_can_be_seen_and_stand_still():
+    assert len({*WALLS, *FLATS}) == len(WALLS) + len(FLATS) >= 300
+    assert {*WALLS, *FLATS} <= stock_textures()
+    assert {"NUKAGE1", "FIREWALL", "SLIME04"} <= moving()
+    assert not {*WALLS, *FLATS} & moving()
+    for name in (*WALLS, *FLATS):
+        assert picture(name).min() >= 0, f"{name} has holes"
+        luminance = colours(name) @ [0.299, 0.587, 0.114]
+        assert 28 <= luminance.mean() <= 150, name
+        assert luminance.std() <= 38, name
+        assert not name.startswith(("SKY", "F_SKY", "SW1", "SW2")), name
+
+
+# ------------------------------------------------------------------------------------------ what is the default task's
+
+
+@pytest.mark.parametrize("profile", ["thesis", "levdoom"])
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=str)
+def test_nothing_but_looks_differs_from_the_default_task(scenario: Scenario, profile):
+    default = task_content(Task(scenario), profile)
+    looks = {"ScaleX", "ScaleY", "RenderStyle", "Alpha", "StencilColor"}
+    for number in range(20):
+        content = varied.draw_look(scenario, default, drawn_map(scenario, number), number)
+        assert {k: v for k, v in content.entity.items() if k not in looks} == default.entity
+        assert (content.agent, content.base_wad, content.things) == (default.agent, default.base_wad, default.things)
+        for name, value in default.parameters.items():
+            drawn = content.parameters[name]
+            if name in scenario.variety.entity_parameters:  # classes that inherit all but their colours
+                drawn, value = (re.sub(r"Tint\d+", "", str(one)) for one in (drawn, value))
+            assert drawn == value, name
+        for name, text in content.actors.items():
+            if name not in default.actors:
+                assert re.fullmatch(r'ACTOR \w+ : \w+(?: 19\d+| 2\d+)?\n{\n  (?:Translation ".*"|-SOLID)\n}\n', text)
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=str)
+def test_decorations_stand_inside_the_map_and_clear_of_starts_enemies_and_each_other(scenario: Scenario):
+    num_own = len(parse_textmap(map_source(Task(scenario), "thesis").textmap).things)
+    found = 0
+    for number in range(50):
+        room = drawn_map(scenario, number)
+        starts = [(t["x"], t["y"]) for t in room.things if t["type"] in (1, 9001)]
+        places = [(t["x"], t["y"]) for t in room.things if t["type"] not in (1, 9001)]
+        assert len(starts) == num_own
+        for place in places:
+            assert is_inside(room, *place)
+            assert min(dist(place, start) for start in starts) >= 128
+            if scenario.id == "defend_the_center":
+                assert hypot(*place) <= 735 - 100
+            if scenario.id == "dodge_projectiles":
+                assert -448 + 100 <= place[0] <= 96 - 64
+        pairs = ((one, other) for n, one in enumerate(places) for other in places[:n])
+        assert all(dist(one, other) >= 112 for one, other in pairs)
+        found += len(places)
+    assert found > 50
+
+
+def test_the_places_of_a_square_are_inside_it_and_know_how_far_its_walls_are():
+    corners = [(0.0, 0.0), (64.0, 0.0), (64.0, 64.0), (0.0, 64.0)]
+    square = tuple(zip(corners, corners[1:] + corners[:1], strict=True))
+    places = varied.open_places(square, (True,) * 4)
+    assert {(x, y) for x, y, _ in places if x and y} == {(x, y) for x in (16, 32, 48) for y in (16, 32, 48)}
+    assert {(x, y): to_wall for x, y, to_wall in places}[16, 32] == 16
+
+
+# ------------------------------------------------------------------------------------------------ the same everywhere
+
+
+def digest(scenario: Scenario, numbers: range) -> str:
+    texts = [str(map_source(Task(scenario, num_maps=50), "thesis", number)) for number in numbers]
+    return hashlib.sha256("".join(texts).encode()).hexdigest()[:16]
+
+
+def test_a_map_is_drawn_from_its_number_alone():
+    centre = SCENARIOS[0]
+    one = map_source(Task(centre, num_maps=10), "thesis", 7)
+    assert one == map_source(Task(centre, num_maps=1000), "thesis", 7)
+    texts = [map_source(Task(centre, num_maps=50), "thesis", number).textmap for number in range(50)]
+    assert len(set(texts)) == 50
+    code = "import tests.scenarios.test_varied as t; print([t.digest(one, range(3)) for one in t.SCENARIOS])"
+    env = {**os.environ, "PYTHONHASHSEED": "7"}
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == str([digest(one, range(3)) for one in SCENARIOS])
+
+
+def test_the_first_maps_are_those_that_runs_were_trained_on():
+    """If they change, say so in the changelog: a score over the number of training maps would not compare."""
+    assert {one.id: digest(one, range(3)) for one in SCENARIOS} == {
+        "defend_the_center": "4bcf4c8692a684b0",
+        "dodge_projectiles": "e253bd10b8edd907",
+        "health_gathering": "7ea06c724b783534",
+        "seek_and_kill": "b597e6f7d3d30912",
+    }
+
+
+@pytest.mark.usefixtures("cache")
+def test_an_episodes_map_is_its_seed_modulo_the_number_of_maps():
+    compiled = compile_task(parse_task("defend_the_center/varied-3"))
+    assert len(set(compiled.map_magics)) == 3
+    assert [compiled.map_of(seed) for seed in (0, 1, 2, 3, 2**31 - 1)] == [
+        (f"VARY000{number}", compiled.map_magics[number]) for number in (0, 1, 2, 0, (2**31 - 1) % 3)
+    ]
+    maps = read_maps(read_wad(compiled.wad_path.read_bytes()))
+    assert list(maps) == ["VARY0000", "VARY0001", "VARY0002"]
+    for (name, lumps), magic in zip(maps.items(), compiled.map_magics, strict=True):
+        assert f"map_magic = {magic};" in lumps["SCRIPTS"].decode(), name
+
+
+# ----------------------------------------------------------------------------------------------------------- the cache
+
+
+@pytest.mark.usefixtures("cache")
+def test_the_file_of_all_maps_is_built_once():
+    task = parse_task("dodge_projectiles/varied-4")
+    path = compile_task(task).wad_path
+    written, whole = path.stat().st_mtime_ns, path.read_bytes()
+    assert compile_task(task) == CompiledTask(task=task, wad_path=path, map_magics=compile_task(task).map_magics)
+    assert path.stat().st_mtime_ns == written
+    assert compile_task(parse_task("dodge_projectiles/varied-5")).wad_path != path
+    for damage in (b"", whole[:-1], whole[:200] + b"x" + whole[201:]):
+        path.write_bytes(damage)
+        assert compile_task(task).wad_path == path
+        assert path.read_bytes() == whole
+
+
+@pytest.mark.usefixtures("cache")
+def test_another_code_that_draws_makes_another_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    task = parse_task("dodge_projectiles/varied-2")
+    path = compile_task(task).wad_path
+    code = tmp_path / "varied.py"
+    code.write_text(Path(varied.__file__).read_text() + "\n")
+    monkeypatch.setattr(varied, "__file__", str(code))
+    assert compile_task(task).wad_path != path
+
+
+def _compile(task_id: str) -> CompiledTask:
+    return compile_task(parse_task(task_id))
+
+
+def test_many_processes_build_one_file(cache: Path):
+    with ProcessPoolExecutor(3, mp_context=get_context("spawn")) as pool:
+        results = list(pool.map(_compile, ["health_gathering/varied-30"] * 6))
+    assert len({(one.wad_path, one.map_magics) for one in results}) == 1
+    assert list(cache.iterdir()) == [results[0].wad_path]
+
+
+def test_a_cache_that_cannot_be_written_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path / "file" / "below"))
+    with pytest.raises(ResourceError, match=r"map cache .*set GVZ_CACHE_DIR"):
+        compile_task(parse_task("dodge_projectiles/varied-2"))
+
+
+def test_training_on_varied_maps_has_the_scenarios_range_of_returns():
+    drawn = RunConfig(name="drawn", tasks=("seek_and_kill/varied", "seek_and_kill/varied-10"))
+    default = RunConfig(name="default", tasks=("seek_and_kill/default",))
+    assert [task.num_maps for task in drawn.table.tasks] == [1000, 10]
+    assert drawn.support == default.support
+
+
+# ----------------------------------------------------------------------------------------------------------- the games
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=str)
+def test_every_map_plays_and_is_the_right_one(scenario: Scenario):
+    """The environment compares the running map's magic number with the one of the episode's map."""
+    with closing(DoomEnv(Task(scenario, num_maps=12), buffers=("labels",))) as env:
+        frames = []
+        for number in (*range(12), 5):
+            observation, info = env.reset(seed=None, options={"episode_seed": 12 + number})
+            assert info["episode_seed"] == 12 + number
+            frames.append(observation["screen"].tobytes())
+            env.step(0)
+        assert len(set(frames)) == 12
+        assert frames[-1] == frames[5]
+        assert env._engine is not None
+        log = env._engine.log.read_text(errors="replace")
+        assert [line for line in _faults(log) if "bots read" not in line] == []
+
+
+@pytest.mark.engine
+def test_another_map_than_the_episodes_is_noticed():
+    with closing(DoomEnv("defend_the_center/varied-3")) as env:
+        env._compiled = dataclasses.replace(env._compiled, map_magics=(1, 2, 3))
+        with pytest.raises(EngineError, match=r"varied-3: .* a map with magic number \d+, want 2, that of VARY0001"):
+            env.reset(options={"episode_seed": 4})
+
+
+@pytest.mark.engine
+def test_a_map_that_is_not_in_the_file_is_an_error():
+    with closing(DoomEnv("defend_the_center/varied-3")) as env:
+        engine = Engine(env._engine_config)
+    with closing(engine):
+        for _ in range(2):
+            with pytest.raises(EngineError, match="got the map VARY0003, want one of the file"):
+                engine.new_episode(1, "VARY0003")
+            engine.new_episode(1, "VARY0002")
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("scenario", ["defend_the_center", "seek_and_kill"])
+def test_an_episode_is_the_same_after_any_others_and_in_any_engine(scenario: str):
+    with closing(DoomEnv(f"{scenario}/varied-5")) as env:
+        first = {seed: fingerprint(env, seed) for seed in (3, 6, 1, 4)}
+        assert len(set(first.values())) == 4
+        again = {seed: fingerprint(env, seed) for seed in (4, 4, 3, 1, 6)}
+    with closing(DoomEnv(f"{scenario}/varied-5", recycle_episodes=1)) as env:
+        fresh = {seed: fingerprint(env, seed) for seed in (6, 3)}
+    assert again == first
+    assert fresh == {seed: first[seed] for seed in fresh}
+
+
+@pytest.mark.engine
+def test_an_engine_starts_episodes_on_the_map_it_is_told():
+    compiled = compile_task(parse_task("defend_the_center/varied-3"))
+    with closing(DoomEnv("defend_the_center/varied-3")) as env:
+        engine = Engine(env._engine_config)
+    with closing(engine):
+        ran = []
+        for name in ("VARY0002", None, "VARY0000", "VARY0000", "VARY0001"):
+            state = engine.new_episode(1, name)
+            ran.append(engine.variable(BOOKKEEPING["MAP_MAGIC"]))
+            np.testing.assert_array_equal(state.screen_buffer, engine.screen)
+            assert engine.tic() == 10
+        assert ran == [compiled.map_magics[number] for number in (2, 2, 0, 0, 1)]
+
+
+@pytest.mark.engine
+def test_a_player_that_is_told_where_enemies_are_lives_as_long_as_in_the_default_task():
+    """Measured, 60 episodes each: 1020 frames (95% interval 978 to 1055) and 1043 (1006 to 1074)."""
+    means = []
+    for name in ("varied", "default"):
+        with closing(DoomEnv(f"defend_the_center/{name}", player_env("scripted", EnvConfig()))) as env:
+            means.append(np.mean([play_episode(env, ScriptedPlayer(), number)["score"] for number in range(12)]))
+    assert min(means) > 0.85 * max(means)
+
+
+@pytest.mark.engine
+def test_a_sheet_shows_different_maps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setattr(gallery, "NUM_VARIED", 2)
+    file = gallery.write_contact_sheet(SCENARIOS[0], tmp_path, "varied")
+    assert file.name == "varied_defend_the_center.png"
+    width = gallery.FRAME_WIDTH + 2
+    sheet = np.asarray(gallery.Image.open(file).convert("RGB"))[: gallery.FRAME_HEIGHT]
+    assert (sheet[:, : width - 2] != sheet[:, width : 2 * width - 2]).mean() > 0.3
