@@ -1,4 +1,4 @@
-"""A window that shows a game."""
+"""A window that shows a game and notes the keys that are pressed in it."""
 
 import os
 
@@ -29,6 +29,8 @@ class Window:
 
         self._pygame = pygame
         self.closed = False
+        self._down: list[str] = []
+        self._released: set[str] = set()
         scale = max(1, -(-_MIN_HEIGHT // height))
         try:
             pygame.display.init()
@@ -46,10 +48,28 @@ class Window:
         picture = self._pygame.surfarray.make_surface(frame.swapaxes(0, 1))
         self._pygame.transform.scale(picture, self._surface.get_size(), self._surface)
         self._pygame.display.flip()
-        for event in self._pygame.event.get():  # else the desktop would call the window unresponsive
-            escape = event.type == self._pygame.KEYDOWN and event.key == self._pygame.K_ESCAPE
-            self.closed = self.closed or escape or event.type == self._pygame.QUIT
+        self._read_events()  # else the desktop would call the window unresponsive
+
+    def pressed_keys(self) -> tuple[str, ...]:
+        """pygame's names of the keys that are down, or were since the last call: the one pressed last comes last."""
+        self._read_events()
+        found = tuple(self._down)
+        self._down = [key for key in self._down if key not in self._released]
+        self._released.clear()
+        return found
 
     def close(self) -> None:
         """Closes the window."""
         self._pygame.display.quit()
+
+    def _read_events(self) -> None:
+        pygame = self._pygame
+        for event in pygame.event.get():
+            if event.type == pygame.QUIT or (event.type == pygame.KEYDOWN and event.key == pygame.K_ESCAPE):
+                self.closed = True
+            elif event.type == pygame.KEYDOWN:
+                name = pygame.key.name(event.key)
+                self._down = [key for key in self._down if key != name] + [name]
+                self._released.discard(name)
+            elif event.type == pygame.KEYUP:
+                self._released.add(pygame.key.name(event.key))

@@ -88,8 +88,7 @@ class Record:
             events = self.choice.run_dir / "tensorboard" / "episodes"
             add_to_tensorboard(self.out, events, f"episode/{task.id}", player_spec.identity["num_updates"])
         [last] = shown
-        how = "died" if last.terminated else "reached the time-out" if last.truncated else "was cut off"
-        print(f"{self.out}: {name} {how} at tic {last.frames}, score {last.score:g}")
+        print(f"{self.out}: {name} {last.ending}")
         return 0
 
 

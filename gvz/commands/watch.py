@@ -2,13 +2,12 @@
 
 import contextlib
 import sys
-import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from gvz.core.errors import ConfigError, ResourceError
+from gvz.core.errors import ConfigError
 from gvz.evaluation.choice import ANY_EPISODE, EpisodeChoice
 from gvz.scenarios.base import Task
 
@@ -17,8 +16,6 @@ if TYPE_CHECKING:
     from gvz.viewer import Window
 
 EXIT_INTERRUPTED = 130
-END_S = 1.5
-"""for how long the last picture stays, seconds"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,16 +41,13 @@ class Watch:
         if self.speed <= 0:
             raise ConfigError(f"--speed: got {self.speed:g}, want more than 0")
         player_spec, task = self.choice.resolve()
-        from gvz.evaluation.panel import HEIGHT, WIDTH
-        from gvz.viewer import Window
+        from gvz.evaluation.window import open_window
 
-        try:
-            window = Window(f"{task.id}: {player_spec.identity['player']}", WIDTH, HEIGHT)
-        except ResourceError as error:
-            raise ResourceError(
-                "watch: no window can be opened, there seems to be no display ($DISPLAY); "
-                "`gvz record` writes the same pictures to a file"
-            ) from error
+        window = open_window(
+            "watch",
+            f"{task.id}: {player_spec.identity['player']}",
+            "`gvz record` writes the same pictures to a file",
+        )
         episode = self.choice.episode
         with contextlib.closing(window):
             try:
@@ -67,30 +61,16 @@ class Watch:
 
     def _show(self, window: "Window", player_spec: "PlayerSpec", task: Task, episode: int) -> None:
         """Plays an episode in the window, unless somebody closes it before."""
-        import numpy as np
-
-        from gvz.env import TICS_PER_SECOND
         from gvz.evaluation.panel import Panel
         from gvz.evaluation.play import Episode
         from gvz.evaluation.playback import perform
+        from gvz.evaluation.window import show
 
-        panel, begun_s = Panel(player_spec.identity["player"], task, player_spec.env), time.monotonic()
+        panel = Panel(player_spec.identity["player"], task, player_spec.env)
         with contextlib.closing(perform(player_spec, Episode(task.id, episode, self.choice.seed))) as moments:
-            for moment in moments:
-                if moment.frames == 0:
-                    begun_s = time.monotonic()  # the engines have started
-                late_s = time.monotonic() - begun_s - moment.frames / TICS_PER_SECOND / self.speed
-                ended = moment.terminated or moment.truncated
-                if late_s > 0 and not moment.decided and not ended:
-                    continue  # a slow machine shows every decision, but not every tic
-                time.sleep(max(-late_s, 0))
-                window.show(np.asarray(panel.draw(moment)))
-                if window.closed:
-                    return
-                if ended:
-                    how = "died" if moment.terminated else "reached the time-out"
-                    print(f"{task.id}, episode {episode}: {how} at tic {moment.frames}, score {moment.score:g}")
-                    time.sleep(END_S / self.speed)
+            last = show(window, panel, moments, speed=self.speed)
+        if last is not None:
+            print(f"{task.id}, episode {episode}: {last.ending}")
 
 
 COMMAND = Watch

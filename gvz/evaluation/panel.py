@@ -30,19 +30,20 @@ BAD: Colour = (236, 102, 92)
 LEVEL_COLOURS: Sequence[Colour] = ((235, 235, 235), (140, 220, 140), (230, 220, 110), (240, 165, 80), (240, 100, 90))
 """by the task's level"""
 
-MARGIN = 16
+MARGIN, NOTE_HEIGHT = 16, 18
 
 
 class Panel:
     """Draws the moments of one episode, in their order."""
 
-    def __init__(self, player: str, task: Task, env: EnvConfig):
-        """`player` is a name; `env` is what it plays in."""
+    def __init__(self, player: str, task: Task, env: EnvConfig, notes: Sequence[str] = ()):
+        """`player` is a name; `env` is what it plays in; `notes` are lines for the lower right corner."""
         self._task = task
         held = action_buttons(task.scenario, env.action_set)
         self._actions = ["+".join(buttons).replace("_", " ").lower() or "nothing" for buttons in held]
         self._bound = task.scenario.upper_bound(env.profile)
         self._timeout = task.scenario.timeout_frames(env.profile)
+        self._notes = notes
         self._value_range = (np.inf, -np.inf)
         self._timeline: list[tuple[int, float | None, float]] = []
         self._reward = 0.0
@@ -54,7 +55,7 @@ class Panel:
         """The picture of a moment; it is drawn over with the next one."""
         self._picture.paste(Image.fromarray(moment.screen), (0, HEAD_HEIGHT))
         if moment.terminated or moment.truncated:
-            self._draw_end("died" if moment.terminated else "time is up")
+            self.announce("died" if moment.terminated else "time is up")
         rewarded = moment.reward - self._reward
         if moment.decided or rewarded:
             value = None if moment.values is None else float(moment.values.q_values.max())
@@ -75,10 +76,13 @@ class Panel:
         size = _fitting(player, 16, SIDE_WIDTH - 2 * MARGIN)
         self._text((SCREEN_WIDTH + MARGIN, middle), player, size, TEXT, "lm")
 
-    def _draw_end(self, how: str) -> None:
+    def announce(self, text: str) -> Image.Image:
+        """The picture with a line of text over the game."""
         x, y = SCREEN_WIDTH / 2, HEAD_HEIGHT + SCREEN_HEIGHT / 3
-        self._draw.rounded_rectangle((x - 110, y - 26, x + 110, y + 26), 8, BACKGROUND)
-        self._text((x, y), how, 26, ACCENT, "mm")
+        half = max(110, _font(26).getlength(text) / 2 + 20)
+        self._draw.rounded_rectangle((x - half, y - 26, x + half, y + 26), 8, BACKGROUND)
+        self._text((x, y), text, 26, ACCENT, "mm")
+        return self._picture
 
     def _draw_side(self, moment: Moment) -> None:
         self._draw.rectangle((SCREEN_WIDTH, HEAD_HEIGHT, WIDTH, HEIGHT), BACKGROUND)
@@ -86,7 +90,9 @@ class Panel:
         y = self._draw_actions(moment, (left, HEAD_HEIGHT, right, 0))
         if moment.values is not None and moment.values.probabilities is not None and moment.action is not None:
             y = self._draw_returns(moment.values, moment.action, (left, y + 12, right, 0))
-        self._draw_rewards(moment, (left, y + 12, right, 0))
+        self._draw_rewards(moment, (left, y + 12, right, HEIGHT - NOTE_HEIGHT * len(self._notes)))
+        for n, note in enumerate(reversed(self._notes)):
+            self._text((left, HEIGHT - 8 - NOTE_HEIGHT * n), note, 13, FAINT, "ld")
 
     def _draw_actions(self, moment: Moment, box: Box) -> float:
         """A line an action, the held one marked, with its value if there are any. Returns where it ends."""
@@ -147,10 +153,10 @@ class Panel:
         return bottom + 22
 
     def _draw_rewards(self, moment: Moment, box: Box) -> None:
-        left, y, right, _ = box
+        left, y, right, bottom = box
         self._caption((left, y), "reward so far")
         y += 22
-        row = min(22, (HEIGHT - y - 10) // (len(moment.reward_components) + 1))
+        row = min(22, (bottom - y - 10) // (len(moment.reward_components) + 1))
         size = min(15, row - 3)
         for name, value in moment.reward_components.items():
             colour = GOOD if value > 0 else BAD if value < 0 else FAINT

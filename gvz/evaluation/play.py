@@ -69,6 +69,39 @@ def episode_seed(task: str, episode: int, base_seed: int = 0) -> int:
     return int.from_bytes(digest, "little") & 0x7FFFFFFF
 
 
+class Tally:
+    """Adds up the decisions of one episode for its row."""
+
+    def __init__(self, episode: Episode):
+        self.components: dict[str, float] = {}
+        self._episode = episode
+        self._reward, self._steps = 0.0, 0
+
+    def add(self, reward: float, info: Mapping[str, Any]) -> None:
+        """A decision's reward and info."""
+        self._reward += reward
+        self._steps += 1
+        for name, value in info["reward_components"].items():
+            self.components[name] = self.components.get(name, 0.0) + float(value)
+
+    def row(self, info: Mapping[str, Any], terminated: bool, truncated: bool) -> Row:
+        """The row of the episode, which ended with this info; `play_episode` says what is in it."""
+        return {
+            **self._episode._asdict(),
+            "seed": episode_seed(*self._episode),
+            "score": float(info["score"]),
+            "normalized_score": float(info["normalized_score"]),
+            "kills": float(info["kills"]),
+            "player_kills": float(info["player_kills"]),
+            "reward": self._reward,
+            "reward_components": self.components,
+            "length_frames": int(info["episode_frames"]),
+            "length_steps": self._steps,
+            "terminated": bool(terminated),
+            "truncated": bool(truncated),
+        }
+
+
 def play_episode(env: "DoomEnv", player: Player, episode: int, base_seed: int = 0) -> Row:
     """Plays one episode to its end.
 
@@ -84,32 +117,14 @@ def play_episode(env: "DoomEnv", player: Player, episode: int, base_seed: int = 
     for _ in range(MAX_ATTEMPTS):
         observation, info = env.reset(options={"episode_seed": seed})
         player.begin(env, observation, info, seed)
-        reward_sum, steps, components = 0.0, 0, {}
+        tally = Tally(Episode(task, episode, base_seed))
         terminated = truncated = False
         while not (terminated or truncated):
             observation, reward, terminated, truncated, info = env.step(player.act())
             player.observe(observation, info)
-            reward_sum += float(reward)
-            steps += 1
-            for name, value in info["reward_components"].items():
-                components[name] = components.get(name, 0.0) + float(value)
+            tally.add(float(reward), info)
         if not info.get("engine_crash", False):
-            return {
-                "task": task,
-                "episode": episode,
-                "base_seed": base_seed,
-                "seed": seed,
-                "score": float(info["score"]),
-                "normalized_score": float(info["normalized_score"]),
-                "kills": float(info["kills"]),
-                "player_kills": float(info["player_kills"]),
-                "reward": reward_sum,
-                "reward_components": components,
-                "length_frames": int(info["episode_frames"]),
-                "length_steps": steps,
-                "terminated": bool(terminated),
-                "truncated": bool(truncated),
-            }
+            return tally.row(info, terminated, truncated)
     raise EngineError(f"{task}, evaluation episode {episode} (seed {seed}): the engine died {MAX_ATTEMPTS} times")
 
 

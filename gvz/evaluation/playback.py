@@ -15,7 +15,7 @@ import numpy as np
 
 from gvz.core.errors import EngineError
 from gvz.env import DoomEnv
-from gvz.evaluation.play import Episode, PlayerSpec, episode_seed
+from gvz.evaluation.play import Episode, PlayerSpec, Row, Tally, episode_seed
 from gvz.evaluation.trained import TrainedPlayer, Values
 
 SCREEN_WIDTH, SCREEN_HEIGHT = 800, 450
@@ -43,6 +43,14 @@ class Moment:
     """tics since the episode's start"""
     terminated: bool = False
     truncated: bool = False
+    row: Row | None = None
+    """of the last moment: the episode's row of an evaluation"""
+
+    @property
+    def ending(self) -> str:
+        """Of the last moment that is shown: "died at tic 312, score 312"."""
+        how = "died" if self.terminated else "reached the time-out" if self.truncated else "was cut off"
+        return f"{how} at tic {self.frames}, score {self.score:g}"
 
 
 def perform(player_spec: PlayerSpec, episode: Episode) -> Generator[Moment, None, None]:
@@ -64,15 +72,16 @@ def perform(player_spec: PlayerSpec, episode: Episode) -> Generator[Moment, None
         stage_info = stage.reset(options={"episode_seed": seed})[1]
         player.begin(env, observation, info, seed)
         rewards: dict[str, float] = dict.fromkeys(info["reward_components"], 0.0)
+        tally = Tally(episode)
         yield _moment(stage, stage_info, rewards, decided=True)
         ended = False
         while not ended:
             action = np.int64(player.act())
             values = player.values if isinstance(player, TrainedPlayer) else None
-            observation, _, terminated, truncated, info = env.step(action)
+            observation, reward, terminated, truncated, info = env.step(action)
             ended = terminated or truncated
-            before = rewards
-            rewards = {name: before[name] + value for name, value in info["reward_components"].items()}
+            tally.add(float(reward), info)
+            before, rewards = rewards, dict(tally.components)
             for tic in range(player_spec.env.frame_skip):
                 _, _, stage_terminated, stage_truncated, stage_info = stage.step(action)
                 stage_ended = stage_terminated or stage_truncated
@@ -86,6 +95,7 @@ def perform(player_spec: PlayerSpec, episode: Episode) -> Generator[Moment, None
                     values=values,
                     terminated=stage_terminated,
                     truncated=stage_truncated,
+                    row=tally.row(info, terminated, truncated) if ended and done else None,
                 )
                 if done or stage_ended:
                     break
