@@ -213,7 +213,7 @@ def _tasks(budget: Budget) -> list[Row]:
     from gvz.tasks import named_tasks
 
     cores, tasks = (1 if budget.quick else len(os.sched_getaffinity(0))), named_tasks()
-    env = EnvConfig(action_set="unified")
+    env = EnvConfig(action_set="unified_v1")
     counts = (1, 2) if budget.quick else (1, 8, len(tasks))
     values: dict[float, list[float]] = {}
     with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:

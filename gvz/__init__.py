@@ -5,29 +5,40 @@ Tier 1. The modules beside this file belong to the benchmark, except the command
 `import gvz` registers every named task in Gymnasium: gymnasium.make("GViZDoom/DefendTheCenter-Gore-v0").
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 from gvz.core.env_config import LABEL_CLASSES
 from gvz.registration import register_with_gymnasium
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from gvz.env import DoomEnv
+    from gvz.multi_task import MultiTaskEnv
     from gvz.scenarios.base import Task
 
 __version__ = "0.1.0"
 __all__ = ["LABEL_CLASSES", "__version__", "make"]
 
 
-def make(task: "str | Task", **options: Any) -> "DoomEnv":
-    """The Gymnasium environment of a task.
+@overload
+def make(task: "str | Task", **options: Any) -> "DoomEnv": ...
+@overload
+def make(task: "Sequence[str | Task]", **options: Any) -> "MultiTaskEnv": ...
+def make(task: "str | Task | Sequence[str | Task]", **options: Any) -> "DoomEnv | MultiTaskEnv":
+    """The Gymnasium environment of a task, or of several tasks.
 
     Args:
-        task: `<scenario>/<attribute>+<attribute>...`, for example "defend_the_center/gore+mossy_bricks".
-        **options: arguments of gvz.env.DoomEnv and fields of gvz.core.env_config.EnvConfig.
+        task: `<scenario>/<attribute>+<attribute>...`, for example "defend_the_center/gore+mossy_bricks". With a list,
+            every episode is of one of the tasks (gvz.multi_task.MultiTaskEnv).
+        **options: arguments of gvz.env.DoomEnv and fields of gvz.core.env_config.EnvConfig; with a list of tasks,
+            also of gvz.multi_task.MultiTaskEnv.
     """
     from gvz.env import DoomEnv  # here, so that `import gvz` is quick
+    from gvz.multi_task import MultiTaskEnv
+    from gvz.scenarios.base import Task
 
-    return DoomEnv(task, **options)
+    return DoomEnv(task, **options) if isinstance(task, str | Task) else MultiTaskEnv(task, **options)
 
 
 register_with_gymnasium()

@@ -1,33 +1,70 @@
 """Discrete actions: the buttons that each action of a scenario holds."""
 
-from itertools import chain, combinations
-from typing import assert_never
+from itertools import chain, combinations, product
+from types import MappingProxyType
 
 from gvz.core.env_config import ActionSet
 from gvz.scenarios.base import Scenario
-from gvz.tasks import scenarios
+
+Buttons = tuple[str, ...]
+"""buttons that are held together"""
 
 _CONTRADICTORY = ({"TURN_LEFT", "TURN_RIGHT"}, {"MOVE_LEFT", "MOVE_RIGHT"}, {"MOVE_FORWARD", "MOVE_BACKWARD"})
 
+UNIFIED_V1: tuple[Buttons, ...] = (
+    (),
+    *(("ATTACK",), ("MOVE_FORWARD",), ("MOVE_BACKWARD",), ("MOVE_LEFT",), ("MOVE_RIGHT",)),
+    *(("TURN_LEFT",), ("TURN_RIGHT",), ("USE",)),
+    *(("ATTACK", "MOVE_FORWARD"), ("ATTACK", "MOVE_LEFT"), ("ATTACK", "MOVE_RIGHT")),
+    *(("ATTACK", "TURN_LEFT"), ("ATTACK", "TURN_RIGHT")),
+    *(("MOVE_FORWARD", "TURN_LEFT"), ("MOVE_FORWARD", "TURN_RIGHT")),
+    *(("SPEED", "MOVE_FORWARD"), ("SPEED", "MOVE_LEFT"), ("SPEED", "MOVE_RIGHT")),
+    *(("ATTACK", "MOVE_FORWARD", "TURN_LEFT"), ("ATTACK", "MOVE_FORWARD", "TURN_RIGHT")),
+)
+"""One list for all scenarios. It never changes: policies and records name actions by their place in it. A scenario
+that needs other actions gets a new list, `unified_v2`. SPEED alone is not in it: it does nothing."""
 
-def action_buttons(scenario: Scenario, action_set: ActionSet) -> tuple[tuple[str, ...], ...]:
+AXES_V1: tuple[Buttons, ...] = (
+    *(("", "TURN_LEFT", "TURN_RIGHT"), ("", "MOVE_FORWARD", "MOVE_BACKWARD"), ("", "MOVE_LEFT", "MOVE_RIGHT")),
+    *(("", "ATTACK"), ("", "USE"), ("", "SPEED")),
+)
+"""The axes of a MultiDiscrete action, for agents that choose each by itself; "" holds no button. Never changes."""
+
+_FIXED: MappingProxyType[ActionSet, tuple[Buttons, ...]] = MappingProxyType(
+    {
+        "unified_v1": UNIFIED_V1,
+        "multi_discrete_v1": tuple(tuple(filter(None, held)) for held in product(*AXES_V1)),
+    }
+)
+"""lists that are the same in every scenario"""
+
+
+def action_buttons(scenario: Scenario, action_set: ActionSet) -> tuple[Buttons, ...]:
     """The buttons that each action holds, by action.
 
     buttons: one button each, in the scenario's order (thesis 3.3).
     combinations: every set of buttons without a contradiction, the empty one first, then by size (LevDoom's sets:
         6, 6, 12 and 6 actions).
-    unified: one button each, of all scenarios together, in alphabetical order. If the scenario does not have
-        the button, the action holds none (thesis 6.1.1).
+    unified_v1: `UNIFIED_V1`, the same actions in all scenarios (thesis 6.1.1). An action with a button that the
+        scenario does not have holds none, and `action_mask` forbids it.
+    multi_discrete_v1: all products of `AXES_V1`, in C order; buttons that the scenario does not have are left out.
     """
-    match action_set:
-        case "buttons":
-            return tuple((button,) for button in scenario.buttons)
-        case "combinations":
-            buttons = scenario.buttons if scenario.combination_buttons is None else scenario.combination_buttons
-            sets = chain.from_iterable(combinations(buttons, size) for size in range(len(buttons) + 1))
-            return tuple(held for held in sets if not any(pair <= set(held) for pair in _CONTRADICTORY))
-        case "unified":
-            everything = sorted({button for one in scenarios().values() for button in one.buttons})
-            return tuple((button,) if button in scenario.buttons else () for button in everything)
-        case _:
-            assert_never(action_set)
+    if action_set == "buttons":
+        return tuple((button,) for button in scenario.buttons)
+    if action_set == "combinations":
+        buttons = scenario.buttons if scenario.combination_buttons is None else scenario.combination_buttons
+        sets = chain.from_iterable(combinations(buttons, size) for size in range(len(buttons) + 1))
+        return tuple(held for held in sets if not any(pair <= set(held) for pair in _CONTRADICTORY))
+    if action_set == "multi_discrete_v1":
+        return tuple(tuple(b for b in held if b in scenario.buttons) for held in _FIXED[action_set])
+    allowed = action_mask(scenario, action_set)
+    return tuple(held if one else () for held, one in zip(_FIXED[action_set], allowed, strict=True))
+
+
+def action_mask(scenario: Scenario, action_set: ActionSet) -> tuple[bool, ...]:
+    """Whether the scenario allows each action: it has all of the action's buttons. Allowed actions all differ, except
+    those of multi_discrete_v1, which allows everything.
+    """
+    if action_set != "unified_v1":
+        return (True,) * len(action_buttons(scenario, action_set))
+    return tuple(set(held) <= set(scenario.buttons) for held in _FIXED[action_set])

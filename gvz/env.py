@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
-from gymnasium.spaces import Discrete
+from gymnasium.spaces import Discrete, MultiDiscrete
 
-from gvz.actions import action_buttons
+from gvz.actions import AXES_V1, action_buttons, action_mask
 from gvz.core.env_config import EnvConfig, typed
 from gvz.core.errors import ConfigError, EngineError
 from gvz.engine.engine import Engine, EngineConfig, check_config
@@ -34,7 +34,7 @@ _MAX_CRASHES = 3
 _EPISODE_SEEDS = 2**31
 
 
-class DoomEnv(gymnasium.Env[Observation, np.int64]):
+class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
     """One game of a task.
 
     - Observation: uint8 [H, W, C], the screen as the player sees it; with `config.buffers` a dict of `screen` and of
@@ -44,11 +44,11 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
     - Termination: the agent died; the final observation shows this moment. (The buffers are those before it.)
     - Truncation: the time-out, with its true final observation; or a crash of the engine (`info["engine_crash"]`): then
       the last observation is repeated and the reward is 0.
-    - Info, each step: score (at most upper_bound), normalized_score (percent of upper_bound), upper_bound,
-      reward_components, variables (those that the agent may see), kills (the engine's count, including enemies that
-      enemies killed), player_kills (enemies that the agent killed), episode_frames, episode_seed, engine_crash (in
-      `reset`: the engine had died and was replaced); in the last step also solved_episode (a survival scenario's
-      time-out was reached).
+    - Info, each step: task (its id), score (at most upper_bound), normalized_score (percent of upper_bound),
+      upper_bound, reward_components, variables (those that the agent may see), kills (the engine's count, including
+      enemies that enemies killed), player_kills (enemies that the agent killed), episode_frames, episode_seed,
+      engine_crash (in `reset`: the engine had died and was replaced); in the last step also solved_episode (a survival
+      scenario's time-out was reached).
     - Seeds: `reset(seed=n)` seeds the sequence of episodes. Each episode has its own seed, `info["episode_seed"]`, and
       `reset(options={"episode_seed": m})` replays that episode alone. In a `varied` task it also chooses the map.
     """
@@ -121,7 +121,10 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         )
         check_config(self._engine_config)
         ensure_loads(self._compiled.wad_path, self._compiled.map_name)
-        self.action_space = Discrete(len(self.action_meanings))
+        if config.action_set == "multi_discrete_v1":
+            self.action_space = MultiDiscrete([len(axis) for axis in AXES_V1])
+        else:
+            self.action_space = Discrete(len(self.action_meanings))
         self.observation_space = observation_space(config)
         fuzzy = "STYLE_Fuzzy" in task_content(self.task, config.profile).entity.values()
         if recycle_episodes is None or (fuzzy and recycle_episodes > 0):
@@ -176,7 +179,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
             info |= {"engine_crash": True, "engine_error": str(crash)}
         return self._observe(engine), info
 
-    def step(self, action: int | np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: int | np.integer | np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Holds the action's buttons for `frame_skip` tics, or for the rest until the time-out.
 
         Raises:
@@ -187,7 +190,12 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         engine = self._engine
         if engine is None or not self._playing:
             raise ResetNeeded("DoomEnv.step: no episode is running; call reset first")
-        if not 0 <= action < len(self._actions):
+        if isinstance(self.action_space, MultiDiscrete):
+            held = np.asarray(action)
+            if not self.action_space.contains(held):
+                raise ValueError(f"DoomEnv.step: action {action!r}, want integers of {self.action_space}")
+            action = int(np.ravel_multi_index(tuple(held), tuple(self.action_space.nvec)))
+        elif not 0 <= action < len(self._actions):
             raise ValueError(f"DoomEnv.step: action {action!r}, want 0..{len(self._actions) - 1}")
         tics = min(self.config.frame_skip, self._timeout_frames - self._frames)
         try:
@@ -204,6 +212,10 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         components = self._rewarder.step(self._variables, terminated)
         info = self._info(components, terminated, truncated)
         return self._observe(engine), sum(components.values()), terminated, truncated, info
+
+    def action_masks(self) -> np.ndarray:
+        """bool[A]: the actions that the task allows. (sb3-contrib's algorithms with masks ask for it by this name.)"""
+        return np.array(action_mask(self.task.scenario, self.config.action_set))
 
     def render(self) -> np.ndarray | None:
         """The last rendered screen, uint8 [render_height, render_width, 3]; None in mode human."""
@@ -301,6 +313,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64]):
         if scenario.metric == "kills":  # enemies that kill each other can raise the count above the bound
             score = min(variables["KILLCOUNT"], self._upper_bound)
         info = {
+            "task": self.task.id,
             "score": score,
             "normalized_score": 100.0 * score / self._upper_bound,
             "upper_bound": self._upper_bound,

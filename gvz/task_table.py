@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 
-from gvz.actions import action_buttons
+from gvz.actions import action_mask
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError
 from gvz.scenarios.base import Scenario
@@ -22,10 +22,12 @@ class TaskRow:
     """game tics after which an episode is truncated"""
     reward_weights: Mapping[str, float]
     """weight of each reward component"""
+    reward_scale: float
+    """what the learner multiplies its rewards by"""
     return_range: tuple[float, float]
-    """(v_min, v_max) of its discounted returns"""
+    """(v_min, v_max) of its discounted returns, of scaled rewards"""
     action_mask: tuple[bool, ...]
-    """the actions that hold a button of its scenario"""
+    """the actions that its scenario allows"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +64,14 @@ class TaskTable:
         return None if all(map(all, masks)) else masks
 
     @property
+    def reward_scales(self) -> tuple[float, ...] | None:
+        """[task]: what the learner multiplies rewards by; None where nothing is scaled."""
+        scales = tuple(row.reward_scale for row in self.rows)
+        return None if set(scales) == {1.0} else scales
+
+    @property
     def return_range(self) -> tuple[float, float]:
-        """(v_min, v_max) of the discounted returns of all tasks."""
+        """(v_min, v_max) of the discounted returns of all tasks, of scaled rewards."""
         lows, highs = zip(*(row.return_range for row in self.rows), strict=True)
         return min(lows), max(highs)
 
@@ -74,13 +82,14 @@ class TaskTable:
 
 
 @cache
-def task_table(ids: tuple[str, ...], env: EnvConfig, discount: float) -> TaskTable:
+def task_table(ids: tuple[str, ...], env: EnvConfig, discount: float, *, scale_rewards: bool = False) -> TaskTable:
     """The table of these tasks.
 
     Args:
         ids: of the tasks, in the order of their indices.
         env: how they are played.
         discount: gamma of one decision.
+        scale_rewards: scale each task's rewards so that the largest absolute value of its discounted returns is 1.
 
     Raises:
         TaskError: an unknown task. ConfigError: no task, one twice, tasks whose scenarios have other actions, or
@@ -92,24 +101,26 @@ def task_table(ids: tuple[str, ...], env: EnvConfig, discount: float) -> TaskTab
     if len({task.id for task in tasks}) < len(tasks):
         raise ConfigError(f"tasks: got one task twice in {[task.id for task in tasks]}")
     names = sorted({task.scenario.id for task in tasks})
-    if len(names) > 1 and env.action_set != "unified":
+    if len(names) > 1 and env.action_set != "unified_v1":
         raise ConfigError(
-            f"tasks: got tasks of {names}, whose actions are others; want one scenario, or env.action_set unified"
+            f"tasks: got tasks of {names}, whose actions are others; want one scenario, or env.action_set unified_v1"
         )
-    return TaskTable(tuple(_row(task, env, discount) for task in tasks))
+    return TaskTable(tuple(_row(task, env, discount, scale_rewards) for task in tasks))
 
 
-def _row(task: Task, env: EnvConfig, discount: float) -> TaskRow:
+def _row(task: Task, env: EnvConfig, discount: float, scale_rewards: bool) -> TaskRow:
     scenario = task.scenario
     weights = scenario.reward_weights(dict(env.reward_weights), env.profile)
     if not any(weights.values()):
         raise ConfigError(f"env.reward_weights: got 0 for each of {', '.join(weights)}, want a reward to learn from")
-    held = action_buttons(scenario, env.action_set)
+    low, high = scenario.return_range(env, discount)
+    scale = 1.0 / max(-low, high) if scale_rewards else 1.0
     return TaskRow(
         task=task,
         upper_bound=scenario.upper_bound(env.profile),
         timeout_frames=scenario.timeout_frames(env.profile),
         reward_weights=weights,
-        return_range=scenario.return_range(env, discount),
-        action_mask=tuple(env.action_set != "unified" or bool(buttons) for buttons in held),
+        reward_scale=scale,
+        return_range=(scale * low, scale * high),
+        action_mask=action_mask(scenario, env.action_set),
     )

@@ -60,6 +60,9 @@ class AgentConfig:
     """observe the scenario's game variables (health, ammunition, ...)"""
     task_conditioned: bool = False
     """give the policy the task's index, pi(a | s, z) (eq. 4.18)"""
+    scale_rewards: bool = False
+    """scale each task's rewards so that the largest absolute value of its discounted returns is 1, for tasks of several
+    scenarios; records and scores stay as they are"""
     encoder: str = "nature"
     """module in learner/encoders, or the path of a Python file: what makes features of frames"""
     conv_channels: tuple[int, ...] = (32, 64, 64)
@@ -170,6 +173,9 @@ class ReplayConfig:
     """step records kept on the learner's device, over all games"""
     prioritized: bool = True
     """sample in proportion to priority; off samples uniformly"""
+    equal_shares: bool = False
+    """every game gives the same share of a batch; priorities choose within a game. For tasks whose errors differ in
+    size, such as those of several scenarios"""
     priority_exponent: Annotated[float, Range(0.0, 2.0)] = 0.6
     """omega: 0 is uniform, 1 fully proportional"""
     importance_sampling_exponent: Share = 0.4

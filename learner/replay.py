@@ -39,6 +39,8 @@ class ReplaySpec(StoreSpec):
     """added to |TD error| before the exponent"""
     prioritized: bool
     """False samples uniformly"""
+    equal_shares: bool = False
+    """every game gives the same share of a batch"""
     num_newest: int
     """newest transitions at the end of every batch"""
 
@@ -114,7 +116,7 @@ def init(spec: ReplaySpec) -> ReplayState:
     """Returns an empty replay."""
     return ReplayState(
         store=store.init(spec),
-        tree=sum_tree.init(spec.num_slots),
+        tree=sum_tree.init(spec.num_slots, spec.num_lanes if spec.equal_shares else 1),
         max_priority=jnp.ones((), jnp.float32),
         newest=jnp.full(spec.num_newest, spec.num_slots, jnp.int32),
         newest_head=jnp.zeros((), jnp.int32),
@@ -281,7 +283,7 @@ def _transitions(spec: ReplaySpec, state: ReplayState, anchors: Int[Array, "B"])
     return Transitions(
         obs_tm1=store.observations(spec, records, anchors),
         a_tm1=records.action[anchors],
-        r_t=jnp.sum(jnp.where(within, powers[None, :n] * records.reward[window], 0.0), axis=1),
+        r_t=jnp.sum(jnp.where(within, powers[None, :n] * store.rewards(spec, records, window), 0.0), axis=1),
         discount_t=powers[length] * ~records.terminated[end],
         obs_t=store.observations(spec, records, end),
     )

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from gvz.transport.messages import StepBlock, step_dtype
+from learner import store
 from learner.agents.base import RolloutSteps
 from learner.store import Store, StoreSpec
 
@@ -160,7 +161,7 @@ def steps_of(spec: RolloutSpec, windows: Store) -> tuple[RolloutSteps, Int[Array
     slots = first_slot[None, :] + jnp.arange(spec.num_steps + 1)[:, None]  # [T + 1, B]
     extras, terminated = jnp.asarray(windows.extras)[slots], windows.terminated[slots[1:]]
     steps = RolloutSteps(
-        r_t=windows.reward[slots[1:]],
+        r_t=store.rewards(spec, windows, slots[1:]),
         terminated=terminated,
         truncated=windows.last[slots[1:]] & ~terminated,
         extras_tm1=extras[:-1],

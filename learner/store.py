@@ -45,6 +45,8 @@ class StoreSpec:
     """numbers that the policy records with an action, E"""
     action_masks: tuple[tuple[bool, ...], ...] | None = None
     """[num_tasks][num_actions]: the actions that each task allows; None for all"""
+    reward_scales: tuple[float, ...] | None = None
+    """[num_tasks]: what the task's rewards are multiplied by when they are read; None for 1"""
 
     @property
     def lane_capacity(self) -> int:
@@ -177,6 +179,12 @@ def observations(spec: StoreSpec, store: Store, slots: Int[Array, "B"]) -> Obser
         task=task,
         mask=None if spec.action_masks is None else jnp.asarray(spec.action_masks)[task],
     )
+
+
+def rewards(spec: StoreSpec, store: Store, slots: Int[Array, "..."]) -> Float[Array, "..."]:
+    """The rewards at `slots`, each times the scale of its task."""
+    raw = store.reward[slots]
+    return raw if spec.reward_scales is None else raw * jnp.asarray(spec.reward_scales, jnp.float32)[store.task[slots]]
 
 
 def records_per_task(spec: StoreSpec, store: Store) -> Int[Array, "num_tasks"]:

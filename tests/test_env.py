@@ -211,18 +211,35 @@ def test_kills_beyond_the_upper_bound_do_not_score():
     env.close()
 
 
-def test_forbidden_actions_of_the_unified_set_do_nothing():
-    env = DoomEnv("defend_the_center/default", action_set="unified")
-    assert env.action_space.n == 7
-    frames = {}
-    for action in range(7):
+def test_unified_actions_differ_where_they_are_allowed_and_forbidden_ones_do_nothing():
+    env = DoomEnv("defend_the_center/default", action_set="unified_v1")
+    played = {}
+    for action in range(env.action_space.n):
         env.reset(options={"episode_seed": 1})
-        frames[action] = np.stack([env.step(action)[0] for _ in range(5)])
+        played[action] = np.stack([env.step(action)[0] for _ in range(5)])
     env.close()
-    idle = [action for action, held in enumerate(env.action_meanings) if not held]
-    assert len(idle) == 4
-    for action in range(7):
-        assert (frames[action] == frames[idle[0]]).all() == (action in idle)
+    allowed = np.flatnonzero(env.action_masks())
+    assert [env.action_meanings[a] for a in allowed] == [
+        *((), ("ATTACK",), ("TURN_LEFT",), ("TURN_RIGHT",)),
+        *(("ATTACK", "TURN_LEFT"), ("ATTACK", "TURN_RIGHT")),
+    ]
+    assert len({played[action].tobytes() for action in allowed}) == len(allowed)
+    assert all((played[action] == played[0]).all() for action in played if action not in allowed)
+
+
+def test_a_multi_discrete_action_holds_one_button_of_each_axis():
+    one, other = (DoomEnv("seek_and_kill/default", action_set=name) for name in ("multi_discrete_v1", "unified_v1"))
+    assert one.action_space == gymnasium.spaces.MultiDiscrete([3, 3, 3, 2, 2, 2])
+    for env in (one, other):
+        env.reset(options={"episode_seed": 3})
+    # turn right, go, strafe left (no such button here), shoot, use (none), do not run
+    same = other.action_meanings.index(("ATTACK", "MOVE_FORWARD", "TURN_RIGHT"))
+    for _ in range(10):
+        assert (one.step(np.array([2, 1, 1, 1, 1, 0]))[0] == other.step(same)[0]).all()
+    with pytest.raises(ValueError, match="want integers of MultiDiscrete"):
+        one.step(np.array([3, 0, 0, 0, 0, 0]))
+    for env in (one, other):
+        env.close()
 
 
 # --------------------------------------------------------------------------------------------- how it ends
@@ -345,7 +362,11 @@ def test_a_seed_gives_a_sequence_of_episodes(shared: DoomEnv):
         ({"task": "defend_the_center/blood"}, TaskError, "unknown attribute 'blood'"),
         ({"frame_skp": 4}, ConfigError, r"unknown options \['frame_skp'\], want some of frame_height"),
         ({"frame_skip": 0}, ConfigError, r"env.frame_skip: got 0, want 1\.\.35"),
-        ({"action_set": "all"}, ConfigError, "env.action_set: got 'all', want one of buttons, combinations, unified"),
+        (
+            {"action_set": "all"},
+            ConfigError,
+            "env.action_set: got 'all', want one of buttons, combinations, unified_v1",
+        ),
         ({"buffers": ("depth", "sound")}, ConfigError, "env.buffers: got 'sound', want one of depth, labels, automap"),
         ({"buffers": "depth"}, ConfigError, "env.buffers: got 'depth', want a list"),
         ({"frame_skip": 2.5}, ConfigError, "env.frame_skip: got 2.5, want int"),

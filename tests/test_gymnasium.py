@@ -26,7 +26,8 @@ def test_gymnasiums_checker_passes(task):
 def test_gymnasiums_checker_passes_in_every_form():
     for fields in (
         {"action_set": "combinations"},
-        {"action_set": "unified", "buffers": ("depth",)},
+        {"action_set": "unified_v1", "buffers": ("depth",)},
+        {"action_set": "multi_discrete_v1"},
         {"grayscale": True},
     ):
         env = DoomEnv("seek_and_kill/default", render_mode="rgb_array", **fields)

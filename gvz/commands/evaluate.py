@@ -1,6 +1,5 @@
 """`gvz evaluate`: plays evaluation episodes and prints the scores."""
 
-import dataclasses
 import json
 import os
 import sys
@@ -39,7 +38,7 @@ class Evaluate:
     run_dirs: Annotated[
         tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[RUN_DIR ...]", help_behavior_hint="")
     ] = ()
-    """run directories: their policies play greedily, noise off; by default the test tasks of their scenario"""
+    """run directories: their policies play greedily, noise off; by default the test tasks of their scenarios"""
     player: SimplePlayerName | None = None
     """random: uniformly random buttons; idle: presses nothing; sweep: a fixed sequence of buttons; scripted: the
     scenario's simple script, which gets names and places of what is in sight"""
@@ -109,7 +108,7 @@ class Evaluate:
         found = {}
         for run_dir in dict.fromkeys(self.run_dirs):
             config = read_run_config(run_dir, self.agent)
-            tasks = run_tasks(self.select, config.table.scenarios[0].id)
+            tasks = self.select.of_run([scenario.id for scenario in config.table.scenarios])
             check_tasks(config, tasks)
             out = run_dir / "evaluation.jsonl" if self.out is None else self.out
             for num_updates in find_checkpoints(run_dir, self.checkpoints):
@@ -132,15 +131,6 @@ class Evaluate:
 
 
 COMMAND = Evaluate
-
-
-def run_tasks(select: TaskSelection, scenario: str) -> tuple[Task, ...]:
-    """The tasks a run is evaluated on: the selected ones, of its own scenario by default; else its test set."""
-    if select == ALL_TASKS:
-        select = TaskSelection(split="test")
-    if not select.tasks and select.scenario is None:
-        select = dataclasses.replace(select, scenario=scenario)
-    return select.resolve()
 
 
 def _show_progress(rows: "Iterator[Row]", total: int) -> None:

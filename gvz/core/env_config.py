@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from gvz.core.errors import ConfigError
 
-ActionSet = Literal["buttons", "combinations", "unified"]
+ActionSet = Literal["buttons", "combinations", "unified_v1", "multi_discrete_v1"]
 Profile = Literal["thesis", "levdoom"]
 Buffer = Literal["depth", "labels", "automap"]
 Interpolation = Literal["linear", "area"]
@@ -45,7 +45,8 @@ class EnvConfig:
     render_height: int = 144
     """height the engine renders, pixels"""
     action_set: ActionSet = "buttons"
-    """buttons: one button held an action; combinations: all non-contradictory sets; unified: one space for all"""
+    """buttons: one button held an action; combinations: all non-contradictory sets; unified_v1: one list of actions for
+    all scenarios; multi_discrete_v1: a MultiDiscrete space for all scenarios, not for the trainer"""
     profile: Profile = "thesis"
     """whose numbers where they differ: the thesis's text, or LevDoom's maps and settings"""
     interpolation: Interpolation = "linear"

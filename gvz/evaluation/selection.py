@@ -1,5 +1,6 @@
 """The flags that choose tasks."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gvz.core.errors import ConfigError
@@ -27,13 +28,31 @@ class TaskSelection:
             TaskError: an unknown name. ConfigError: ids together with another choice, or no task fits the choice.
         """
         if not self.tasks:
-            chosen = named_tasks(scenario=self.scenario, level=self.level, split=self.split)
-            if not chosen:
-                raise ConfigError(f"--level, --split: no task of {self.split} has level {self.level}")
-            return chosen
+            return self._named((self.scenario,))
         if (self.scenario, self.split, self.level) != (None, None, None):
             raise ConfigError("--tasks: got ids and also --scenario, --split or --level, want one or the other")
         return tuple(dict.fromkeys(parse_task(text) for text in self.tasks))
+
+    def of_run(self, scenarios: Sequence[str]) -> tuple[Task, ...]:
+        """The tasks that a run is evaluated on: of its own scenarios by default, and then the test sets.
+
+        Raises:
+            TaskError, ConfigError: as `resolve`.
+        """
+        if self == ALL_TASKS:
+            return TaskSelection(split="test")._named(scenarios)
+        return self.resolve() if self.tasks or self.scenario else self._named(scenarios)
+
+    def _named(self, scenarios: Sequence[str | None]) -> tuple[Task, ...]:
+        """The named tasks of these scenarios; None stands for all.
+
+        Raises:
+            ConfigError: there is none.
+        """
+        chosen = [task for one in scenarios for task in named_tasks(scenario=one, level=self.level, split=self.split)]
+        if not chosen:
+            raise ConfigError(f"--level, --split: no task of {self.split} has level {self.level}")
+        return tuple(chosen)
 
 
 ALL_TASKS = TaskSelection()

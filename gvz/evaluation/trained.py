@@ -63,10 +63,10 @@ def check_tasks(config: RunConfig, tasks: Sequence[Task]) -> None:
     """Raises ConfigError for tasks that the run's policy cannot play."""
     trained, scenarios = config.table.ids, config.table.scenarios
     for task in tasks:
-        if task.scenario not in scenarios and config.env.action_set != "unified":
+        if task.scenario not in scenarios and config.env.action_set != "unified_v1":
             raise ConfigError(
                 f"{task.id}: the run was trained on {', '.join(s.id for s in scenarios)}, which has other buttons; "
-                "only a run with env.action_set=unified can play another scenario"
+                "only a run with env.action_set=unified_v1 can play another scenario"
             )
         if config.agent.task_conditioned and task.id not in trained:
             raise ConfigError(
@@ -176,7 +176,7 @@ class TrainedPlayer:
         assert isinstance(observation, np.ndarray)
         self._obs.begin(0, self._task(env), observation, info["variables"])
         if "mask" in self._obs.arrays:
-            self._obs.arrays["mask"][0] = [bool(buttons) for buttons in env.action_meanings]
+            self._obs.arrays["mask"][0] = env.action_masks()
         self._evaluation = None
 
     def act(self) -> int:

@@ -9,6 +9,7 @@ from gvz.core.errors import ConfigError
 from gvz.reports.abstract import caveats, what_beats_what, what_was_run
 from gvz.reports.document import Block, Document, Section
 from gvz.reports.experiment_section import experiment_section
+from gvz.reports.joint_section import joint_sections
 from gvz.reports.results import read_results
 from gvz.reports.run_section import run_sections
 from gvz.reports.scenario_section import scenario_sections
@@ -48,7 +49,7 @@ def make_report(paths: Sequence[Path], out: Path, title: str | None = None) -> t
     except OSError as error:
         raise ConfigError(f"--out: {out} cannot be written: {error.strerror}") from error
     sections = [experiment_section(results, asked, out) for asked in results.asked]
-    sections += [*scenario_sections(results, out), *run_sections(results, out)]
+    sections += [*joint_sections(results), *scenario_sections(results, out), *run_sections(results, out)]
     if results.problems:
         text = ("What could not be read or is not there. Everything else was.", *results.problems)
         sections.append(Section(id="problems", title="Problems", blocks=(Block(text=text),)))

@@ -76,15 +76,16 @@ class Run:
         return used_up or self.metrics["num_updates"][-1] >= self.total_updates
 
     @property
-    def scenario(self) -> str:
-        return self.tasks[0].partition("/")[0]
+    def scenarios(self) -> tuple[str, ...]:
+        """Ids of the scenarios of its tasks."""
+        return tuple(dict.fromkeys(task.partition("/")[0] for task in self.tasks))
 
     @property
     def training(self) -> str:
         """ "4 tasks", "gore alone": what it was trained on, in words."""
         for split, words in TRAINING_SETS.items():
-            if set(self.tasks) == _task_ids(self.scenario, split):
-                return words
+            if set(self.tasks) == set().union(*(_task_ids(one, split) for one in self.scenarios)):
+                return words if len(self.scenarios) == 1 else f"{words} of each scenario"
         one = self.tasks[0].partition("/")[2]
         return f"{one} alone" if len(self.tasks) == 1 else f"{len(self.tasks)} chosen tasks"
 
@@ -176,7 +177,7 @@ def _read_run(file: Path, results: Path) -> tuple[Run | None, list[str]]:
             ),
             starts=tuple(starts),
         )
-        _ = run.name, run.seed, run.total_updates, run.scenario
+        _ = run.name, run.seed, run.total_updates, run.training
     except (OSError, ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError) as error:
         return None, [f"{file}: not a configuration of ours ({type(error).__name__}: {error}); the run is left out"]
     return run, [*problems, *more, *unread]
@@ -194,13 +195,13 @@ def _task_ids(scenario: str, split: Split) -> set[str]:
 
 def _agents(runs: Sequence[Run]) -> dict[str, str]:
     """Run directory -> agent: the configuration's name, and what it was trained on where that tells agents apart."""
-    alone: dict[tuple[str, str], set[str]] = {}
+    alone: dict[tuple[str, tuple[str, ...]], set[str]] = {}
     for run in runs:
         if len(run.tasks) == 1:
-            alone.setdefault((run.name, run.scenario), set()).add(run.training)
+            alone.setdefault((run.name, run.scenarios), set()).add(run.training)
 
     def training(run: Run) -> str:
-        several = len(run.tasks) == 1 and len(alone[run.name, run.scenario]) > 2  # more than default and one other
+        several = len(run.tasks) == 1 and len(alone[run.name, run.scenarios]) > 2  # more than default and one other
         return EACH if several and not run.id.count("/train") else run.training
 
     trainings = {name: {training(run) for run in runs if run.name == name} for name in {run.name for run in runs}}

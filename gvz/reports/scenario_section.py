@@ -22,7 +22,8 @@ from gvz.tasks import LEVELS, named_tasks, parse_task, scenario_named, scenarios
 
 def scenario_sections(results: Results, out: Path) -> list[Section]:
     """A section for each scenario that has evaluated episodes or runs."""
-    played = set(results.episodes.drop_nulls("level")["scenario"]) | {run.scenario for run in results.runs}
+    played = set(results.episodes.drop_nulls("level")["scenario"])
+    played.update(*(run.scenarios for run in results.runs))
     return [_section(results, scenario_named(name), out) for name in scenarios() if name in played]
 
 
@@ -166,13 +167,14 @@ def gap_table(
     results: Results, scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task]
 ) -> Table | None:
     """How much lower agents score on other tasks than on their training tasks, and on levels 2 to 4 than on 0 and 1."""
-    trained_on = {results.agents[str(r.path)]: r.tasks for r in results.runs if r.scenario == scenario.id}
+    trained_on = {results.agents[str(r.path)]: r.tasks for r in results.runs}
     test = [task.id for task in named_tasks(scenario.id, split="test")]
     low, high = [t.id for t in tasks if t.level <= 1], [t.id for t in tasks if t.level >= 2]
     rows = []
     for agent, one in scores.items():
         if agent in trained_on and not one.agents_of_tasks:
-            of_tasks = _gap(one, trained_on[agent], [id for id in test if id not in trained_on[agent]])
+            own = [id for id in trained_on[agent] if id.partition("/")[0] == scenario.id]
+            of_tasks = _gap(one, own, [id for id in test if id not in own])
             rows.append((words(agent), of_tasks, _gap(one, low, high)))
     if not any(cell.estimate for row in rows for cell in row):
         return None
@@ -232,10 +234,11 @@ def _learning(results: Results, scenario: Scenario, out: Path) -> list[Figure]:
     figures = []
     agents: dict[str, list[Run]] = {}
     for run in results.runs:
-        if run.scenario == scenario.id:
+        if scenario.id in run.scenarios:
             agents.setdefault(results.agents[str(run.path)], []).append(run)
     for agent, runs in agents.items():
-        tasks = list(dict.fromkeys(task for run in runs for task in run.tasks))
+        trained_on = dict.fromkeys(task for run in runs for task in run.tasks)
+        tasks = [task for task in trained_on if task.partition("/")[0] == scenario.id]
         lines = [learning_curve(task.partition("/")[2], runs, [task]) for task in tasks]
         if any(lines):
             caption = f"{scenario.title}, {agent}: training scores, running mean of 30 episodes"

@@ -130,6 +130,7 @@ def _off_policy(config: RunConfig, agent: Agent, pool: PoolConfig) -> OffPolicyP
         priority_exponent=replay.priority_exponent,
         min_priority=replay.min_priority,
         prioritized=replay.prioritized,
+        equal_shares=replay.equal_shares,
         num_newest=replay.num_newest,
     )
     return OffPolicyParts(
@@ -164,4 +165,5 @@ def _store_sizes(config: RunConfig, pool: PoolConfig) -> dict[str, Any]:
         "num_variables": len(pool.variables),
         "num_extras": pool.num_extras,
         "action_masks": pool.action_masks,
+        "reward_scales": config.table.reward_scales,
     }

@@ -69,7 +69,7 @@ class RunConfig:
     training_set: Literal[1, 4, 8] = 4
     """tasks in the training set: 1 is the default task, 4 and 8 add tasks of level 1"""
     tasks: tuple[str, ...] | None = None
-    """ids of the tasks to train on, all of one scenario, instead of a training set"""
+    """ids of the tasks to train on, instead of a training set; of several scenarios with env.action_set unified_v1"""
     seed: int = 1111
     """seed of everything: parameters, noise, replay sampling, episodes"""
     mode: Literal["async", "sync"] = "async"
@@ -99,6 +99,10 @@ class RunConfig:
             raise ConfigError(f"max_processor_s: got {self.max_processor_s:g}, want more than 0")
         if self.env.buffers:
             raise ConfigError(f"env.buffers: got {self.env.buffers}, want none: the trainer's agents see frames alone")
+        if self.env.action_set == "multi_discrete_v1":
+            raise ConfigError(
+                "env.action_set: got multi_discrete_v1, want unified_v1: the trainer's actions are discrete"
+            )
         _ = self.table
         if self.num_lanes > MAX_LANES:
             raise ConfigError(
@@ -163,7 +167,7 @@ class RunConfig:
         ids = self.tasks
         if ids is None:
             ids = tuple(task.id for task in named_tasks(scenario=self.scenario, split=_SPLITS[self.training_set]))
-        return task_table(ids, self.env, self.agent.discount)
+        return task_table(ids, self.env, self.agent.discount, scale_rewards=self.agent.scale_rewards)
 
     @property
     def support(self) -> tuple[float, float] | None:

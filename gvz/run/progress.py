@@ -61,6 +61,15 @@ def _short_score(task: TaskStatus) -> str:
     return f"{task.score:.0f}/{task.upper_bound:.0f}" if task.episodes else "-"
 
 
+def _scenarios(status: Status) -> list[str]:
+    return list(dict.fromkeys(task.task.partition("/")[0] for task in status.tasks))
+
+
+def _short_name(task: TaskStatus, status: Status) -> str:
+    """Without its scenario, unless there are several."""
+    return task.task.partition("/")[2] if len(_scenarios(status)) == 1 else task.task
+
+
 def _figures(status: Status) -> tuple[str, ...]:
     row = status.row
     return (
@@ -77,7 +86,7 @@ def _figures(status: Status) -> tuple[str, ...]:
 
 def plain_line(status: Status) -> str:
     """One line with everything of a status."""
-    scores = "  ".join(f"{t.task.split('/')[-1]} {_short_score(t)}" for t in status.tasks)
+    scores = "  ".join(f"{_short_name(t, status)} {_short_score(t)}" for t in status.tasks)
     return (
         f"{status.phase}  update {status.num_updates:,}/{status.total_updates:,}  eta {format_duration(status.eta_s)}  "
         f"{'  '.join(_figures(status))}  {scores}"
@@ -86,10 +95,9 @@ def plain_line(status: Status) -> str:
 
 def panel(status: Status, width: int) -> Group:
     """The live panel."""
-    scenario = status.tasks[0].task.partition("/")[0] if status.tasks else ""
     head = Text.assemble(
         (f"{status.phase}  ", "bold"),
-        f"{scenario}  " if scenario else "",
+        "".join(f"{scenario}  " for scenario in _scenarios(status)),
         f"{status.num_updates:,} / {status.total_updates:,} updates   ETA {format_duration(status.eta_s)}",
     )
     bar = Table.grid()  # puts the bar on a line of its own
@@ -102,7 +110,7 @@ def panel(status: Status, width: int) -> Group:
     tasks.add_column("% of bound", justify="right")
     for t in status.tasks:
         percent = f"{100 * t.score / t.upper_bound:.1f}" if t.episodes else "-"
-        tasks.add_row(t.task.partition("/")[2], f"{t.episodes:,}", _short_score(t), percent)
+        tasks.add_row(_short_name(t, status), f"{t.episodes:,}", _short_score(t), percent)
     num_restarts = int(status.row["actors/restarts"])
     restarts = [Text(f"{num_restarts} actor restarts", style="yellow")] if num_restarts else []
     return Group(head, bar, rates, *restarts, tasks)

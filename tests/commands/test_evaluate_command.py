@@ -9,7 +9,6 @@ import time
 import pytest
 
 from gvz import cli
-from gvz.commands.evaluate import run_tasks
 from gvz.evaluation.episode_log import RecordFile, read_rows
 from gvz.evaluation.selection import TaskSelection
 from gvz.tasks import named_tasks
@@ -54,10 +53,10 @@ def test_a_damaged_policy_is_told_of_before_anything_is_played(capsys, small_run
 
 def test_a_run_is_evaluated_on_the_test_tasks_of_its_scenario_unless_told_otherwise():
     scenario = "dodge_projectiles"
-    assert run_tasks(TaskSelection(), scenario) == named_tasks(scenario, split="test")
-    assert run_tasks(TaskSelection(level=2), scenario) == named_tasks(scenario, level=2)
-    assert run_tasks(TaskSelection(split="train4"), scenario) == named_tasks(scenario, split="train4")
-    assert run_tasks(TaskSelection(scenario="seek_and_kill"), scenario) == named_tasks("seek_and_kill")
+    assert TaskSelection().of_run([scenario]) == named_tasks(scenario, split="test")
+    assert TaskSelection(level=2).of_run([scenario]) == named_tasks(scenario, level=2)
+    assert TaskSelection(split="train4").of_run([scenario]) == named_tasks(scenario, split="train4")
+    assert TaskSelection(scenario="seek_and_kill").of_run([scenario]) == named_tasks("seek_and_kill")
 
 
 @pytest.mark.engine

@@ -104,7 +104,7 @@ def test_a_reward_stays_on_the_timeline():
 
 
 @pytest.mark.parametrize("scenario", list(scenarios()))
-@pytest.mark.parametrize("action_set", ["buttons", "combinations", "unified"])
+@pytest.mark.parametrize("action_set", ["buttons", "combinations", "unified_v1"])
 def test_everything_fits_in_whatever_is_played(scenario, action_set):
     task = max(named_tasks(scenario), key=lambda task: len(task.name))
     buttons = action_buttons(task.scenario, action_set)

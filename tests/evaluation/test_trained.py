@@ -14,6 +14,7 @@ from gvz.core.env_config import EnvConfig
 from gvz.core.errors import CheckpointError, ConfigError
 from gvz.env import DoomEnv
 from gvz.evaluation.choice import EpisodeChoice
+from gvz.evaluation.selection import TaskSelection
 from gvz.evaluation.trained import TrainedPlayer, check_tasks, find_checkpoints, read_run_config, trained_player
 from gvz.run.assemble import run_agent
 from gvz.run.config import RunConfig
@@ -122,11 +123,18 @@ def test_a_conditioned_policy_plays_its_training_tasks_only():
         check_tasks(config, [parse_task("defend_the_center/complete")])
 
 
-def test_a_run_cannot_play_another_scenario_unless_its_buttons_are_unified():
+def test_a_run_cannot_play_another_scenario_unless_its_actions_are_unified():
     tasks = named_tasks("seek_and_kill", level=0)
     with pytest.raises(ConfigError, match="seek_and_kill/default: the run was trained on defend_the_center"):
         check_tasks(CONFIG, tasks)
-    check_tasks(dataclasses.replace(CONFIG, env=EnvConfig(action_set="unified")), tasks)
+    check_tasks(dataclasses.replace(CONFIG, env=EnvConfig(action_set="unified_v1")), tasks)
+
+
+def test_a_run_of_several_scenarios_is_evaluated_on_the_test_tasks_of_each():
+    two = ["dodge_projectiles", "seek_and_kill"]
+    test = [task for name in two for task in named_tasks(name, split="test")]
+    assert list(TaskSelection().of_run(two)) == test
+    assert list(TaskSelection(level=0).of_run(two)) == [named_tasks(name, level=0)[0] for name in two]
 
 
 def test_the_support_of_a_run_follows_from_how_its_games_are_played():
@@ -138,7 +146,7 @@ def test_the_support_of_a_run_follows_from_how_its_games_are_played():
 
 
 def test_the_reward_weights_of_a_run_are_shown_in_its_own_scenario_alone(run):
-    env = EnvConfig(action_set="unified", reward_weights=(("kill", 2.0),))
+    env = EnvConfig(action_set="unified_v1", reward_weights=(("kill", 2.0),))
     config = dataclasses.replace(CONFIG, env=env)
     (run / "config.json").write_text(json.dumps(config_to_dict(config)))
     write_policy(run, config, 5)

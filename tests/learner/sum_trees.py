@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from learner.sum_tree import FANOUT, SumTree, _level_starts, _sum_row
+from learner.sum_tree import FANOUT, SumTree, _sum_row
 
 
 def check_valid(tree: SumTree) -> None:
@@ -11,14 +11,17 @@ def check_valid(tree: SumTree) -> None:
     Raises:
         ValueError: it is not so; names the first wrong leaf or node.
     """
-    nodes = np.asarray(tree.nodes)
-    starts = _level_starts(tree.num_leaves)
-    leaves, padding = np.split(nodes[starts[-2] :], [tree.num_leaves])
+    for nodes in np.asarray(tree.nodes).reshape(tree.num_groups, -1):
+        _check_group(nodes, tree.starts, tree.num_leaves // tree.num_groups)
+
+
+def _check_group(nodes: np.ndarray, starts: list[int], num_leaves: int) -> None:
+    leaves, padding = np.split(nodes[starts[-2] :], [num_leaves])
     if not (good := np.isfinite(leaves) & (leaves >= 0)).all():
         wrong = int(np.argmin(good))
         raise ValueError(f"sum tree: leaf {wrong} is {leaves[wrong]}, want a finite number of at least 0")
     if padding.any():
-        raise ValueError(f"sum tree: padding after leaf {tree.num_leaves - 1} is {padding}, want zeros")
+        raise ValueError(f"sum tree: padding after leaf {num_leaves - 1} is {padding}, want zeros")
     for start, stop, children_stop in zip(starts, starts[1:], starts[2:], strict=False):
         sums = np.zeros(stop - start, np.float32)
         sums[: (children_stop - stop) // FANOUT] = _sum_row(nodes[stop:children_stop].reshape(-1, FANOUT))

@@ -93,8 +93,9 @@ def record(lane: int = 0, *, reward=0.0, first=False, terminated=False, truncate
         ({"n_steps": 7, "stack_size": 3, "num_lanes": 2, "capacity": 61, "num_newest": 5}, 5, 6_000),
         ({"stack_size": 2, "num_lanes": 5, "capacity": 2_000, "discount": 0.5}, 40, 5_000),
         ({"num_past_actions": 6, "num_variables": 3, "num_extras": 2}, 7, 5_000),
+        ({"equal_shares": True, "num_lanes": 4, "capacity": 400}, 6, 5_000),
     ],
-    ids=["rainbow", "dqn", "long windows", "long episodes", "past actions and variables"],
+    ids=["rainbow", "dqn", "long windows", "long episodes", "past actions and variables", "equal shares"],
 )
 def test_every_sample_is_what_the_actor_saw_and_the_oracle_says(changes, mean_steps, num_records):
     """Thousands of random episodes in random blocks: every drawable slot, stack, return and discount."""
@@ -116,6 +117,9 @@ def test_every_sample_is_what_the_actor_saw_and_the_oracle_says(changes, mean_st
             continue
         batch, info = replayed.sample(seed=round_)
         assert (leaves[info.slots] > 0).all()
+        if spec.equal_shares:
+            drawn = np.bincount(info.slots // spec.lane_capacity)[leaves.reshape(spec.num_lanes, -1).any(1)]
+            assert drawn.max() - drawn.min() <= 2
         want = [oracle.transition(slot) for slot in info.slots.tolist()]
         check_batch(batch, want)
         num_drawn += len(want)
@@ -182,6 +186,16 @@ def test_returns_and_discounts_by_hand():
     )
     np.testing.assert_array_equal(batch.obs_t.frames[:4, 0, 0, ::3], [[0, 10, 20, 30]] + [[10, 20, 30, 40]] * 3)
     assert set(np.flatnonzero(replayed.leaves())) == set(slots.tolist())
+
+
+def test_rewards_are_scaled_by_task_when_they_are_read():
+    spec = make_spec(num_lanes=2, capacity=40, discount=0.5, num_tasks=2, reward_scales=(3.0, 0.25))
+    replayed = Replay(spec)
+    for lane in range(2):
+        replayed.add([record(lane, reward=r, first=t == 0, task=lane) for t, r in enumerate([0, 1, 2, 4, 8])])
+    batch = jax.jit(replay._transitions, static_argnums=0)(spec, replayed.state, jnp.array([0, 1, 20, 21]))
+    np.testing.assert_array_equal(batch.r_t, [3 * 3, 3 * 6, 3 / 4, 6 / 4])
+    np.testing.assert_array_equal(replayed.state.store.reward[:5], [0, 1, 2, 4, 8])
 
 
 def test_new_transitions_enter_with_the_largest_priority_ever():

@@ -13,6 +13,8 @@ from learner.agents.configs.ppo import PPOConfig
 from learner.rollouts import Rollouts, RolloutSpec, steps_of
 
 LANES, T, STACK, PAST, GAMMA, LAMBDA = 3, 5, 3, 4, 0.9, 0.8
+SCALES = (1.0, 0.25)
+"""of the rewards of the two tasks"""
 HISTORY = max(STACK, PAST + 1)
 SPEC = RolloutSpec(
     num_lanes=LANES,
@@ -23,6 +25,7 @@ SPEC = RolloutSpec(
     num_past_actions=PAST,
     num_variables=1,
     num_extras=2,
+    reward_scales=SCALES,
 )
 DTYPE = step_dtype(1, 2)
 
@@ -84,12 +87,13 @@ def expected_observation(records: list[dict], t: int) -> tuple[np.ndarray, list[
 def expected_return(records: list[dict], t: int, end: int) -> float:
     """The lambda return of the step from record t, recursively, in float64; `end` is the window's last record."""
     after = records[t + 1]
+    reward = after["reward"] * SCALES[after["task"]]
     if after["terminated"]:
-        return after["reward"]
+        return reward
     if after["last"] or t + 1 == end:
-        return after["reward"] + GAMMA * after["value"]
+        return reward + GAMMA * after["value"]
     rest = expected_return(records, t + 1, end)
-    return after["reward"] + GAMMA * ((1 - LAMBDA) * after["value"] + LAMBDA * rest)
+    return reward + GAMMA * ((1 - LAMBDA) * after["value"] + LAMBDA * rest)
 
 
 AGENT = make_agent(

@@ -17,6 +17,7 @@ from learner.sum_tree import FANOUT, SumTree
 from tests.learner.sum_trees import check_valid
 
 NUM_LEAVES = (1, FANOUT - 1, FANOUT, FANOUT**2, FANOUT**2 + 1, 1000)
+NUM_GROUPS = (1, 3)
 set_leaves = jax.jit(sum_tree.set, donate_argnums=0)
 get_leaves = jax.jit(lambda tree: sum_tree.get(tree, jnp.arange(tree.num_leaves + 3)))
 total = jax.jit(sum_tree.total)
@@ -31,10 +32,10 @@ def tree_of(values) -> SumTree:
 class AgainstOracle(RuleBasedStateMachine):
     """Random operations on the tree and on a float64 array; indices repeat and some lie beyond the last leaf."""
 
-    @initialize(num_leaves=st.sampled_from(NUM_LEAVES))
-    def make(self, num_leaves):
-        self.tree = sum_tree.init(num_leaves)
-        self.leaves = np.zeros(num_leaves)
+    @initialize(group_size=st.sampled_from(NUM_LEAVES), num_groups=st.sampled_from(NUM_GROUPS))
+    def make(self, group_size, num_groups):
+        self.tree = sum_tree.init(group_size * num_groups, num_groups)
+        self.leaves = np.zeros(group_size * num_groups)
 
     @rule(data=st.data(), size=st.sampled_from((1, 8)), spread=st.sampled_from((1, 3, 1000)))
     def set_some(self, data, size, spread):
@@ -59,10 +60,12 @@ class AgainstOracle(RuleBasedStateMachine):
     def draw_some(self, seed, batch_size):
         indices, probabilities = map(np.asarray, draw(self.tree, jax.random.key(seed), batch_size))
         assert (self.leaves[indices] > 0).all(), "drew a leaf of zero, or beyond the last"
-        total = math.fsum(self.leaves)
-        np.testing.assert_allclose(probabilities, self.leaves[indices] / total, rtol=1e-5)
-        ends = np.cumsum(self.leaves) / total
-        starts = ends - self.leaves / total
+        groups = self.leaves.reshape(self.tree.num_groups, -1)
+        sums = groups.sum(1, keepdims=True)
+        wanted = (groups / np.maximum(sums, 1e-300) / np.count_nonzero(sums)).ravel()
+        np.testing.assert_allclose(probabilities, wanted[indices], rtol=1e-5)
+        ends = np.cumsum(wanted)
+        starts = ends - wanted
         strata = np.arange(batch_size + 1) / batch_size
         assert (starts[indices] <= strata[1:] + 1e-5).all(), "drew a leaf that lies behind its stratum"
         assert (ends[indices] >= strata[:-1] - 1e-5).all(), "drew a leaf that lies before its stratum"
@@ -118,6 +121,20 @@ def test_frequencies_are_the_priorities(batch_size: int):
     assert p_value > 0.001
     if batch_size == 1:
         assert p_value < 0.999
+
+
+def test_groups_get_equal_shares_whatever_their_priorities():
+    """Chi-square, fixed seed: group sums are 1e-3, 1 and 1e5, one group is empty; within a group draws follow it."""
+    rng = np.random.default_rng(5)
+    values = rng.exponential(size=(4, 100)) * np.array([[1e-5], [0], [1e-2], [1e3]])
+    tree = set_leaves(sum_tree.init(400, 4), np.arange(400), values.ravel().astype(np.float32))
+    keys = jax.random.split(jax.random.key(6), 1_000)
+    indices = jax.jit(jax.vmap(lambda key: sum_tree.sample(tree, key, 64)[0]))(keys)
+    counts = np.bincount(np.asarray(indices).ravel(), minlength=400).reshape(4, 100)
+    assert np.abs(counts.sum(1) - np.array([1, 0, 1, 1]) * 64_000 / 3).max() <= 1_000
+    for group in (0, 2, 3):
+        expected = values[group] / values[group].sum() * counts[group].sum()
+        assert stats.chisquare(counts[group], expected).pvalue > 0.001
 
 
 def test_a_million_leaves_are_drawn_in_proportion_and_those_of_zero_never():
@@ -194,6 +211,8 @@ def test_all_zero_priorities_are_refused_with_nan():
 def test_an_empty_tree_cannot_be_made():
     with pytest.raises(ValueError, match="sum tree: got num_leaves 0, want at least 1"):
         sum_tree.init(0)
+    with pytest.raises(ValueError, match="sum tree: got num_groups 3, want a divisor of num_leaves 10"):
+        sum_tree.init(10, 3)
 
 
 def test_donation_writes_in_place():

@@ -8,6 +8,7 @@ import sys
 
 import pytest
 
+from gvz.actions import UNIFIED_V1
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError
 from gvz.launch import main, parse
@@ -35,6 +36,26 @@ def test_the_main_config_plays_the_four_tasks():
         "defend_the_center/stone_wall",
         "defend_the_center/fast_enemies",
     ]
+
+
+def test_one_agent_for_all_scenarios_sees_returns_of_one_size_and_each_tasks_actions():
+    config = load_config("rainbow_all")
+    table = config.table
+    assert len(table) == 16
+    assert [scenario.id for scenario in table.scenarios] == [
+        *("defend_the_center", "dodge_projectiles", "health_gathering", "seek_and_kill")
+    ]
+    raw = dataclasses.replace(config, agent=dataclasses.replace(config.agent, scale_rewards=False)).table
+    assert raw.reward_scales is None
+    for row, unscaled in zip(table.rows, raw.rows, strict=True):
+        assert max(map(abs, row.return_range)) == pytest.approx(1)
+        assert row.return_range == pytest.approx([row.reward_scale * end for end in unscaled.return_range])
+        assert [UNIFIED_V1[a] for a in range(21) if row.action_mask[a]] == [
+            held for held in UNIFIED_V1 if set(held) <= set(row.task.scenario.buttons)
+        ]
+    assert table.reward_scales == tuple(row.reward_scale for row in table.rows)
+    assert config.support[0] >= -1
+    assert config.support[1] <= 1
 
 
 def test_a_path_is_taken_as_a_path(tmp_path):
@@ -129,6 +150,8 @@ BAD = {
     "--actors.num-actors 1 --actors.games-per-actor 2": "every task needs a game: want at least 4",
     "--checkpoint.keep 0": "checkpoint.keep: got 0",
     "--log.period-updates 0": "log.period_updates: got 0",
+    "--env.action-set unified_v2": "unified_v1",
+    "--env.action-set multi_discrete_v1": "env.action_set: got multi_discrete_v1, want unified_v1",
     "--env.buffers depth": "env.buffers: got ('depth',), want none",
     "--env.frame-skip 99": "env.frame_skip: got 99",
     "--env.reward-weights kil 2": "env.reward_weights: unknown component 'kil' (did you mean 'kill'?)",

@@ -1,0 +1,122 @@
+"""Several tasks as one Gymnasium environment: each episode is of one of them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from gvz.core.errors import ConfigError, TaskError
+from gvz.env import DoomEnv
+from gvz.observation import Observation
+from gvz.scenarios.base import Task
+
+Sampler = Callable[[np.random.Generator], str]
+"""chooses an episode's task: a random number generator -> the id of one of the environment's tasks"""
+
+
+class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
+    """A game whose episodes are of several tasks, also of several scenarios (`action_set="unified_v1"`).
+
+    `reset` takes the task from its options or else from the sampler; `info["task"]` names it. All else is as in
+    `gvz.env.DoomEnv`. Tasks that were played last keep their engines.
+    """
+
+    metadata = DoomEnv.metadata
+
+    def __init__(
+        self,
+        tasks: Sequence[Task | str],
+        *,
+        sampler: Sampler | None = None,
+        max_engines: int = 4,
+        **options: Any,
+    ):
+        """Compiles the maps of all tasks.
+
+        Args:
+            tasks: tasks or their ids.
+            sampler: chooses the task of an episode; default: uniformly. The random numbers are those of `reset`'s seed.
+            max_engines: engines that run at the same time, at least 1. An engine takes some 20 MB and 0.2 s to start.
+            **options: arguments of DoomEnv.
+
+        Raises:
+            ConfigError: no task, one twice, or tasks whose actions differ.
+            TaskError, EngineError: as DoomEnv.
+        """
+        if max_engines < 1:
+            raise ConfigError(f"max_engines: got {max_engines}, want at least 1")
+        games = [DoomEnv(task, **options) for task in tasks]
+        self._games = {game.task.id: game for game in games}
+        if not games or len(self._games) < len(games):
+            raise ConfigError(f"tasks: got {[game.task.id for game in games]}, want at least one, each once")
+        names = sorted({game.task.scenario.id for game in games})
+        if len(names) > 1 and games[0].config.action_set not in ("unified_v1", "multi_discrete_v1"):
+            raise ConfigError(
+                f"tasks: got tasks of {', '.join(names)}, whose actions differ; want one scenario, or "
+                'action_set="unified_v1"'
+            )
+        self._sampler = self._uniform if sampler is None else sampler
+        self._max_engines = max_engines
+        self._running: list[DoomEnv] = []
+        """games with an engine; the one played last comes last"""
+        self._game = games[0]
+        self.render_mode, self.metadata = self._game.render_mode, self._game.metadata
+        self.action_space, self.observation_space = self._game.action_space, self._game.observation_space
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Ids of the tasks."""
+        return tuple(self._games)
+
+    @property
+    def task(self) -> Task:
+        """The task of the present episode; before the first one, the first task."""
+        return self._game.task
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Starts an episode.
+
+        Args:
+            seed: starts a new sequence of tasks and episodes; without it the sequence continues.
+            options: {"task": id} chooses the task; {"episode_seed": n} as in DoomEnv.
+
+        Raises:
+            TaskError: the task is none of the environment's.
+            ValueError, EngineError, ResourceError: as DoomEnv.
+        """
+        super().reset(seed=seed)
+        rest = dict(options or {})
+        task = rest.pop("task") if "task" in rest else self._sampler(self.np_random)
+        if task not in self._games:
+            raise TaskError(f"reset: got task {task!r}, want one of {', '.join(self._games)}")
+        self._game = game = self._games[task]
+        if game in self._running:
+            self._running.remove(game)
+        elif len(self._running) == self._max_engines:
+            self._running.pop(0).close()
+        self._running.append(game)
+        rest.setdefault("episode_seed", int(self.np_random.integers(2**31)))
+        return game.reset(options=rest)
+
+    def step(self, action: int | np.integer | np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """As DoomEnv's."""
+        return self._game.step(action)
+
+    def action_masks(self) -> np.ndarray:
+        """bool[A]: the actions that the present episode's task allows."""
+        return self._game.action_masks()
+
+    def render(self) -> np.ndarray | None:
+        """As DoomEnv's."""
+        return self._game.render()
+
+    def close(self) -> None:
+        """Ends all engines. Can be repeated."""
+        while self._running:
+            self._running.pop().close()
+
+    def _uniform(self, rng: np.random.Generator) -> str:
+        return self.tasks[int(rng.integers(len(self._games)))]

@@ -1,0 +1,32 @@
+"""The section over all scenarios."""
+
+from gvz.reports.joint_section import joint_sections
+from gvz.reports.results import read_results
+from gvz.tasks import named_tasks
+from tests.reports.conftest import evaluation_row, write_rows
+
+PERCENT = {"health_gathering": 40.0, "seek_and_kill": 10.0}
+
+
+def test_an_agent_of_two_scenarios_has_the_mean_of_their_means(tmp_path):
+    rows = [
+        evaluation_row(player, task.id, n, percent)
+        for scenario, percent in PERCENT.items()
+        for player in ("random", "idle")
+        for task in named_tasks(scenario, split="test")
+        for n in range(2)
+        if player == "random" or scenario == "seek_and_kill"
+    ]
+    write_rows(tmp_path / "rows.jsonl", rows)
+    (section,) = joint_sections(read_results([tmp_path]))
+    (table,) = section.blocks[0].tables
+    assert table.columns == ("agent", "Health Gathering", "Seek and Kill", "P_norm")
+    assert [[cell.text for cell in row] for row in table.rows] == [
+        ["random", "40.0 [40.0, 40.0]", "10.0 [10.0, 10.0]", "25.0 [25.0, 25.0]"]
+    ]
+
+
+def test_one_scenario_needs_no_such_section(tmp_path):
+    tasks = named_tasks("health_gathering", split="test")
+    write_rows(tmp_path / "rows.jsonl", [evaluation_row("random", task.id, 0, 40.0) for task in tasks])
+    assert joint_sections(read_results([tmp_path])) == []

@@ -1,0 +1,66 @@
+"""Several tasks as one environment: the games are those of the single environments."""
+
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import gvz
+from gvz.core.errors import ConfigError, TaskError
+from gvz.env import DoomEnv
+from gvz.multi_task import MultiTaskEnv
+
+TASKS = ("defend_the_center/default", "seek_and_kill/default", "dodge_projectiles/default")
+
+
+def play(env, options) -> tuple[np.ndarray, dict]:
+    frame, info = env.reset(options={"episode_seed": 5} | options)
+    return np.stack([frame, *(env.step(1)[0] for _ in range(6))]), info
+
+
+@pytest.mark.engine
+def test_an_episode_is_the_single_environments():
+    several = gvz.make(TASKS, action_set="unified_v1", max_engines=2)
+    assert isinstance(several, MultiTaskEnv)
+    for task in (*TASKS, TASKS[0]):
+        alone = DoomEnv(task, action_set="unified_v1")
+        frames, info = play(alone, {})
+        same, same_info = play(several, {"task": task})
+        assert (frames == same).all()
+        assert info == same_info
+        assert info["task"] == several.task.id == task
+        assert (several.action_masks() == alone.action_masks()).all()
+        assert len(several._running) <= 2
+        alone.close()
+    several.close()
+    assert not several._running
+
+
+@pytest.mark.engine
+def test_the_sampler_chooses_and_the_seed_repeats_the_sequence():
+    with gvz.make(TASKS, action_set="unified_v1") as env:
+        first = [env.reset(seed=3 if n == 0 else None)[1] for n in range(6)]
+        again = [env.reset(seed=3 if n == 0 else None)[1] for n in range(6)]
+        pairs = [[(info["task"], info["episode_seed"]) for info in infos] for infos in (first, again)]
+        assert pairs[0] == pairs[1]
+        assert len(set(pairs[0])) == 6
+        assert len({task for task, _ in pairs[0]}) > 1
+    with gvz.make(TASKS[:2], action_set="unified_v1", sampler=lambda _rng: TASKS[1]) as env:
+        assert env.reset(seed=1)[1]["task"] == TASKS[1]
+
+
+@pytest.mark.engine
+def test_gymnasiums_checker_passes():
+    env = gvz.make(["health_gathering/default", "health_gathering/lava"])
+    check_env(env, skip_render_check=True)
+    env.close()
+
+
+def test_bad_input_is_named():
+    with pytest.raises(ConfigError, match='whose actions differ; want one scenario, or action_set="unified_v1"'):
+        gvz.make(TASKS)
+    with pytest.raises(ConfigError, match="want at least one, each once"):
+        gvz.make([TASKS[0], TASKS[0]])
+    with pytest.raises(ConfigError, match="max_engines: got 0, want at least 1"):
+        gvz.make(TASKS, action_set="unified_v1", max_engines=0)
+    with pytest.raises(TaskError, match="reset: got task 'doom', want one of defend_the_center/default, seek"):
+        gvz.make(TASKS, action_set="unified_v1").reset(options={"task": "doom"})
