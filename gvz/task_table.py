@@ -36,6 +36,10 @@ class TaskTable:
 
     rows: tuple[TaskRow, ...]
 
+    def percent(self, task: int, score: float) -> float:
+        """A score of the task with this index, in percent of its upper bound."""
+        return 100 * score / self.rows[task].upper_bound
+
     def __len__(self) -> int:
         return len(self.rows)
 

@@ -4,6 +4,7 @@ Nothing here changes a run. Its sizes are bounded by design (a game owns its sha
 is capped, parameters that are not finite are never kept); these are the conditions under which it may be wasted.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -26,7 +27,7 @@ class Expected:
     """What the metrics of a run are held against."""
 
     games: Mapping[str, int]
-    """of each task"""
+    """of each task; empty where a game's tasks change"""
     timeout_steps: int
     """decisions after which an episode is truncated"""
     num_slots: int
@@ -82,8 +83,8 @@ def _idle_tasks(row: Mapping[str, float], tasks: Sequence[TaskStatus], expected:
     """Tasks from which nothing comes: no score, or no end of an episode."""
     found = {}
     for task in tasks:
-        share = row.get(f"replay/share/{task.task}", 0.0)
-        steps = share * row["replay/fill_share"] * expected.num_slots / expected.games[task.task]
+        share, games = row.get(f"replay/share/{task.task}", 0.0), expected.games.get(task.task, math.inf)
+        steps = share * row["replay/fill_share"] * expected.num_slots / games
         if task.episodes >= ZERO_EPISODES and task.score == 0.0:
             found[f"zero/{task.task}"] = f"{task.task} scored 0 in each of its last {ZERO_EPISODES} episodes"
         if task.episodes == 0 and steps > ENDLESS_EPISODES * expected.timeout_steps:

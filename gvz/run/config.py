@@ -11,6 +11,7 @@ from typing import Literal
 from actors.config import MAX_LANES, ActorsConfig
 from gvz.core.env_config import EnvConfig, leaves
 from gvz.core.errors import ConfigError
+from gvz.run.curriculum import CurriculumConfig, check_curriculum
 from gvz.scenarios.base import Split
 from gvz.task_table import TaskTable, task_table
 from gvz.tasks import named_tasks
@@ -80,6 +81,7 @@ class RunConfig:
     """where the run is kept; default runs/<name>/seed_<seed>"""
     env: EnvConfig = field(default_factory=EnvConfig)
     actors: ActorsConfig = field(default_factory=ActorsConfig)
+    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     agent: AgentConfig = field(default_factory=RainbowConfig)
     replay: ReplayConfig | None = field(default_factory=ReplayConfig)
     """None for an agent that learns on-policy"""
@@ -103,7 +105,7 @@ class RunConfig:
             raise ConfigError(
                 "env.action_set: got multi_discrete_v1, want unified_v1: the trainer's actions are discrete"
             )
-        _ = self.table
+        check_curriculum(self.curriculum, self.table)
         if self.num_lanes > MAX_LANES:
             raise ConfigError(
                 f"actors.num_actors, games_per_actor: got {self.num_actors} times {self.games_per_actor} games, want "
@@ -208,7 +210,7 @@ class RunConfig:
         num_tasks, actors, games = len(self.table), self._configured_actors, self.actors.games_per_actor
         if games is None:
             games = num_tasks * math.ceil(4 / num_tasks)
-        if games * actors < num_tasks:
+        if games * actors < num_tasks and self.curriculum.kind == "fixed":
             raise ConfigError(
                 f"actors.games_per_actor: got {games} games for each of {actors} actors, but there are {num_tasks} "
                 f"tasks; every task needs a game: want at least {math.ceil(num_tasks / actors)}"

@@ -130,7 +130,7 @@ def _expected(config: RunConfig, parts: RunParts) -> Expected:
     waiting = config.num_actors * parts.pool_config.ring_capacity + ahead
     played = Counter(tasks[lane % len(tasks)] for lane in range(config.num_lanes))
     return Expected(
-        games={task: played[task] for task in tasks},
+        games={task: played[task] for task in tasks} if config.curriculum.kind == "fixed" else {},
         timeout_steps=-(-max(row.timeout_frames for row in parts.table.rows) // config.env.frame_skip),
         num_slots=parts.learner.num_slots,
         v_min=v_min,

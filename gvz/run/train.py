@@ -21,6 +21,7 @@ from gvz.core.watchdog import AwakeClock, Watchdog
 from gvz.run import footprint, machine
 from gvz.run.assemble import RunParts, assemble
 from gvz.run.config import RunConfig
+from gvz.run.curriculum import Curriculum
 from gvz.run.monitor import Counts, Monitor
 from gvz.run.progress import Progress
 from gvz.run.rundir import START_RECORDS, RunDir
@@ -55,6 +56,7 @@ class Trainer:
         self._telemetry = Telemetry(run, parts.table, config.log, self._counts.updates)
         if host is not None:
             self._telemetry.restore(host["telemetry"])
+        self._curriculum = Curriculum(config.curriculum, parts.table, config.seed, host and host["curriculum"])
         self._monitor = Monitor(config, parts, progress, self._telemetry, self._counts)
         self._saver = Saver(run, config.checkpoint, self._counts, self._snapshot, self._monitor.failed_save)
         self._clock, self._collected_s = AwakeClock(LONGEST_WAIT_S), 0.0
@@ -72,8 +74,7 @@ class Trainer:
             NonFiniteError: the learner's numbers went wrong; the checkpoints before it stand.
             CheckpointError: the last checkpoint could not be written.
         """
-        # rates count from here
-        self._monitor.look(self._pool.statistics(), self._learner.take_staleness)
+        self._monitor.look(self._pool.statistics(), self._learner.take_staleness)  # rates count from here
         try:
             with Watchdog("the learner", LONGEST_ROUND_S) as watchdog:
                 while not self._is_done() and not stop.requested:
@@ -85,8 +86,7 @@ class Trainer:
                     self._record()
                     self._saver.save_when_due()
         except (WorkerError, WaitTimeoutError):
-            # a failed save is already reported; the first error is raised
-            with contextlib.suppress(CheckpointError, WaitTimeoutError):
+            with contextlib.suppress(CheckpointError, WaitTimeoutError):  # already reported; the first error is raised
                 self._saver.save_last(self._record_row)
             raise
         self._progress.say("stopping: writing a checkpoint" if stop.requested else "done: writing the last checkpoint")
@@ -104,9 +104,9 @@ class Trainer:
 
     def _is_done(self) -> bool:
         """Processor time is looked at with every row of metrics: a row more or less is how exact its limit is."""
-        limit_s = self._config.max_processor_s
-        used_up = limit_s is not None and self._counts.processor_s >= limit_s
-        return used_up or self._counts.updates >= self._config.learner.total_updates
+        config, counts = self._config, self._counts
+        used_up = config.max_processor_s is not None and counts.processor_s >= config.max_processor_s
+        return used_up or counts.updates >= config.learner.total_updates
 
     def _collect(self) -> None:
         """Rings -> learner, as far as it allows."""
@@ -130,8 +130,10 @@ class Trainer:
             if isinstance(message, EpisodeStats):
                 self._telemetry.episode(message, num_updates=self._counts.updates, env_steps=self._counts.env_steps)
                 if not message.cut:
-                    upper_bound = self._parts.table.rows[message.task].upper_bound
-                    self._learner.add_episode(message.task, 100 * message.score / upper_bound)
+                    percent = self._parts.table.percent(message.task, message.score)
+                    self._learner.add_episode(message.task, percent)
+                    if (task := self._curriculum.next_task(message, percent)) is not None:
+                        self._pool.assign(message.lane, task)
             elif isinstance(message, Fault):
                 self._telemetry.fault(message, num_updates=self._counts.updates)
                 self._progress.say(f"fault: {message.message}")
@@ -171,13 +173,12 @@ class Trainer:
         if counts.updates > counts.logged_updates:
             counts.logged_updates = counts.updates
             self._take_processor_time()
-            metrics = self._learner.take_metrics()
-            self._monitor.log(self._pool.statistics(), self._learner.take_staleness(), metrics)
+            learner = self._learner
+            self._monitor.log(self._pool.statistics(), learner.take_staleness(), learner.take_metrics())
 
     def _take_processor_time(self) -> None:
         """Never less than before: a child may have ended without being waited for."""
-        now_s = machine.processor_s() - self._processor_start_s
-        self._counts.processor_s = max(self._counts.processor_s, now_s)
+        self._counts.processor_s = max(self._counts.processor_s, machine.processor_s() - self._processor_start_s)
 
     def _snapshot(self) -> Snapshot:
         """The whole state; raises NonFiniteError instead of saving numbers that went wrong."""
@@ -186,6 +187,7 @@ class Trainer:
         host = {
             "counts": dataclasses.asdict(self._counts),
             "telemetry": self._telemetry.state(),
+            "curriculum": self._curriculum.state(),
             "pool": self._pool.state(),
             "records": self._run.record_lengths(),
             **self._learner.state(),

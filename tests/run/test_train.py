@@ -12,6 +12,7 @@ from gvz.core import records
 from gvz.core.env_config import EnvConfig
 from gvz.core.stop import StopRequest
 from gvz.run.config import LogConfig, RunConfig
+from gvz.run.curriculum import CurriculumConfig
 from gvz.run.rundir import RunDir
 from gvz.run.train import train
 from learner.agents.configs.dqn import DQNConfig
@@ -71,17 +72,22 @@ def logged_updates(path: Path) -> list[int]:
     return [row["num_updates"] for row in rows]
 
 
-def test_a_run_that_explores_by_epsilon_goes_on_bit_for_bit_between_two_publications(tmp_path):
+@pytest.mark.parametrize("curriculum", ["fixed", "uniform"])
+def test_a_run_that_explores_by_epsilon_goes_on_bit_for_bit_between_two_publications(tmp_path, curriculum):
     """The cut lies after the last publication and in a fuzzy enemies' episode that is not its game's first."""
-    go_on(tmp_path / "whole", DQN, 80)
-    rarely = replace(DQN, log=replace(DQN.log, period_updates=1_000))
+    config = replace(DQN, curriculum=CurriculumConfig(kind=curriculum))
+    go_on(tmp_path / "whole", config, 80)
+    rarely = replace(config, log=replace(DQN.log, period_updates=1_000))
     go_on(tmp_path / "cut", rarely, 50)
     assert logged_updates(tmp_path / "cut") == [50], "a run that ends before its log period leaves a row"
-    go_on(tmp_path / "cut", DQN, 80)
+    go_on(tmp_path / "cut", config, 80)
     whole, cut = (arrays_of(tmp_path / name / "checkpoints" / "80") for name in ("whole", "cut"))
     assert len(np.unique(whole["['replay'].store.action"])) > 1
     assert [name for name in whole if not np.array_equal(whole[name], cut[name])] == []
     assert (tmp_path / "whole" / "episodes.jsonl").read_bytes() == (tmp_path / "cut" / "episodes.jsonl").read_bytes()
+    episodes, _ = records.read(tmp_path / "whole" / "episodes.jsonl")
+    tasks_of_lanes = {(row["lane"], row["task"]) for row in episodes}
+    assert (len(tasks_of_lanes) > 2) == (curriculum == "uniform")
     assert logged_updates(tmp_path / "whole") == [20, 40, 60, 80]
     assert logged_updates(tmp_path / "cut") == [50, 60, 80]
 

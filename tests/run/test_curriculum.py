@@ -1,0 +1,93 @@
+"""Curricula: which task is drawn, and that a run goes on with the same draws."""
+
+import dataclasses
+
+import msgspec
+import numpy as np
+import pytest
+
+from gvz.core.env_config import EnvConfig
+from gvz.core.errors import ConfigError
+from gvz.run.config_files import load_config
+from gvz.run.curriculum import Curriculum, CurriculumConfig
+from gvz.task_table import task_table
+from gvz.transport.messages import EpisodeStats
+
+TASKS = tuple(f"defend_the_center/{name}" for name in ("default", "gore", "stone_wall", "gore+mossy_bricks"))
+TABLE = task_table(TASKS, EnvConfig(), 0.99)
+"""levels 0, 1, 1, 2"""
+
+
+def ended(task: int) -> EpisodeStats:
+    return EpisodeStats(
+        lane=0, task=task, episode=0, seed=0, score=0.0, reward=0.0, reward_components={}, length_frames=4,
+        length_steps=1, params_version=0, terminated=True, truncated=False, cut=False,
+    )  # fmt: skip
+
+
+def curriculum(state=None, **fields) -> Curriculum:
+    return Curriculum(CurriculumConfig(**fields), TABLE, 7, state)
+
+
+def play(lessons: Curriculum, percent_of, episodes: int) -> list[int]:
+    """The tasks drawn, each played as soon as it is drawn; scores are percent_of(task, number), or a number."""
+    drawn = [0]
+    for number in range(episodes):
+        drawn.append(
+            lessons.next_task(ended(drawn[-1]), percent_of(drawn[-1], number) if callable(percent_of) else percent_of)
+        )
+    return drawn[1:]
+
+
+def test_a_fixed_game_keeps_its_task():
+    assert curriculum().next_task(ended(2), 10.0) is None
+
+
+def test_uniform_draws_every_task_alike():
+    counts = np.bincount(play(curriculum(kind="uniform"), 0.0, 4_000), minlength=4)
+    assert np.abs(counts - 1_000).max() < 4 * 1_000**0.5
+
+
+def test_the_next_level_opens_when_every_task_of_the_last_is_learned():
+    lessons = curriculum(kind="level", learned_percent=60.0, window_episodes=5)
+    assert set(play(lessons, 59.0, 50)) == {0}
+    for _ in range(5):
+        lessons.next_task(ended(0), 61.0)
+    np.testing.assert_allclose(lessons.probabilities(), [1 / 3, 1 / 3, 1 / 3, 0])
+    for number in range(10):
+        lessons.next_task(ended(1), 100.0)
+        assert lessons.probabilities()[3] == 0, number
+    for _ in range(5):
+        lessons.next_task(ended(2), 60.0)
+    np.testing.assert_allclose(lessons.probabilities(), [1 / 4] * 4)
+
+
+def test_progress_draws_where_the_score_moves_most():
+    lessons = curriculum(kind="progress", staleness_share=0.0)
+    counts = np.bincount(play(lessons, lambda task, number: number / 20 if task == 2 else 30.0, 2_000), minlength=4)
+    by_rank = 1 / np.arange(1, 5) / (1 / np.arange(1, 5)).sum()
+    assert counts[2] / 2_000 == pytest.approx(by_rank[0], abs=0.06)
+    lessons = curriculum(kind="progress", staleness_share=1.0)
+    gaps = np.diff(np.flatnonzero(np.array(play(lessons, 30.0, 2_000)) == 3))
+    assert gaps.max() < 30, "a stale task comes back"
+
+
+@pytest.mark.parametrize("kind", ["uniform", "level", "progress"])
+def test_a_run_that_goes_on_draws_the_same(kind):
+    def score(task, number):
+        return 10.0 * task + number % 7
+
+    whole = curriculum(kind=kind, window_episodes=4, learned_percent=0.0)
+    play(whole, score, 40)
+    state = msgspec.msgpack.decode(msgspec.msgpack.encode(whole.state()))
+    resumed = curriculum(state, kind=kind, window_episodes=4, learned_percent=0.0)
+    assert play(whole, score, 40) == play(resumed, score, 40)
+
+
+def test_what_cannot_be_is_refused():
+    config = load_config("rainbow_quick")
+    for kind, message in (("level", "all tasks have level 0"), ("uniform", "got uniform for one task")):
+        with pytest.raises(ConfigError, match=message):
+            dataclasses.replace(config, curriculum=CurriculumConfig(kind=kind))
+    with pytest.raises(ConfigError, match=r"curriculum\.learned_percent: got 101\.0, want 0\.\.100"):
+        CurriculumConfig(learned_percent=101.0)
