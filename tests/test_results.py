@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from gvz.evaluation.statistics import Estimate, bootstrap
+from gvz.reports.experiment_section import comparison_table, result_table
+from gvz.reports.results import read_results
 from gvz.tasks import named_tasks
 
 ROOT = Path(__file__).parent.parent
@@ -46,6 +48,26 @@ def test_the_quick_comparison_says_what_its_records_give():
             tasks = {task.id for task in named_tasks("defend_the_center", level=level)}
             assert value == round(np.mean([row["normalized_score"] for row in final if row["task"] in tasks]), 1)
         assert said[-1] == round(np.mean([row["normalized_score"] for row in final if row["task"] in test_tasks]), 1)
+
+
+def test_the_findings_say_what_the_gates_records_give():
+    page = (ROOT / "docs" / "FINDINGS.md").read_text()
+    results = read_results([ROOT / "results" / "gates"])
+    assert {run.id.rpartition("/")[0] for run in results.runs} == {
+        f"rainbow_quick/{scenario}/{training}"
+        for scenario in ("defend_the_center", "dodge_projectiles")
+        for training in ("train4", "train8", "varied")
+    }
+    for asked in results.asked:
+        for trained in (False, True):
+            for scenario, _, *cells in result_table(results, asked, trained=trained).rows[:-1]:
+                assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
+    (asked,) = results.asked
+    for _, compared, gain, _ in comparison_table(results, asked).rows[:2]:
+        value, _, interval = gain.text.partition(" ")
+        assert compared.text == "8 tasks against 4 tasks"
+        assert value in page
+        assert interval in page
 
 
 def test_the_readme_says_how_fast_the_records_are():

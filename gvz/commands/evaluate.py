@@ -38,7 +38,8 @@ class Evaluate:
     run_dirs: Annotated[
         tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[RUN_DIR ...]", help_behavior_hint="")
     ] = ()
-    """run directories: their policies play greedily, noise off; by default the test tasks of their scenarios"""
+    """run directories, or zoo:NAME (see gvz zoo): their policies play greedily, noise off; by default
+    the test tasks of their scenarios"""
     player: SimplePlayerName | None = None
     """random: uniformly random buttons; idle: presses nothing; sweep: a fixed sequence of buttons; scripted: the
     scenario's simple script, which gets names and places of what is in sight"""
@@ -101,12 +102,13 @@ class Evaluate:
         """Who plays -> what, and the record file."""
         from gvz.evaluation.episode_log import simple_player
         from gvz.evaluation.trained import check_tasks, find_checkpoints, read_run_config, trained_player
+        from gvz.evaluation.zoo import run_directory
 
         if self.player is not None:
             out = Path("evaluation.jsonl") if self.out is None else self.out
             return {simple_player(self.player, EnvConfig(profile=self.profile)): (self.select.resolve(), out)}
         found = {}
-        for run_dir in dict.fromkeys(self.run_dirs):
+        for run_dir in dict.fromkeys(map(run_directory, self.run_dirs)):
             config = read_run_config(run_dir, self.agent)
             tasks = self.select.of_run([scenario.id for scenario in config.table.scenarios])
             check_tasks(config, tasks)

@@ -29,7 +29,7 @@ class Export:
     run_dirs: Annotated[
         tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN_DIR ...", help_behavior_hint="")
     ]
-    """run directories of the trainer"""
+    """run directories of the trainer, or zoo:NAME (see gvz zoo)"""
     format: Literal["csv", "parquet"] = "csv"
     """csv, or parquet, which keeps the types"""
     out: Path = Path("tables")
@@ -40,10 +40,12 @@ class Export:
         if not self.run_dirs:
             raise ConfigError("export: got no run directory, want at least one")
         from gvz.evaluation.dataset import collect_evaluations
+        from gvz.evaluation.zoo import run_directory
 
         problems: list[str] = []
-        tables = {Path(name).stem: run_table(self.run_dirs, name, problems) for name in (*RECORD_FILES, START_RECORDS)}
-        tables["evaluation"], damaged = collect_evaluations(self.run_dirs)
+        run_dirs = [run_directory(path) for path in self.run_dirs]
+        tables = {Path(name).stem: run_table(run_dirs, name, problems) for name in (*RECORD_FILES, START_RECORDS)}
+        tables["evaluation"], damaged = collect_evaluations(run_dirs)
         try:
             self.out.mkdir(parents=True, exist_ok=True)
         except OSError as error:

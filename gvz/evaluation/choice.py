@@ -25,7 +25,7 @@ class EpisodeChoice:
         tyro.conf.Positional[Path | None],
         tyro.conf.arg(metavar="[RUN_DIR]", help_behavior_hint=""),
     ] = None
-    """a run directory: its policy plays greedily, noise off"""
+    """a run directory, or zoo:NAME (see gvz zoo): its policy plays greedily, noise off"""
     player: SimplePlayerName | None = None
     """instead: random, idle, or the scenario's simple script"""
     agent: Path | None = None
@@ -49,6 +49,7 @@ class EpisodeChoice:
         """
         from gvz.evaluation.episode_log import simple_player
         from gvz.evaluation.trained import check_tasks, find_checkpoints, read_run_config, trained_player
+        from gvz.evaluation.zoo import run_directory
 
         if (self.player is None) == (self.run_dir is None):
             raise ConfigError("want a run directory or --player")
@@ -60,15 +61,16 @@ class EpisodeChoice:
             if self.task is None:
                 raise ConfigError("--task: want a task id, for example defend_the_center/gore (gvz tasks lists them)")
             return simple_player(self.player, EnvConfig(profile=self.profile)), parse_task(self.task)
-        config = read_run_config(self.run_dir, self.agent)
+        run_dir = run_directory(self.run_dir)
+        config = read_run_config(run_dir, self.agent)
         task = config.table.tasks[0] if self.task is None else parse_task(self.task)
         check_tasks(config, [task])
-        found = find_checkpoints(self.run_dir, [self.checkpoint])
+        found = find_checkpoints(run_dir, [self.checkpoint])
         if len(found) > 1:
             raise ConfigError(f"--checkpoint: got {self.checkpoint}, want one of {', '.join(map(str, found))}")
         if task.scenario not in config.table.scenarios:  # a run's weights are of its own scenario's components
             config = dataclasses.replace(config, env=dataclasses.replace(config.env, reward_weights=()))
-        return trained_player(self.run_dir, config, found[0]), task
+        return trained_player(run_dir, config, found[0]), task
 
 
 ANY_EPISODE = EpisodeChoice()

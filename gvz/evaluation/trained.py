@@ -113,7 +113,7 @@ def trained_player(run_dir: Path, config: RunConfig, num_updates: int) -> Player
     Raises:
         CheckpointError: it is damaged, or belongs to another configuration.
     """
-    _, params = _read_params(run_dir, config, num_updates)
+    _, params = read_params(run_dir, config, num_updates)
     import jax  # not before: reading says on which platform
 
     digest = hashlib.blake2b(digest_size=8)
@@ -143,7 +143,7 @@ class TrainedPlayer:
 
     def __init__(self, run_dir: Path, num_updates: int, agent_file: Path | None = None):
         config = read_run_config(run_dir, agent_file)
-        agent, params = _read_params(run_dir, config, num_updates)
+        agent, params = read_params(run_dir, config, num_updates)
         import jax
 
         self._params = jax.device_put(params)
@@ -204,7 +204,7 @@ def _jitted(agent: "Agent") -> Any:
     return jax.jit(lambda params, arrays: agent.evaluate(params, Observation(**arrays)))
 
 
-def _read_params(run_dir: Path, config: RunConfig, num_updates: int) -> "tuple[Agent, Any]":
+def read_params(run_dir: Path, config: RunConfig, num_updates: int) -> "tuple[Agent, Any]":
     # acting is done on the CPU, by the form of the convolutions that is quick there
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     import jax

@@ -5,7 +5,6 @@ import hashlib
 import json
 import pickle
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -17,39 +16,10 @@ from gvz.evaluation.choice import EpisodeChoice
 from gvz.evaluation.selection import TaskSelection
 from gvz.evaluation.trained import TrainedPlayer, check_tasks, find_checkpoints, read_run_config, trained_player
 from gvz.run.assemble import run_agent
-from gvz.run.config import RunConfig
 from gvz.run.config_files import config_to_dict
-from gvz.run.rundir import RunDir
 from gvz.tasks import named_tasks, parse_task
-from learner import checkpoint
-from learner.agents.configs.rainbow import RainbowConfig
 from learner.export import flatten_params
-
-CONFIG = RunConfig(
-    name="small",
-    seed=7,
-    env=EnvConfig(frame_height=24, frame_width=32, grayscale=True),
-    agent=RainbowConfig(conv_channels=(4,), conv_kernels=(8,), conv_strides=(4,), hidden_units=8),
-)
-
-
-@pytest.fixture
-def run(tmp_path):
-    """A run directory with the policies of updates 10, 20 and 100."""
-    with RunDir(tmp_path / "run") as directory:
-        directory.write_config(CONFIG)
-    for step in (10, 20, 100):
-        write_policy(tmp_path / "run", CONFIG, step)
-    return tmp_path / "run"
-
-
-def write_policy(run, config, step):
-    """Writes random parameters as the policy of a step, and returns them."""
-    rng = np.random.default_rng(step)
-    template = jax.eval_shape(run_agent(config).init, jax.random.key(0))
-    params = jax.tree.map(lambda leaf: 0.1 * rng.standard_normal(leaf.shape, np.float32), template)
-    checkpoint.write(run / "policies" / str(step), params, {"num_updates": step})
-    return params
+from tests.evaluation.policies import CONFIG, write_policy
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,21 @@
+"""Rainbow for tasks that it has not seen, on two CPU cores: settings that gates have chosen so far (docs/FINDINGS.md).
+
+Against `rainbow_quick`: the eight training tasks of a scenario, a replay twice as large, and 500,000 gradient steps, of
+which two cores do some 150,000 an hour; stop it when you like.
+"""
+
+import dataclasses
+
+from configs.rainbow_quick import CONFIG as QUICK
+from gvz.run.config import CheckpointConfig, off_policy
+
+_LEARNER, _REPLAY = off_policy(QUICK)
+
+CONFIG = dataclasses.replace(
+    QUICK,
+    name="rainbow_general",
+    training_set=8,
+    replay=dataclasses.replace(_REPLAY, capacity=100_000),
+    learner=dataclasses.replace(_LEARNER, total_updates=500_000),
+    checkpoint=CheckpointConfig(period_updates=10_000),
+)

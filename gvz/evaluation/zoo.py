@@ -1,0 +1,125 @@
+"""Trained policies that come with GViZDoom: one file each, which holds a run directory.
+
+Wherever a command takes a run directory, `zoo:NAME` stands for such a policy. Its file is a zip archive with the run's
+configuration, its newest policy, its records of training, and the evaluation episodes of this policy (its score card).
+"""
+
+import contextlib
+import hashlib
+import json
+import shutil
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gvz.core.cache import cache_directory
+from gvz.core.errors import ConfigError, nearest
+
+ZOO_DIRECTORY = Path(__file__).parent.parent / "zoo"
+PREFIX = "zoo:"
+MAX_BYTES = 2_000_000
+"""of a file"""
+RECORDS = ("config.json", "metrics.jsonl", "episodes.jsonl", "starts.jsonl", "evaluation.jsonl")
+_ROUNDED_BITS = 12
+"""of a float32's 23 bits of fraction that are rounded away: half the file's size, a relative change of 2^-12"""
+
+
+def zoo_names() -> list[str]:
+    """Names of the policies."""
+    return sorted(file.stem for file in ZOO_DIRECTORY.glob("*.zip"))
+
+
+def run_directory(path: Path) -> Path:
+    """The run directory that `path` names: itself, or that of a policy, which is unpacked into the cache.
+
+    Raises:
+        ConfigError: there is no such policy.
+    """
+    if not str(path).startswith(PREFIX):
+        return path
+    name, known = str(path).removeprefix(PREFIX), zoo_names()
+    if name not in known:
+        raise ConfigError(f"{path}: no such policy{nearest(name, known)}; want one of {', '.join(known) or 'none'}")
+    file = ZOO_DIRECTORY / f"{name}.zip"
+    digest = hashlib.blake2b(file.read_bytes(), digest_size=8).hexdigest()
+    unpacked = cache_directory() / "zoo" / digest / name
+    if not unpacked.exists():
+        unpacked.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=unpacked.parent) as temporary, zipfile.ZipFile(file) as archive:
+            archive.extractall(Path(temporary) / name)  # zipfile keeps every name inside
+            # another process may have been first; then its directory stays
+            with contextlib.suppress(OSError):
+                (Path(temporary) / name).rename(unpacked)
+    return unpacked
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Packed:
+    """A policy as it was put into the zoo."""
+
+    file: Path
+    num_updates: int
+    num_bytes: int
+    num_episodes: int
+    """evaluation episodes of this very policy, its score card"""
+
+
+def pack(run_dir: Path, name: str, checkpoint: str = "newest", agent_file: Path | None = None) -> Packed:
+    """Puts a policy of a run into the zoo. Its parameters are rounded to 11 bits of fraction.
+
+    Only evaluation episodes of the rounded parameters go with it. So pack, evaluate `zoo:NAME`, and pack `zoo:NAME`
+    again.
+
+    Args:
+        run_dir: of the run.
+        name: of the policy in the zoo.
+        checkpoint: which of its policies, as for `gvz evaluate`.
+        agent_file: of an agent in a file of its own.
+
+    Raises:
+        ConfigError: not a run, no such policy, a name that no file can have, or a file that would be too large.
+        CheckpointError: the policy is damaged.
+    """
+    from gvz.core import records
+    from gvz.evaluation.trained import find_checkpoints, read_params, read_run_config, trained_player
+    from learner import checkpoint as checkpoints
+
+    if not name.replace("_", "").replace("-", "").isalnum():
+        raise ConfigError(f"zoo: got name {name!r}, want letters, digits, _ and -")
+    config = read_run_config(run_dir, agent_file)
+    [num_updates] = find_checkpoints(run_dir, [checkpoint])
+    _, params = read_params(run_dir, config, num_updates)
+    with tempfile.TemporaryDirectory() as temporary:
+        packed = Path(temporary) / name
+        packed.mkdir()
+        for record in RECORDS[:-1]:
+            if (run_dir / record).exists():
+                shutil.copy(run_dir / record, packed)
+        checkpoints.write(packed / "policies" / str(num_updates), _rounded(params), {"num_updates": num_updates})
+        player = trained_player(packed, config, num_updates)
+        rows = [row for row in records.read_stored(run_dir / RECORDS[-1])[0] if player.identity.items() <= row.items()]
+        (packed / RECORDS[-1]).write_text("".join(json.dumps(row) + "\n" for row in rows))
+        file = Path(shutil.make_archive(str(packed), "zip", packed))
+        if (size := file.stat().st_size) > MAX_BYTES:
+            raise ConfigError(
+                f"zoo: {name} would have {size:,} bytes, want at most {MAX_BYTES:,}; train a smaller network"
+            )
+        ZOO_DIRECTORY.mkdir(exist_ok=True)
+        shutil.copy(file, ZOO_DIRECTORY)
+    return Packed(file=ZOO_DIRECTORY / file.name, num_updates=num_updates, num_bytes=size, num_episodes=len(rows))
+
+
+def _rounded(params: object) -> object:
+    import jax
+
+    def rounded(leaf: np.ndarray) -> np.ndarray:
+        if leaf.dtype != np.float32:
+            return leaf
+        bits = np.ascontiguousarray(leaf).view(np.uint32)
+        half, mask = np.uint32(1 << (_ROUNDED_BITS - 1)), np.uint32(~((1 << _ROUNDED_BITS) - 1) & 0xFFFFFFFF)
+        return ((bits + half) & mask).view(np.float32)
+
+    return jax.tree.map(rounded, params)

@@ -1,0 +1,63 @@
+"""Policies of the zoo: packed, unpacked, played."""
+
+import numpy as np
+import pytest
+
+from gvz import cli
+from gvz.core.errors import ConfigError
+from gvz.evaluation import zoo
+from gvz.evaluation.episode_log import read_rows
+from gvz.evaluation.trained import read_params, read_run_config
+from gvz.evaluation.zoo import pack, run_directory, zoo_names
+from tests.evaluation.policies import CONFIG
+
+
+@pytest.fixture(autouse=True)
+def empty_zoo(tmp_path, monkeypatch):
+    monkeypatch.setattr(zoo, "ZOO_DIRECTORY", tmp_path / "zoo")
+    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path / "cache"))
+
+
+def test_a_packed_policy_is_the_runs_rounded(run):
+    packed = pack(run, "one", "20")
+    assert packed.num_updates == 20
+    assert zoo_names() == ["one"]
+    directory = run_directory("zoo:one")
+    assert read_run_config(directory).agent == read_run_config(run).agent
+    (_, before), (_, after) = (read_params(path, CONFIG, 20) for path in (run, directory))
+    import jax
+
+    for exact, rounded in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
+        np.testing.assert_allclose(rounded, exact, rtol=2.0**-12)
+        assert (rounded.view(np.uint32) % 2**12 == 0).all()
+    pack(directory, "one")
+    _, twice = read_params(run_directory("zoo:one"), CONFIG, 20)
+    assert all(np.array_equal(*pair) for pair in zip(jax.tree.leaves(after), jax.tree.leaves(twice), strict=True))
+
+
+@pytest.mark.engine
+def test_it_is_evaluated_recorded_and_listed_with_its_score_card(run, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    pack(run, "one")
+    task = "defend_the_center/gore+mossy_bricks"
+    assert cli.main(["evaluate", "zoo:one", "--tasks", task, "--episodes", "2", "--workers", "1"]) == 0
+    assert cli.main(["zoo", "--add", "zoo:one", "--name", "one"]) == 0
+    rows = read_rows(run_directory("zoo:one") / "evaluation.jsonl")
+    assert [row["task"] for row in rows] == [task] * 2
+    capsys.readouterr()
+    assert cli.main(["zoo"]) == 0
+    shown = capsys.readouterr().out
+    assert "zoo:one: small, seed 7, 100 updates, trained on defend_the_center/default" in shown
+    assert task in shown
+    assert cli.main(["record", "zoo:one", "--out", "episode.gif", "--seconds", "0.5"]) == 0
+    assert (tmp_path / "episode.gif").stat().st_size > 1000
+
+
+def test_an_unknown_policy_is_named(run):
+    pack(run, "dodge_projectiles")
+    with pytest.raises(
+        ConfigError, match=r"zoo:dodge_projectile: no such policy \(did you mean 'dodge_projectiles'\?\); want one of"
+    ):
+        run_directory("zoo:dodge_projectile")
+    with pytest.raises(ConfigError, match="zoo: got name 'a/b', want letters, digits, _ and -"):
+        pack(run, "a/b")
