@@ -16,7 +16,7 @@ from gvz.core.env_config import EnvConfig, typed
 from gvz.core.errors import ConfigError, EngineError
 from gvz.engine.engine import Engine, EngineConfig, check_config
 from gvz.engine.probe import ensure_loads
-from gvz.observation import Observation, observation_space, observe_buffers, observe_screen
+from gvz.observation import Observation, observation_space, observe_buffers, observe_classes, observe_screen
 from gvz.scenarios.base import BOOKKEEPING, Task
 from gvz.scenarios.compiler import compile_task, task_content
 from gvz.tasks import parse_task
@@ -37,8 +37,9 @@ _EPISODE_SEEDS = 2**31
 class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
     """One game of a task.
 
-    - Observation: uint8 [H, W, C], the screen as the player sees it; with `config.buffers` a dict of `screen` and of
-      `depth` [H, W, 1], `labels` [H, W, 1] (numbers of gvz.LABEL_CLASSES) and `automap` [H, W, C] (the whole map).
+    - Observation: uint8 [H, W, C], the screen as the player sees it, or with `config.frames` the classes of what it
+      shows; with `config.buffers` a dict of `screen` and of `depth` [H, W, 1], `labels` [H, W, 1] (numbers of
+      gvz.LABEL_CLASSES) and `automap` [H, W, C] (the whole map).
     - Actions: `action_meanings`, each held for `config.frame_skip` game tics.
     - Reward: the sum of `info["reward_components"]`.
     - Termination: the agent died; the final observation shows this moment. (The buffers are those before it.)
@@ -115,7 +116,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             height=config.render_height,
             render_weapon=scenario.render_weapon,
             depth="depth" in config.buffers,
-            labels="labels" in config.buffers,
+            labels="labels" in config.buffers or config.frames == "classes",
             automap="automap" in config.buffers,
             start_tic=_WEAPON_UP_TIC if scenario.render_weapon else 1,
         )
@@ -275,13 +276,16 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         self._frames = engine.tic() - self._start_tic
 
     def _observe(self, engine: Engine) -> Observation:
-        screen = observe_screen(engine.screen, self.config)
-        if not self.config.buffers:
-            self._observation = screen
-        else:
+        if self.config.buffers or self.config.frames == "classes":
             self._state = engine.state() or self._state
+        if self.config.frames == "classes":
             assert self._state is not None
-            self._observation = {"screen": screen, **observe_buffers(self._state, self.config)}
+            self._observation = observe_classes(self._state, self.config)
+            return self._observation
+        self._observation = observe_screen(engine.screen, self.config)
+        if self.config.buffers:
+            assert self._state is not None
+            self._observation = {"screen": self._observation, **observe_buffers(self._state, self.config)}
         return self._observation
 
     def _crashed(self, error: EngineError) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

@@ -20,6 +20,9 @@ Observation = np.ndarray | dict[str, np.ndarray]
 # (at worst 3.0) and 7.0 (4.5). So linear makes walls coarser and enemies stronger, and no enemy is lost.
 _INTERPOLATIONS = {"linear": cv2.INTER_LINEAR, "area": cv2.INTER_AREA}
 
+CLASS_STEP = np.uint8(25)
+"""grey levels between two classes in frames of classes"""
+
 _CLASS_OF_NAME = {
     "Poison": "poison",  # a class of our own, derived from Health as kits are
     "BulletPuff": "effect",  # ViZDoom's category of these two is Explosive, as for missiles
@@ -55,6 +58,12 @@ def observe_screen(screen: np.ndarray, config: EnvConfig) -> np.ndarray:
     size = (config.frame_width, config.frame_height)
     frame = cv2.resize(screen, size, interpolation=_INTERPOLATIONS[config.interpolation])
     return cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)[:, :, None] if config.grayscale else frame
+
+
+def observe_classes(state: "GameState", config: EnvConfig) -> np.ndarray:
+    """What each pixel shows: u8[frame_height frame_width 1], CLASS_STEP times the number of its class; a new array."""
+    assert state.labels_buffer is not None
+    return CLASS_STEP * _class_numbers(state)[_values(state.labels_buffer, config)]
 
 
 def observe_buffers(state: "GameState", config: EnvConfig) -> dict[str, np.ndarray]:

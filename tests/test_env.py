@@ -156,6 +156,24 @@ def test_the_automap_is_whole_and_stands_still_and_buffers_change_no_screen():
     assert 0 < (automaps[-1] != automaps[0]).any(-1).mean() < 0.02, "only the agent moves"
 
 
+def test_frames_of_classes_are_the_labels_as_grey_levels():
+    task = "defend_the_center/gore"
+    classes, labels = DoomEnv(task, frames="classes"), DoomEnv(task, buffers=("labels",), grayscale=True)
+    assert classes.observation_space.shape == (84, 84, 1)
+    seen = set()
+    for env in (classes, labels):
+        env.reset(options={"episode_seed": 4})
+    for action in (1, 1, 0, 2, 2) * 4:
+        frame, expected = classes.step(action)[0], labels.step(action)[0]["labels"]
+        np.testing.assert_array_equal(frame, 25 * expected)
+        seen |= set(np.unique(frame))
+    assert {0, 25, 50, 75} <= seen, "wall, plane, weapon, enemy"
+    for env in (classes, labels):
+        env.close()
+    with pytest.raises(ConfigError, match=r"env\.buffers: got depth with env\.frames classes, want none"):
+        DoomEnv(task, frames="classes", buffers=("depth",))
+
+
 def test_labels_need_their_buffer(shared: DoomEnv):
     with pytest.raises(ValueError, match="want 'labels' among the buffers"):
         shared.labels()

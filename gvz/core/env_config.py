@@ -38,6 +38,8 @@ class EnvConfig:
     """width of an observation frame, pixels"""
     grayscale: bool = False
     """one luminance channel instead of RGB"""
+    frames: Literal["screen", "classes"] = "screen"
+    """classes: instead of the screen, a grey picture of what each pixel shows (LABEL_CLASSES, 25 grey levels apart)"""
     frame_skip: int = 4
     """game tics an action is held; one decision = frame_skip frames"""
     render_width: int = 256
@@ -64,6 +66,8 @@ class EnvConfig:
         names = [name for name, _ in self.reward_weights]
         if len(set(names)) < len(names):
             raise ConfigError(f"env.reward_weights: got {' '.join(names)}, want each component once")
+        if self.frames == "classes" and self.buffers:
+            raise ConfigError(f"env.buffers: got {' '.join(self.buffers)} with env.frames classes, want none")
         for name, low, high in (
             ("frame_height", 8, 1080),
             ("frame_width", 8, 1920),
@@ -77,7 +81,7 @@ class EnvConfig:
 
     @property
     def channels(self) -> int:
-        return 1 if self.grayscale else 3
+        return 1 if self.grayscale or self.frames == "classes" else 3
 
     @property
     def frame_shape(self) -> tuple[int, int, int]:
