@@ -222,7 +222,7 @@ def _tasks(budget: Budget) -> list[Row]:
             chosen = [tasks[i * len(tasks) // count] for i in range(count)]
             for task in chosen:
                 compiled = compile_task(task, env.profile)
-                ensure_loads(compiled.wad_path, compiled.map_name)
+                ensure_loads(compiled.wad_path)
             config = PoolConfig(
                 tasks=tuple(task.id for task in chosen),
                 num_actors=cores,

@@ -51,7 +51,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
       engine_crash (in `reset`: the engine had died and was replaced); in the last step also solved_episode (a survival
       scenario's time-out was reached).
     - Seeds: `reset(seed=n)` seeds the sequence of episodes. Each episode has its own seed, `info["episode_seed"]`, and
-      `reset(options={"episode_seed": m})` replays that episode alone. In a `varied` task it also chooses the map.
+      `reset(options={"episode_seed": m})` replays that episode alone. It also chooses the map, where maps are drawn.
     """
 
     metadata = {  # noqa: RUF012  Gymnasium's; an instance's has the pictures per second of its own frame skip
@@ -109,7 +109,6 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         self._names = (*own, *bookkeeping)
         self._engine_config = EngineConfig(
             wad=self._compiled.wad_path,
-            map_name=self._compiled.map_name,
             buttons=scenario.buttons,
             variables=(*own, *bookkeeping.values()),
             width=config.render_width,
@@ -121,7 +120,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             start_tic=_WEAPON_UP_TIC if scenario.render_weapon else 1,
         )
         check_config(self._engine_config)
-        ensure_loads(self._compiled.wad_path, self._compiled.map_name)
+        ensure_loads(self._compiled.wad_path)
         if config.action_set == "multi_discrete_v1":
             self.action_space = MultiDiscrete([len(axis) for axis in AXES_V1])
         else:
@@ -251,22 +250,22 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
     def _begin(self) -> tuple[Engine, EngineError | None]:
         """Starts the episode, on a new engine if needed; returns the engine, and the error if an engine died."""
         crash = None
-        map_name, map_magic = self._compiled.map_of(self._episode_seed)
+        map_wad, map_magic = self._compiled.map_of(self._episode_seed)
         while True:
             if self._engine is None:
                 self._engine = Engine(self._engine_config)
             try:
-                self._engine.new_episode(self._episode_seed, map_name)
+                self._engine.new_episode(self._episode_seed, map_wad)
                 magic = self._engine.variable(BOOKKEEPING["MAP_MAGIC"])
             except EngineError as error:
                 crash = error
                 self._note_crash(error)
                 continue
-            if magic != map_magic:  # if a file has no such map, ViZDoom plays another one
+            if magic != map_magic:  # ViZDoom plays another map rather than none
                 self._stop_engine()
                 raise EngineError(
                     f"{self.task.id}: {self._compiled.wad_path} runs a map with magic number {magic:.0f}, "
-                    f"want {map_magic}, that of {map_name}"
+                    f"want {map_magic}, that of the map of episode seed {self._episode_seed}"
                 )
             return self._engine, crash
 

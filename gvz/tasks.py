@@ -1,12 +1,12 @@
 """Tasks by name: ids, levels, the named tasks, training and test sets."""
 
-import re
 from functools import cache
 from typing import Literal, get_args
 
 from gvz.core.errors import TaskError, nearest
 from gvz.core.registry import discover
-from gvz.scenarios.base import MAX_LEVEL, MAX_VARIED_MAPS, VARIED, Scenario, Split, Task
+from gvz.scenarios.base import MAX_LEVEL, Scenario, Split, Task
+from gvz.scenarios.map_set import names_map_set, parse_map_set
 
 LEVELS = range(MAX_LEVEL + 1)
 """levels of tasks, the easiest first"""
@@ -41,7 +41,8 @@ def parse_task(text: str) -> Task:
 
     Args:
         text: `<scenario>/default`, `<scenario>/complete` or `<scenario>/<attribute>+<attribute>...`, attributes
-            in any order; `<scenario>/varied` or `<scenario>/varied-<number of maps>`.
+            in any order; or a set of drawn maps (gvz.scenarios.map_set), such as `<scenario>/varied-10` or
+            `<scenario>/procedural-train-100+layout=0.5`.
 
     Raises:
         TaskError: another form, an unknown name, or two attributes of one group; the message says what is possible.
@@ -55,25 +56,12 @@ def parse_task(text: str) -> Task:
     scenario = scenario_named(scenario_id)
     whole_sets = {"default": (), "complete": scenario.complete}
     names = tuple(name.split("+"))
-    for whole in (*whole_sets, *(one for one in names if one.partition("-")[0] == VARIED)):
+    if names_map_set(name):
+        return Task(scenario, maps=parse_map_set(name))
+    for whole in (*whole_sets, *filter(names_map_set, names)):
         if whole in names and len(names) > 1:
             raise TaskError(f"task: got {text!r}, but {whole!r} is a task and no attribute; want {scenario.choices()}")
-    if name.partition("-")[0] == VARIED:
-        return Task(scenario, num_maps=_num_maps(text, name))
     return Task(scenario, whole_sets.get(name, names))
-
-
-def _num_maps(text: str, name: str) -> int:
-    """The number in `varied-<number of maps>`."""
-    if name == VARIED:
-        return MAX_VARIED_MAPS
-    number = name.removeprefix(f"{VARIED}-")
-    if not re.fullmatch(r"[1-9][0-9]{0,3}", number) or int(number) > MAX_VARIED_MAPS:
-        raise TaskError(
-            f"task: got {text!r}, want {VARIED!r} or '{VARIED}-<number of maps>' with 1 to {MAX_VARIED_MAPS} maps, "
-            f"for example '{VARIED}-10'"
-        )
-    return int(number)
 
 
 def named_tasks(

@@ -18,6 +18,7 @@ import gvz.scenarios
 from gvz.core.errors import TaskError
 from gvz.scenarios.base import Attribute, Content, Task, Textures
 from gvz.scenarios.compiler import task_content
+from gvz.scenarios.map_set import PARTS, MapSet
 from gvz.tasks import named_tasks, parse_task, scenario_named, scenarios
 
 LEVELS = {  # tasks of level 0, 1, 2, 3, 4
@@ -131,8 +132,10 @@ def test_ids_are_canonical():
 def test_a_varied_task_has_a_number_of_maps_and_is_none_of_the_named_ones():
     for scenario in scenarios():
         varied, ten = parse_task(f"{scenario}/varied"), parse_task(f"{scenario}/varied-10")
-        assert (varied.num_maps, varied.name, varied.level, varied.attributes) == (1000, "varied", 0, ())
-        assert (ten.num_maps, ten.id) == (10, f"{scenario}/varied-10")
+        assert varied.maps is not None
+        assert ten.maps is not None
+        assert (varied.maps.num_maps, varied.name, varied.level, varied.attributes) == (1000, "varied", 0, ())
+        assert (ten.maps.num_maps, ten.id) == (10, f"{scenario}/varied-10")
         assert parse_task(f"{scenario}/varied-1000") == varied
         assert pickle.loads(pickle.dumps(ten)) == ten != varied
         assert not {varied, ten} & set(named_tasks())
@@ -142,12 +145,34 @@ def test_a_scenario_that_does_not_say_what_may_differ_has_no_varied_task():
     centre = scenario_named("defend_the_center")
     plain = dataclasses.replace(centre, variety=None)
     with pytest.raises(TaskError, match="defend_the_center: got varied, but the scenario has no variety"):
-        Task(plain, num_maps=10)
+        Task(plain, maps=MapSet("varied"))
     assert "varied" not in plain.choices()
     with pytest.raises(TaskError, match="got varied and gore, want one of them"):
-        Task(centre, ("gore",), num_maps=10)
-    with pytest.raises(TaskError, match="defend_the_center/varied--1: want 1 to 1000 maps"):
-        Task(centre, num_maps=-1)
+        Task(centre, ("gore",), MapSet("varied"))
+    with pytest.raises(TaskError, match="varied--1: want 1 to 1000 maps"):
+        MapSet("varied", -1)
+
+
+def test_a_procedural_task_has_a_split_a_number_of_maps_and_strengths():
+    task = parse_task("seek_and_kill/procedural")
+    assert task == parse_task("seek_and_kill/procedural-train")
+    assert (task.id, task.level) == ("seek_and_kill/procedural-train", 0)
+    some = parse_task("seek_and_kill/procedural-test-20+lights=0+layout=0.50+textures=1.0")
+    assert some.id == "seek_and_kill/procedural-test-20+layout=0.5+lights=0"
+    assert parse_task(some.id) == some
+    assert pickle.loads(pickle.dumps(some)) == some
+    assert some.maps is not None
+    assert [some.maps.strength(part) for part in PARTS] == [0.5, 1, 1, 0, 1]
+    assert [some.maps.number_of(seed) for seed in (0, 19, 20, 45)] == [0, 19, 0, 5]
+
+
+def test_no_two_splits_share_a_map():
+    first = {split: MapSet(split).number_of(0) for split in ("test", "validation", "train")}
+    assert first == {"test": 0, "validation": 1_000_000, "train": 2_000_000}
+    last = {split: MapSet(split).number_of(MapSet(split).num_maps - 1) for split in first}
+    assert last == {"test": 999_999, "validation": 1_999_999, "train": 2**31 - 1}
+    ten = MapSet("train", 10)
+    assert {ten.number_of(seed) for seed in range(1000)} == set(range(2_000_000, 2_000_010))
 
 
 def test_all_of_complete_spelled_out_is_complete():
@@ -202,13 +227,26 @@ def test_the_main_job_trains_on_default_gore_stone_wall_and_fast_enemies():
         ("health_gathering/lava++slime", "unknown attribute ''"),
         (
             "defend_the_center/varid",
-            r"unknown attribute 'varid' \(did you mean 'varied'\?\).* or varied-<number of maps>",
+            r"unknown attribute 'varid' \(did you mean 'varied'\?\).* varied-<number of maps>, procedural-<split>",
         ),
-        ("defend_the_center/varied+gore", "'varied' is a task and no attribute; want default, complete"),
+        ("defend_the_center/varied+gore", "'varied' takes no attribute and no strength; 'procedural' does"),
         ("defend_the_center/gore+varied-10", "'varied-10' is a task and no attribute"),
-        ("seek_and_kill/varied-0", "want 'varied' or 'varied-<number of maps>' with 1 to 1000 maps"),
-        ("seek_and_kill/varied-1001", "want 'varied' or 'varied-<number of maps>' with 1 to 1000 maps"),
-        ("seek_and_kill/varied-ten", "got 'seek_and_kill/varied-ten', want 'varied' or"),
+        ("seek_and_kill/varied-0", "got 'varied-0', want 'varied-<number of maps>', as 'varied-10'"),
+        ("seek_and_kill/varied-1001", "varied-1001: want 1 to 1000 maps"),
+        ("seek_and_kill/varied-ten", "got 'varied-ten', want 'varied-<number of maps>'"),
+        ("seek_and_kill/procedural-", "got 'procedural-', want 'procedural-<split>-<number of maps>'"),
+        (
+            "seek_and_kill/procedural-trian",
+            r"unknown split 'trian' \(did you mean 'train'\?\); want one of test, valid",
+        ),
+        ("seek_and_kill/procedural-varied", "unknown split 'varied'"),
+        ("seek_and_kill/procedural-test-2000000", "procedural-test-2000000: want 1 to 1000000 maps"),
+        ("seek_and_kill/procedural-test-20-3", "want 'procedural-<split>-<number of maps>'"),
+        ("seek_and_kill/procedural+layout=1.5", r"got layout=1.5, want a strength from 0 .* to 1"),
+        ("seek_and_kill/procedural+layout=nan", "got 'layout=nan' in .*strengths from 0 to 1"),
+        ("seek_and_kill/procedural+gore", "got 'gore' in 'procedural[+]gore', want each at most once: '<part>="),
+        ("seek_and_kill/procedural+layout=1+layout=0", "got 'layout=0' in .* at most once"),
+        ("seek_and_kill/procedural+light=1", r"unknown part 'light' \(did you mean 'lights'\?\); want one of layout, "),
     ],
 )
 def test_what_is_no_task_is_refused_with_what_is_possible(text: str, message: str):

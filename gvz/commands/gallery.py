@@ -16,9 +16,9 @@ class Gallery:
     """directory for <kind>_<scenario>.png"""
     scenario: str | None = None
     """only this one"""
-    kind: Literal["gallery", "varied", "augmented"] = "gallery"
-    """gallery: the named tasks; varied: the first maps of the task `varied`; augmented: the default task under each
-    augmentation that a learner can train with"""
+    kind: Literal["gallery", "varied", "procedural", "augmented"] = "gallery"
+    """gallery: the named tasks; varied, procedural: the first maps of such a task; augmented: the default task under
+    each augmentation that a learner can train with"""
     moving: bool = False
     """also agents.webp: the scripted agents of all scenarios at play, level after level"""
 

@@ -26,7 +26,6 @@ from gvz.core import janitor
 from gvz.core.errors import ConfigError, EngineError
 from gvz.engine import process as engine_process
 from gvz.engine import queue_locks
-from gvz.wad.lumps import read_wad
 
 if TYPE_CHECKING:
     from vizdoom import DoomGame, GameState
@@ -37,6 +36,8 @@ _LOG_BYTES = 2**20
 """a log larger than this is emptied; the engine prints a few lines per episode"""
 _MAP_VARIABLE = "gvz_map"
 """the engine's console variable that names the map of the next episode"""
+_MAP_FILE = "map.wad"
+"""of a map that is not in the configured file; in the engine's private directory"""
 _OVERRIDE = Path("_vizdoom.cfg")
 """ViZDoom loads a file of this name in the working directory over everything that was configured"""
 
@@ -52,7 +53,7 @@ class EngineConfig:
     variables: tuple[str, ...]
     """names of vizdoom.GameVariable, in the order of `state.game_variables`"""
     map_name: str = "MAP01"
-    """the map's lump"""
+    """the lump of the first map"""
     width: int = 256
     """width of the rendered screen"""
     height: int = 144
@@ -102,31 +103,31 @@ class Engine:
         self.deadline: float | None = None
         self._overdue = False
         game, directory, self.log = _start(config)
-        self._game = game
+        self._game, self._directory = game, directory
         self._end = weakref.finalize(self, engine_process.end_if_ours, game, directory, os.getpid())
         instance = janitor.read_instance(directory)
         assert instance is not None, "an engine that answered has written its instance file"
         self.pid, self._process_start, self.instance_id = instance
         self._queues = queue_locks.mapped(self.instance_id)
-        self._map_name = config.map_name
-        self._lumps = frozenset[str]()  # names in the file; read when another map than the first is wanted
+        self._loads_maps = False
         self._variables = game.get_available_game_variables()
         self.screen = _map_screen(game, self.instance_id)
         engine_process.watch(self)
 
-    def new_episode(self, seed: int, map_name: str | None = None) -> "GameState":
+    def new_episode(self, seed: int, map_wad: bytes | None = None) -> "GameState":
         """Starts an episode that depends on nothing but the map, `seed` in [0, 2^32) and the actions.
 
-        `map_name` is a map of the configured file; by default it is the map of the episode before.
+        `map_wad` is a WAD whose first lumps are a map; by default the map of the episode before is played. Classes of
+        its things are those of the configured file.
 
         Raises:
-            EngineError: the engine died or did not answer, or the player is dead at once; the file has no such map.
+            EngineError: the engine died or did not answer, or the player is dead at once.
         """
         with self._answering("new_episode"):
             if self.log.stat().st_size > _LOG_BYTES:
                 os.truncate(self.log, 0)
-            if map_name not in (None, self._map_name):
-                self._go_to(map_name)
+            if map_wad is not None:
+                self._load_map(map_wad)
             self._game.set_seed(seed)  # last: it holds for one load of a map
             self._game.new_episode()
             state = _state(self._game)
@@ -134,21 +135,19 @@ class Engine:
             raise EngineError(f"engine {self._name}: the episode of seed {seed} ended before it began")
         return state
 
-    def _go_to(self, map_name: str) -> None:
-        """Has the next episode begin on another map of the file.
+    def _load_map(self, map_wad: bytes) -> None:
+        """Has the next episodes play another map: the engine reads a map `file:<path>` when an episode begins.
 
         ViZDoom's own way is `set_doom_map`. It holds Python's interpreter lock while the map loads, so the watchdog
         could not end an engine that hangs there. So the engine is told once that its map is what a console variable
         says; new episodes, which do not hold the lock, go there.
         """
-        if not self._lumps:
-            self._lumps = frozenset(lump.name for lump in read_wad(self.config.wad.read_bytes()))
-            self._game.send_game_command(f"set {_MAP_VARIABLE} {self._map_name}")
+        (self._directory / _MAP_FILE).write_bytes(map_wad)
+        if not self._loads_maps:
+            self._loads_maps = True
+            self._game.send_game_command(f"set {_MAP_VARIABLE} {self.config.map_name}")
             self._game.set_doom_map(f"${_MAP_VARIABLE}")  # the map that it is on
-        if map_name not in self._lumps:  # ViZDoom would ask for it without end
-            raise EngineError(f"engine {self._name}: got the map {map_name}, want one of the file {self.config.wad}")
-        self._game.send_game_command(f"set {_MAP_VARIABLE} {map_name}")
-        self._map_name = map_name
+            self._game.send_game_command(f"set {_MAP_VARIABLE} file:{_MAP_FILE}")  # in its working directory
 
     def step(self, buttons: Sequence[float], tics: int) -> "GameState | None":
         """`advance`, then `state`."""

@@ -21,14 +21,19 @@ from gvz.evaluation.players import ScriptedPlayer
 from gvz.evaluation.scenarios.base import Moment, Moving, stated
 from gvz.evaluation.simple import player_env
 from gvz.scenarios.base import Scenario, Task
-from gvz.scenarios.compiler import compile_task, task_content
+from gvz.scenarios.compiler import CompiledTask, compile_task, map_source, task_content
+from gvz.scenarios.layout import FIRST_PLACE, MAP_SPOT
+from gvz.scenarios.map_set import NUMBERS, MapSet
 from gvz.tasks import named_tasks, parse_task, scenarios
+from gvz.wad.udmf import UdmfMap, parse_textmap
 
 FRAME_WIDTH, FRAME_HEIGHT = 256, 144
 CAPTION_HEIGHT = 16
 COLUMNS = 4
-NUM_VARIED = 24
-"""maps that the sheet of a `varied` task shows"""
+NUM_VARIED, NUM_PROCEDURAL = 24, 48
+"""maps that the sheets of `varied` and `procedural-train` show"""
+PLAN_SIZE = 72
+"""pixels of the side of a map's plan"""
 LEVEL_DECISIONS = 10
 """decisions that the moving picture shows of each level, in real time"""
 _BACKGROUND = (24, 24, 24)
@@ -40,48 +45,55 @@ def task_frame(task: Task) -> np.ndarray:
 
 
 def task_sight(task: Task, moment: Moment | None = None, number: int = 0) -> tuple[np.ndarray, dict[str, int]]:
-    """What the agent sees in a task, or on this map of a `varied` task, at a moment, by default that of the task's map.
+    """What the agent sees in a task, or on this map of a set of drawn ones, at a moment, by default that of its map.
 
     Returns: the screen, uint8[FRAME_HEIGHT, FRAME_WIDTH, 3]; and the pixels that each class of things takes of it.
 
     Raises:
         EngineError: the engine failed.
     """
+    with closing(_engine(compiled := compile_task(task))) as engine:
+        return _sight(engine, _moment(task) if moment is None else moment, compiled.map_of(number)[0])
+
+
+def _moment(task: Task) -> Moment:
     base_wad = task_content(task, "thesis").base_wad
     assert base_wad is not None, "every task has a map"
     moments: Mapping[str, Moment] = stated(task.scenario.id, "MOMENTS") or {}
-    moment = moments.get(base_wad, Moment()) if moment is None else moment
-    compiled = compile_task(task)
-    ensure_loads(compiled.wad_path, compiled.map_name)
-    engine = Engine(
+    return moments.get(base_wad, Moment())
+
+
+def _engine(compiled: CompiledTask) -> Engine:
+    ensure_loads(compiled.wad_path)
+    return Engine(
         EngineConfig(
             wad=compiled.wad_path,
-            map_name=compiled.map_name,
             buttons=("TURN_LEFT_RIGHT_DELTA",),
             variables=("ANGLE",),
             width=FRAME_WIDTH,
             height=FRAME_HEIGHT,
-            render_weapon=task.scenario.render_weapon,
+            render_weapon=compiled.task.scenario.render_weapon,
             labels=True,
             start_tic=10,
         )
     )
-    try:
-        engine.new_episode(moment.seed, compiled.map_of(number)[0])
-        engine.advance([0], moment.tics)
-        if (pose := moment.pose) is not None:
-            engine.command(f"warp {pose.x:g} {pose.y:g}")
-            engine.advance([engine.variables()[0] - pose.angle], 1)
-            engine.advance([0], 1)
-        state = engine.state()
-        assert state is not None, "the agent lives"
-        assert state.labels is not None
-        pixels = dict.fromkeys((label.object_name for label in state.labels), 0)
-        for label in state.labels:
-            pixels[label.object_name] += int(np.count_nonzero(state.labels_buffer == label.value))
-        return engine.screen.copy(), pixels
-    finally:
-        engine.close()
+
+
+def _sight(engine: Engine, moment: Moment, map_wad: bytes | None) -> tuple[np.ndarray, dict[str, int]]:
+    """As `task_sight`."""
+    engine.new_episode(moment.seed, map_wad)
+    engine.advance([0], moment.tics)
+    if (pose := moment.pose) is not None:
+        engine.command(f"warp {pose.x:g} {pose.y:g}")
+        engine.advance([engine.variables()[0] - pose.angle], 1)
+        engine.advance([0], 1)
+    state = engine.state()
+    assert state is not None, "the agent lives"
+    assert state.labels is not None
+    pixels = dict.fromkeys((label.object_name for label in state.labels), 0)
+    for label in state.labels:
+        pixels[label.object_name] += int(np.count_nonzero(state.labels_buffer == label.value))
+    return engine.screen.copy(), pixels
 
 
 def contact_sheet(scenario: Scenario) -> Image.Image:
@@ -92,8 +104,45 @@ def contact_sheet(scenario: Scenario) -> Image.Image:
 
 def varied_sheet(scenario: Scenario) -> Image.Image:
     """A frame of each of the first maps of a scenario's `varied` task."""
-    task = Task(scenario, num_maps=NUM_VARIED)
-    return tiled([(task_sight(task, number=n)[0], f"map {n}", 0) for n in range(NUM_VARIED)], COLUMNS)
+    task = Task(scenario, maps=MapSet("varied", NUM_VARIED))
+    compiled, moment = compile_task(task), _moment(task)
+    with closing(_engine(compiled)) as engine:
+        frames = [_sight(engine, moment, compiled.map_of(n)[0])[0] for n in range(NUM_VARIED)]
+    return tiled([(frame, f"map {n}", 0) for n, frame in enumerate(frames)], COLUMNS)
+
+
+def procedural_sheet(scenario: Scenario) -> Image.Image:
+    """The start of an episode on each of the first maps of `procedural-train`, with a plan of the map."""
+    task = Task(scenario, maps=MapSet("train"))
+    compiled, cells = compile_task(task), []
+    with closing(_engine(compiled)) as engine:
+        for n in range(NUM_PROCEDURAL):
+            frame, _ = _sight(engine, Moment(seed=n, tics=1), compiled.map_of(n)[0])
+            plan = map_plan(parse_textmap(map_source(task, "thesis", NUMBERS["train"][n]).textmap))
+            frame[: len(plan), FRAME_WIDTH - plan.shape[1] :] = plan
+            cells.append((frame, f"map {NUMBERS['train'][n]}", 0))
+    return tiled(cells, COLUMNS)
+
+
+def map_plan(room: UdmfMap) -> np.ndarray:
+    """A map from above, north up: uint8[PLAN_SIZE, PLAN_SIZE, 3]; walls white, starts green, other things yellow."""
+    corners = np.array([(vertex["x"], vertex["y"]) for vertex in room.vertices], float)
+    low, scale = corners.min(axis=0), (PLAN_SIZE - 5) / np.ptp(corners, axis=0).max()
+
+    def pixel(x: float, y: float) -> tuple[float, float]:
+        return 2 + scale * (x - low[0]), PLAN_SIZE - 3 - scale * (y - low[1])
+
+    plan = Image.new("RGB", (PLAN_SIZE, PLAN_SIZE), _BACKGROUND)
+    draw = ImageDraw.Draw(plan)
+    for line in room.linedefs:
+        ends = [pixel(*corners[int(line[end])]) for end in ("v1", "v2")]
+        draw.line(ends, fill=(128, 128, 128) if line.get("twosided") else (255, 255, 255))
+    for thing in room.things:
+        place = int(thing.get("id", 0)) >= FIRST_PLACE
+        start = thing["type"] in (1, MAP_SPOT) and not place
+        colour = (80, 255, 80) if start else (150, 60, 60) if place else (255, 220, 60)
+        draw.point(pixel(float(thing["x"]), float(thing["y"])), fill=colour)
+    return np.asarray(plan)
 
 
 def augmented_sheet(scenario: Scenario) -> Image.Image:
@@ -110,7 +159,12 @@ def augmented_sheet(scenario: Scenario) -> Image.Image:
     return tiled(cells, COLUMNS)
 
 
-SHEETS = {"gallery": contact_sheet, "varied": varied_sheet, "augmented": augmented_sheet}
+SHEETS = {
+    "gallery": contact_sheet,
+    "varied": varied_sheet,
+    "procedural": procedural_sheet,
+    "augmented": augmented_sheet,
+}
 
 
 def tiled(cells: Sequence[tuple[np.ndarray, str, int]], columns: int) -> Image.Image:

@@ -16,13 +16,14 @@ from gvz.evaluation.simple import SIMPLE_PLAYERS
 from gvz.experiments.settings import with_settings
 from gvz.run.config import RunConfig
 from gvz.run.config_files import load_config
-from gvz.scenarios.base import VARIED, Split
+from gvz.scenarios.base import Split
+from gvz.scenarios.map_set import PROCEDURAL, VARIED, names_map_set
 from gvz.tasks import LEVELS, Task, named_tasks, parse_task, scenario_named, scenarios
 
 EACH_TASK = "each"
 """as a training: every named task of the scenario, alone"""
 
-EvaluateOn = Literal["own", "test", "all", "gate"]
+EvaluateOn = Literal["own", "test", "all", "gate", "procedural"]
 Columns = Literal["level", "training", "config"]
 
 SET_BY_EXPERIMENT = (
@@ -109,7 +110,8 @@ class Experiment:
     scenarios: tuple[str, ...] = ()
     """default: those that numbers were published of, or else all"""
     trainings: tuple[str, ...]
-    """train1, train4, train8: a training set; varied, varied-100: such a task; each: every named task alone"""
+    """train1, train4, train8: a training set; varied-100, procedural-train-100: such a
+    task; each: every named task alone"""
     seeds: tuple[int, ...] = (1111, 2222, 3333)
     total_updates: int = 200_000
     """gradient steps of a run"""
@@ -122,7 +124,7 @@ class Experiment:
     """evaluation episodes of a task"""
     evaluate_on: EvaluateOn
     """own: the task trained on; test: the scenario's test set; all: its named tasks; gate: its gate set and the tasks
-    trained on, with a table over each"""
+    trained on, with a table over each; procedural: `procedural-test` and the tasks trained on, likewise"""
     tasks_per_level: int | None = None
     """only this many tasks of a level are used, in the thesis's order; None: all (see `scale`)"""
     table_checkpoints: int = 5
@@ -157,11 +159,11 @@ class Experiment:
                 f"total_updates {self.total_updates}, want each at most the next"
             )
         for training in self.trainings:
-            known = training == EACH_TASK or training.partition("-")[0] == VARIED
+            known = training == EACH_TASK or names_map_set(training)
             if not known and (training not in get_args(Split) or training == "test"):
                 yield (
-                    f"trainings: got {training!r}, want train1, train4, train8, {VARIED}, {VARIED}-<number of maps> or "
-                    f"{EACH_TASK}"
+                    f"trainings: got {training!r}, want train1, train4, train8, {VARIED}, {VARIED}-<number of maps>, "
+                    f"{PROCEDURAL}-<split>-<number of maps> or {EACH_TASK}"
                 )
         for name, settings in self.variants.items():
             if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
@@ -173,8 +175,8 @@ class Experiment:
                 f"got max_processor_s {self.max_processor_s:g} and num_checkpoints {self.num_checkpoints}, want more "
                 "than 0 and exactly 1: a run that ends by its processor time is evaluated at its end"
             )
-        if self.evaluate_on == "gate" and self.columns == "level":
-            yield "evaluate_on 'gate' wants columns 'config' or 'training'"
+        if self.compares_training and self.columns == "level":
+            yield f"evaluate_on {self.evaluate_on!r} wants columns 'config' or 'training'"
         if self.evaluate_on == "own" and self.trainings != (EACH_TASK,):
             yield f"evaluate_on 'own' wants trainings ('{EACH_TASK}',)"
         for scenario in self.scenarios:
@@ -189,6 +191,11 @@ class Experiment:
                         f"published by {who}, {scenario}: got {len(values)} numbers, want {width}, one for each "
                         f"column ({', '.join(self.column_names)})"
                     )
+
+    @property
+    def compares_training(self) -> bool:
+        """Whether there is a second table over the tasks trained on."""
+        return self.evaluate_on in ("gate", "procedural")
 
     @property
     def budget(self) -> str:
@@ -246,12 +253,18 @@ class Experiment:
                 return self._thinned(named_tasks(run.scenario))
             case "gate":
                 return tuple(dict.fromkeys((*self._thinned(named_tasks(run.scenario, split="gate")), *run.tasks)))
+            case "procedural":
+                return tuple(dict.fromkeys((_procedural_test(run.scenario), *run.tasks)))
 
     def table_tasks(self, run: TrainingRun) -> tuple[str, ...]:
-        """Ids of the tasks the table is over: those of its levels, the gate tasks of a gate, else the test tasks."""
+        """Ids of the tasks the table is over: those of its levels, the gate tasks of a gate, `procedural-test`, or the
+        test tasks.
+        """
         tasks = self.evaluation_tasks(run)
         if self.columns == "level":
             return tasks
+        if self.evaluate_on == "procedural":
+            return (_procedural_test(run.scenario),)
         split = "gate" if self.evaluate_on == "gate" else "test"
         counted = {task.id for task in named_tasks(run.scenario, split=split)}
         return tuple(task for task in tasks if task in counted)
@@ -261,7 +274,7 @@ class Experiment:
         for training in self.trainings:
             if training == EACH_TASK:
                 sets |= {id.partition("/")[2]: (id,) for id in self._thinned(named_tasks(scenario))}
-            elif training.partition("-")[0] == VARIED:
+            elif names_map_set(training):
                 sets[training] = (parse_task(f"{scenario}/{training}").id,)
             else:
                 split: Split = training  # pyright: ignore[reportAssignmentType]  # checked in __post_init__
@@ -277,6 +290,10 @@ class Experiment:
             if self.tasks_per_level is None or taken[task.level] <= self.tasks_per_level:
                 ids.append(task.id)
         return tuple(ids)
+
+
+def _procedural_test(scenario: str) -> str:
+    return parse_task(f"{scenario}/{PROCEDURAL}-test").id
 
 
 def _agent(config: str, variant: str | None) -> str:

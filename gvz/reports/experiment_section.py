@@ -25,6 +25,9 @@ from gvz.reports.results import TRAINING_SETS, PlannedExperiment, Results
 from gvz.reports.scores import Scores, estimate, estimate_groups, pick
 from gvz.tasks import LEVELS, parse_task, scenario_named
 
+_TABLE_OVER = {"gate": " on the gate tasks", "procedural": " on the maps of procedural-test"}
+"""what the caption of a table says, by `evaluate_on`"""
+
 
 def experiment_section(results: Results, asked: PlannedExperiment, out: Path) -> Section:
     """All that the report says about an experiment."""
@@ -35,7 +38,7 @@ def experiment_section(results: Results, asked: PlannedExperiment, out: Path) ->
         f"and checkpoint; tables are over the last {count(experiment.table_checkpoints, 'checkpoint')}."
     )
     tables = [result_table(results, asked), aggregate_table(results, asked)]
-    if experiment.evaluate_on == "gate":
+    if experiment.compares_training:
         tables.insert(1, result_table(results, asked, trained=True))
     if experiment.columns != "level":
         tables.append(comparison_table(results, asked))
@@ -120,7 +123,7 @@ def result_table(results: Results, asked: PlannedExperiment, *, trained: bool = 
         }
         rows += _rows("P_norm: mean over scenarios", averages, numbers)
     others = " Rows in italics are published numbers; no number of ours uses them." if published else ""
-    over = " on the tasks of training" if trained else " on the gate tasks" * (experiment.evaluate_on == "gate")
+    over = " on the tasks of training" if trained else _TABLE_OVER.get(experiment.evaluate_on, "")
     return Table(
         id=f"{experiment.name}_training" if trained else experiment.name,
         caption=f"{experiment.title}: percent of the upper bound{over} ({experiment.source}).{others}",

@@ -5,6 +5,7 @@ A task is a scenario with a set of attributes. `gvz.scenarios.compiler` makes a 
 """
 
 import dataclasses
+import random
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -12,6 +13,8 @@ from typing import Literal
 
 from gvz.core.env_config import EnvConfig, Profile
 from gvz.core.errors import TaskError, nearest
+from gvz.scenarios.layout import Layout
+from gvz.scenarios.map_set import PROCEDURAL, VARIED, MapSet
 from gvz.scenarios.rewards import Reward, Rewarder, check_weights, return_range
 from gvz.wad.udmf import UdmfMap
 
@@ -44,11 +47,6 @@ Split = Literal["train1", "train4", "train8", "test"]
 
 MAX_LEVEL = 4
 """Tasks of four or more attributes are level 4 (thesis 3.2: with more than three, difficulty hardly increases)."""
-
-VARIED = "varied"
-"""name of the tasks whose look is drawn for every episode; `varied-10` draws it from 10 maps"""
-MAX_VARIED_MAPS = 1000
-"""the maps of `varied`, and the most that there can be"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +104,7 @@ class Content:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Variety:
-    """What may differ between the maps of a scenario's `varied` tasks. `gvz.scenarios.varied` draws it."""
+    """What may differ between the drawn maps of a scenario. `gvz.scenarios.looks` draws all but the layout."""
 
     entities: tuple[str, ...]
     """classes of the default task's enemies or kits"""
@@ -119,6 +117,8 @@ class Variety:
     keep_clear: Callable[[float, float], bool] | None = None
     """whether no decoration may stand at a place, map units: enemies stand there, or it would fill the screen.
     Walls and the agent's starts are kept clear in any case."""
+    draw_layout: Callable[[random.Random, float], Layout]
+    """f(rng, strength > 0): a map's geometry"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -164,7 +164,7 @@ class Scenario:
     draw_map: Callable[[UdmfMap], None] | None = None
     """changes the base map in place, before textures and things are set"""
     variety: Variety | None = None
-    """what its `varied` tasks may draw; None: it has no such tasks"""
+    """what its drawn maps may draw; None: it has none"""
 
     buttons: tuple[str, ...]
     combination_buttons: tuple[str, ...] | None = None
@@ -231,7 +231,7 @@ class Scenario:
                 return attribute
         raise TaskError(
             f"scenario {self.id}: unknown attribute {name!r}"
-            f"{nearest(name, [*(a.name for a in self.attributes), VARIED])}; want {self.choices()}"
+            f"{nearest(name, [*(a.name for a in self.attributes), VARIED, PROCEDURAL])}; want {self.choices()}"
         )
 
     def choices(self) -> str:
@@ -241,8 +241,8 @@ class Scenario:
             for group in attribute.groups:
                 groups.setdefault(group, []).append(attribute.name)
         members = "; ".join(f"{group}: {', '.join(names)}" for group, names in groups.items())
-        varied = "" if self.variety is None else f", or {VARIED}, or {VARIED}-<number of maps>"
-        return f"default, complete, or at most one of each group ({members}){varied}"
+        drawn = "" if self.variety is None else f", or {VARIED}, {VARIED}-<number of maps>, {PROCEDURAL}-<split>"
+        return f"default, complete, or at most one of each group ({members}){drawn}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,20 +252,25 @@ class Task:
     Attributes:
         scenario: the scenario.
         attributes: canonical names, sorted.
-        num_maps: of a `varied` task: how many maps there are, 1 to MAX_VARIED_MAPS; each is the default task's with
-            another look, and an episode's seed says which is played. 0: one map, that of the attributes.
+        maps: drawn maps; an episode's seed says which is played. None: one map, that of the attributes.
 
     Raises:
-        TaskError: an unknown attribute, two of one group, or a number of maps that cannot be.
+        TaskError: an unknown attribute, two of one group, or attributes together with drawn maps.
     """
 
     scenario: Scenario
     attributes: tuple[str, ...] = ()
-    num_maps: int = 0
+    maps: MapSet | None = None
 
     def __post_init__(self) -> None:
-        if self.num_maps:
-            self._check_varied()
+        if self.maps is not None and self.scenario.variety is None:
+            raise TaskError(
+                f"scenario {self.scenario.id}: got {self.maps.name}, but the scenario has no variety; set it"
+            )
+        if self.maps is not None and self.attributes:
+            raise TaskError(
+                f"{self.scenario.id}: got {self.maps.name} and {'+'.join(self.attributes)}, want one of them"
+            )
         found = [self.scenario.attribute(name) for name in self.attributes]
         taken: dict[str, str] = {}
         for attribute in found:
@@ -278,19 +283,11 @@ class Task:
                 taken[group] = attribute.name
         object.__setattr__(self, "attributes", tuple(sorted(attribute.name for attribute in found)))
 
-    def _check_varied(self) -> None:
-        if self.scenario.variety is None:
-            raise TaskError(f"scenario {self.scenario.id}: got {VARIED}, but the scenario has no variety; set it")
-        if not 1 <= self.num_maps <= MAX_VARIED_MAPS:
-            raise TaskError(f"{self.scenario.id}/{VARIED}-{self.num_maps}: want 1 to {MAX_VARIED_MAPS} maps")
-        if self.attributes:
-            raise TaskError(f"{self.scenario.id}: got {VARIED} and {'+'.join(self.attributes)}, want one of them")
-
     @property
     def name(self) -> str:
-        """The id without its scenario: "gore+mossy_bricks", "default", "complete", "varied", "varied-10"."""
-        if self.num_maps:
-            return VARIED if self.num_maps == MAX_VARIED_MAPS else f"{VARIED}-{self.num_maps}"
+        """The id without its scenario: "gore+mossy_bricks", "default", "complete", "procedural-train-100"."""
+        if self.maps is not None:
+            return self.maps.name
         if set(self.attributes) == set(self.scenario.complete):
             return "complete"
         return "+".join(self.attributes) or "default"
@@ -302,7 +299,7 @@ class Task:
 
     @property
     def level(self) -> int:
-        """Difficulty: the number of groups its attributes change, at most MAX_LEVEL. A `varied` task has none: 0."""
+        """Difficulty: the number of groups its attributes change, at most MAX_LEVEL. Drawn maps have none: 0."""
         groups = sum(len(self.scenario.attribute(name).groups) for name in self.attributes)
         return min(groups, MAX_LEVEL)
 

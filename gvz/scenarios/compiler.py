@@ -1,38 +1,35 @@
 """Task -> WAD file: content of a task, its maps, script and classes, and the cache.
 
-The WAD of one map is built each time (some 20 ms) and stored in the user's cache directory under the hash of its bytes.
-So a file of another version of the code is never used. The many maps of a `varied` task take seconds. Their file is
-stored under the hash of the first map and of the code that draws the others; it is built if there is none.
-Nothing here starts an engine.
+The WAD of a task is built each time (some 20 ms) and stored in the user's cache directory under the hash of its bytes.
+So a file of another version of the code is never used. If the task's maps are drawn, this file holds the classes of all
+its maps, and the first of them; `CompiledTask.map_of` makes the map of an episode when it is played (a few ms), and
+keeps it. Nothing here starts an engine.
 """
 
 import hashlib
 import os
-import struct
 import tempfile
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from string import Template
 
 from gvz.core.cache import cache_directory
 from gvz.core.env_config import Profile
 from gvz.core.errors import ResourceError, TaskError, WadError, nearest
-from gvz.engine.process import one_of
-from gvz.scenarios import varied
+from gvz.scenarios import looks
 from gvz.scenarios.base import Content, Task, Thing, Uniform, Value
+from gvz.scenarios.layout import Floor, Layout
+from gvz.scenarios.map_set import MapSet
 from gvz.wad.acs import compile_acs
 from gvz.wad.decorate import declared_actors, declared_numbers, used_sprites
-from gvz.wad.lumps import HEADER, Lump, read_maps, read_wad, write_map_wad, write_wad
+from gvz.wad.lumps import read_maps, read_wad, write_map_wad, write_wad
 from gvz.wad.stock import scenario_wad, stock_editor_numbers, stock_sprites, stock_textures
 from gvz.wad.textures import check_textures
 from gvz.wad.udmf import UdmfMap, is_inside, make_thing, parse_textmap, write_textmap
 
 MAP_NAME = "MAP01"
-_BUILD_S = 300.0
-"""how long a process waits for another one that builds the same file, seconds"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -40,24 +37,20 @@ class CompiledTask:
     """A task's WAD file, ready to load."""
 
     task: Task
+    profile: Profile
     wad_path: Path
-    map_magics: tuple[int, ...]
-    """for each map, the value that the running map's MAP_MAGIC variable must have"""
+    map_magic: int
+    """the value that the MAP_MAGIC variable of this file's map has"""
 
-    @property
-    def map_name(self) -> str:
-        """Name of the first map; the only one, unless the task is a `varied` one."""
-        return _map_name(self.task, 0)
+    def map_of(self, episode_seed: int) -> tuple[bytes | None, int]:
+        """(The WAD of an episode's drawn map, None for that of `wad_path`; the value of the map's MAP_MAGIC).
 
-    @property
-    def map_magic(self) -> int:
-        """Magic number of the first map."""
-        return self.map_magics[0]
-
-    def map_of(self, episode_seed: int) -> tuple[str, int]:
-        """(name, magic number) of the map of an episode: map number `episode_seed` modulo the number of maps."""
-        number = episode_seed % len(self.map_magics)
-        return _map_name(self.task, number), self.map_magics[number]
+        Raises:
+            TaskError: the drawn map cannot be played.
+        """
+        if self.task.maps is None:
+            return None, self.map_magic
+        return _drawn_map(self.task, self.profile, self.task.maps.number_of(episode_seed))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -81,61 +74,16 @@ def compile_task(task: Task, profile: Profile = "thesis") -> CompiledTask:
         ResourceError: the cache directory cannot be written.
     """
     source = map_source(task, profile)
-    if task.num_maps:
-        return _compile_varied(task, profile, source)
     path = _cached(build_wad(source))
-    return CompiledTask(task=task, wad_path=path, map_magics=(source.map_magic,))
+    return CompiledTask(task=task, profile=profile, wad_path=path, map_magic=source.map_magic)
 
 
-def _compile_varied(task: Task, profile: Profile, first: MapSource) -> CompiledTask:
-    """The file of a `varied` task, built if the cache has none of this name, or a damaged one."""
-    drawn_by = Path(varied.__file__).read_bytes()
-    name = hashlib.sha256(b"\0".join((build_wad(first), drawn_by, str(task.num_maps).encode()))).hexdigest()
-    path = cache_directory() / f"{name}.wad"
-    magics = _read_magics(path, task.num_maps)
-    if magics is None:
-        with one_of([f"build-{name[0]}"], time.monotonic() + _BUILD_S):
-            magics = _read_magics(path, task.num_maps)  # another process may have built it meanwhile
-            if magics is None:
-                data, magics = _build_varied(task, profile)
-                _write(path, data)
-    return CompiledTask(task=task, wad_path=path, map_magics=magics)
-
-
-def _build_varied(task: Task, profile: Profile) -> tuple[bytes, tuple[int, ...]]:
-    """(A WAD of all maps, with the hash of it behind its end; the maps' magic numbers).
-
-    Its first lump, MAGICS, has these numbers. The engine reads neither that lump nor the hash.
-    """
-    classes: set[Lump] = set()
-    maps: list[Lump] = []
-    magics: list[int] = []
-    for number in range(task.num_maps):
-        source = map_source(task, profile, number)
-        decorate, *lumps = read_wad(build_wad(source, _map_name(task, number)))
-        classes.add(decorate)
-        maps += lumps
-        magics.append(source.map_magic)
-    assert [lump.name for lump in classes] == ["DECORATE"], "all maps of a file have the same classes"
-    data = write_wad([Lump("MAGICS", struct.pack(f"<{len(magics)}i", *magics)), *classes, *maps])
-    return data + hashlib.sha256(data).digest(), tuple(magics)
-
-
-def _read_magics(path: Path, num_maps: int) -> tuple[int, ...] | None:
-    """The magic numbers in a file of `_build_varied`; None if there is no such file, or a damaged one."""
-    try:
-        data = path.read_bytes() if path.exists() else b""
-    except OSError as error:
-        raise _cache_error(error) from error
-    whole, digest = data[:-32], data[-32:]
-    if hashlib.sha256(whole).digest() != digest:
-        return None
-    return struct.unpack_from(f"<{num_maps}i", whole, HEADER.size)
-
-
-def _map_name(task: Task, number: int) -> str:
-    """MAP01, or VARY0000 and so on: Doom II has rules of its own for some of MAP01 to MAP32."""
-    return f"VARY{number:04}" if task.num_maps else MAP_NAME
+@lru_cache(maxsize=1000)
+def _drawn_map(task: Task, profile: Profile, number: int) -> tuple[bytes, int]:
+    """(The WAD of a map alone, its magic number). The classes of all maps are in the task's own file."""
+    source = map_source(task, profile, number)
+    _, *lumps = read_wad(build_wad(source))
+    return write_wad(lumps), source.map_magic
 
 
 def task_content(task: Task, profile: Profile) -> Content:
@@ -153,18 +101,20 @@ def task_content(task: Task, profile: Profile) -> Content:
     return content if exception is None else content.overlaid(exception)
 
 
-def map_source(task: Task, profile: Profile, number: int = 0) -> MapSource:
-    """The texts of a task's WAD, or of map `number` of a `varied` task; the magic number is made of their hash.
+def map_source(task: Task, profile: Profile, number: int | None = None) -> MapSource:
+    """The texts of a task's WAD, or of a drawn map, by default the first; the magic number is made of their hash.
 
     Raises:
-        TaskError: the parameters of scenario and attributes do not match the script's names; a thing is not on a map of
-            the scenario, is outside the map, or has an unknown class; a sprite does not exist.
+        TaskError: a drawn map cannot be played; the parameters of scenario and attributes do not match the script's
+            names; a thing is not on a map of the scenario, is outside the map, or has an unknown class; a sprite does
+            not exist.
         WadError: an unknown texture or base map.
     """
     content = task_content(task, profile)
-    drawn = _draw(task, content)
-    if task.num_maps:
-        content = varied.draw_look(task.scenario, content, drawn, number)
+    if task.maps is None:
+        drawn = _draw(task, content)
+    else:
+        content, drawn = _draw_of_set(task, task.maps, content, task.maps.number_of(0) if number is None else number)
     decorate = "\n".join(content.actors.values())
     _check_sprites(task, decorate)
     drawn.things += [make_thing(t.type, t.x, t.y, tid=t.tid) for t in _checked_things(task, content, drawn, decorate)]
@@ -233,13 +183,15 @@ def _set_properties(tid: str, properties: Mapping[str, Value]) -> str:
     return " ".join(lines)
 
 
-def _draw(task: Task, content: Content) -> UdmfMap:
-    """The base map with the content's textures and the scenario's own changes."""
+def _draw(task: Task, content: Content, layout: Layout | None = None) -> UdmfMap:
+    """The base map with the content's textures and the scenario's own changes, or with another layout."""
     assert content.base_wad is not None
     assert content.textures is not None
     drawn = _base_map(content.base_wad).copy()
     if task.scenario.draw_map is not None:
         task.scenario.draw_map(drawn)
+    if layout is not None:
+        drawn = layout.build(drawn)
     for side in drawn.sidedefs:
         if "texturemiddle" in side:  # sides between two open spaces have none
             side["texturemiddle"] = content.textures.wall
@@ -247,6 +199,20 @@ def _draw(task: Task, content: Content) -> UdmfMap:
         sector["texturefloor"] = content.textures.floor
         sector["textureceiling"] = content.textures.ceiling
     return drawn
+
+
+def _draw_of_set(task: Task, maps: MapSet, content: Content, number: int) -> tuple[Content, UdmfMap]:
+    """(What a map of a set has instead of the task's content, the map); the layout is checked."""
+    scenario, layout = task.scenario, None
+    assert scenario.variety is not None, "checked where the task was made"
+    if strength := maps.strength("layout"):
+        layout = scenario.variety.draw_layout(looks.drawn_from(scenario, maps, number, "layout"), strength)
+        content = content.overlaid(Content(things={content.base_wad or "": ()}, parameters=layout.parameters))
+    drawn = _draw(task, content, layout)
+    content = looks.draw_look(scenario, content, drawn, maps, number, layout)
+    if layout is not None and (problem := layout.problem(Floor(drawn, looks.solid_places(drawn)))) is not None:
+        raise TaskError(f"{task.id}, map {number}: {problem}; this is a mistake of the scenario's draw_layout")
+    return content, drawn
 
 
 @cache
@@ -292,15 +258,6 @@ def _cached(data: bytes) -> Path:
     try:
         if path.exists() and path.read_bytes() == data:
             return path
-    except OSError as error:
-        raise _cache_error(error) from error
-    _write(path, data)
-    return path
-
-
-def _write(path: Path, data: bytes) -> None:
-    """Writes a file of the cache directory."""
-    try:
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
         try:
@@ -311,11 +268,7 @@ def _write(path: Path, data: bytes) -> None:
             Path(temporary).unlink(missing_ok=True)
             raise
     except OSError as error:
-        raise _cache_error(error) from error
-
-
-def _cache_error(error: OSError) -> ResourceError:
-    directory = cache_directory()
-    return ResourceError(
-        f"map cache {directory}: {error}; make it writable, or set GVZ_CACHE_DIR to a directory that is"
-    )
+        raise ResourceError(
+            f"map cache {cache_directory()}: {error}; make it writable, or set GVZ_CACHE_DIR to a directory that is"
+        ) from error
+    return path

@@ -12,8 +12,11 @@ Attributes: thesis B.1, below. `complete` takes mossy_bricks for its textures. T
 """
 
 import math
+import random
+from functools import partial
 
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
+from gvz.scenarios.layout import WAY, Layout, Place, draw_pillar, ring, vary
 from gvz.scenarios.parts import COUNTED_MARINE, RESIZED, retextured, things_at
 from gvz.scenarios.rewards import Fell, Pace, Reward, Rose, death
 
@@ -89,9 +92,52 @@ GORE = {
 """editor number -> places"""
 
 
-def near_agent_or_enemies(x: float, y: float) -> bool:
-    """Whether a place is close to the agent or to the ring on which enemies appear."""
-    return not 200 <= math.hypot(x, y) <= 620
+def near_agent_or_enemies(x: float, y: float, ring: float = 735.0) -> bool:
+    """Whether a place is close to the agent or to the ring of this radius on which enemies appear."""
+    return not 200 <= math.hypot(x, y) <= ring - 115
+
+
+def draw_arena(rng: random.Random, strength: float) -> Layout:
+    """A room of 4 to 18 corners round the agent, with up to six pillars that hide at most two of the five enemies.
+
+    Enemies appear 555 to 850 units from the agent, instead of 735. The wall is as far behind them as in the default.
+    """
+    radius = 5 * round(vary(rng, strength, 735, 555, 850) / 5)
+    num_corners, turn = round(vary(rng, strength, 18, 4, 18)), rng.random()
+    corners = []
+    for n in range(num_corners):
+        angle = math.tau * (turn - (n + strength * rng.uniform(-0.15, 0.15)) / num_corners)
+        length = 1 + strength * rng.uniform(0, 0.25)
+        corners.append((length * math.cos(angle), length * math.sin(angle)))
+    sides = zip(corners, corners[1:] + corners[:1], strict=True)
+    scale = (radius + 68) / min(abs(x1 * y2 - x2 * y1) / math.dist((x1, y1), (x2, y2)) for (x1, y1), (x2, y2) in sides)
+    places = tuple(_polar(radius, n / 5) for n in range(5))
+    pillars: list[tuple[Place, float]] = []
+    for _ in range(rng.randint(0, round(6 * strength))):
+        place, size = _polar(rng.uniform(240, radius - 180), rng.random()), rng.uniform(20, 56)
+        if all(math.dist(place, other) >= size + other_size + 2 * WAY for other, other_size in pillars):
+            pillars.append((place, size))
+    while sum(_is_hidden(place, pillars) for place in places) > 2:
+        pillars.pop()
+    return Layout(
+        walls=ring([(scale * x, scale * y) for x, y in corners]) + sum((draw_pillar(rng, *one) for one in pillars), ()),
+        starts=((0.0, 0.0),),
+        height=round(vary(rng, strength, 300, 128, 400)),
+        parameters={"radius": float(radius)},
+        places=places,
+        radius=30.0,
+        keep_clear=partial(near_agent_or_enemies, ring=radius),
+    )
+
+
+def _polar(length: float, turns: float) -> Place:
+    return length * math.cos(math.tau * turns), length * math.sin(math.tau * turns)
+
+
+def _is_hidden(place: Place, pillars: list[tuple[Place, float]]) -> bool:
+    """Whether a pillar stands between the centre and a place."""
+    (x, y), length = place, math.hypot(*place)
+    return any(px * x + py * y > 0 and abs(px * y - py * x) / length < size for (px, py), size in pillars)
 
 
 SCENARIO = Scenario(
@@ -117,6 +163,7 @@ SCENARIO = Scenario(
         entity_parameters=("classes",),
         max_decorations=10,
         keep_clear=near_agent_or_enemies,
+        draw_layout=draw_arena,
     ),
     attributes=(
         Attribute(name="gore", groups=("decorations",), content=Content(things={WAD: things_at(GORE)})),

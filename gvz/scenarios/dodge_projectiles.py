@@ -13,12 +13,17 @@ Attributes: thesis B.4, below. Revenants count as two attributes (their missiles
 Differs: the enemies have their normal health, as in the author's maps; the agent has no weapon.
 """
 
+import random
+from functools import partial
+
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Value, Variety, words
+from gvz.scenarios.layout import Layout, ring, vary
 from gvz.scenarios.parts import retextured, things_at
 from gvz.scenarios.rewards import Fell, Pace, Reward, living
 from gvz.wad.udmf import UdmfMap
 
 WAD = "defend_the_line.wad"
+NUM_IMPS = 10
 
 SCRIPT = """\
 #include "zcommon.acs"
@@ -103,9 +108,34 @@ SKULLS = {42: ((-192, 416), (-224, 320), (-256, 256), (-288, 96), (-288, 480), (
 """editor number -> places of floating skulls; missiles pass over them"""
 
 
-def near_agent_or_enemies(x: float, _y: float) -> bool:
-    """Whether a place is close to the agent's strip or to where enemies stand."""
-    return not -320 <= x <= 16
+def near_agent_or_enemies(x: float, _y: float, row: float = 96.0) -> bool:
+    """Whether a place is close to the agent's strip or to the row in which enemies stand."""
+    return not -320 <= x <= row - 80
+
+
+def draw_room(rng: random.Random, strength: float) -> Layout:
+    """A room without cover, 512 to 832 units deep, as wide at the enemies' end as by default or up to 1.4 times.
+
+    The strip is 0.65 to 1.35 times as long as by default. Behind the enemies the wall is straight, or has a corner.
+    """
+    back, middle = -512.0, 288.0
+    row = 16 * round(vary(rng, strength, 96, -32, 288) / 16)
+    strip, width = (8 * round(224 * vary(rng, strength, 1, *ends) / 8) for ends in ((0.65, 1.35), (1, 1.4)))
+    bulge = strength * max(0.0, rng.uniform(-100, 200))
+    left = [(back, middle + strip), (back + 64, middle + strip), (row + 32, middle + width)]
+    tip = [(row + 32 + bulge, middle)] if bulge >= 16 else []
+    corners = [*left, *tip, *((x, 2 * middle - y) for x, y in reversed(left))]
+    last = min(width, strip + (width - strip) * (row - back - 64) / (row - back - 32)) - 36  # off the side walls
+    ys = tuple(middle + last * (2 * n / (NUM_IMPS - 1) - 1) for n in range(NUM_IMPS))
+    return Layout(
+        walls=ring(corners),
+        barriers=((left[1], (back + 64, middle - strip)),),
+        starts=((back + 32, middle),),
+        height=round(vary(rng, strength, 104, 96, 240)),
+        parameters={"xs": (float(row),) * NUM_IMPS, "ys": ys},
+        places=tuple((row, y) for y in ys),
+        keep_clear=partial(near_agent_or_enemies, row=row),
+    )
 
 
 SCENARIO = Scenario(
@@ -116,7 +146,7 @@ SCENARIO = Scenario(
     content=Content(
         base_wad=WAD,
         textures=Textures("BRICK12", "CRATOP1", "CRATOP1"),
-        parameters=_row("DoomImp", 10, 96.0, 84.0, 492.0),
+        parameters=_row("DoomImp", NUM_IMPS, 96.0, 84.0, 492.0),
         entity={"Speed": 0.0},
         agent={"DamageFactor": 0.7},
     ),
@@ -127,6 +157,7 @@ SCENARIO = Scenario(
         max_decorations=10,
         solid=False,  # what stops missiles would change the game
         keep_clear=near_agent_or_enemies,
+        draw_layout=draw_room,
     ),
     attributes=(
         retextured("city", "SKY2", "ROCKRED1", "CEIL4_1"),

@@ -11,7 +11,10 @@ Metric: frames alive, at most the time-out.
 Attributes: thesis B.2, below. `complete` takes water for its textures. Tasks: thesis Table A.2.
 """
 
+import random
+
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
+from gvz.scenarios.layout import Layout, draw_pillar, draw_pillars, draw_places, draw_rooms, vary
 from gvz.scenarios.parts import RESIZED, retextured, starts_at, things_at
 from gvz.scenarios.rewards import Pace, Reward, Rose, death, living
 
@@ -34,7 +37,15 @@ function int SpawnSomewhere(str kind)
 {
     for (int tries = 0; tries < 100; tries++)
     {
-        if (Spawn(kind, Random(1.0, $map_size - 1.0), Random(1.0, $map_size - 1.0), 20.0, next_tid) != 0)
+        int x = Random(1.0, $map_size - 1.0);
+        int y = Random(1.0, $map_size - 1.0);
+        if ($num_places > 0)
+        {
+            int place = Random(100, 99 + $num_places);
+            x = GetActorX(place);
+            y = GetActorY(place);
+        }
+        if (Spawn(kind, x, y, 20.0, next_tid) != 0)
         {
             next_tid++;
             return next_tid - 1;
@@ -165,6 +176,28 @@ OBSTACLES = {
 """base map -> editor number (green column, red column, heart column) -> places"""
 
 
+def draw_hall(rng: random.Random, strength: float) -> Layout:
+    """One to nine rooms with wide doors, and pillars in them, of about the default room's size together."""
+    rooms = draw_rooms(
+        rng,
+        size=round(vary(rng, strength, 19, 17, 22)),
+        across=round(vary(rng, strength, 1, 0.51, 3.49)) or 1,
+        shrink=rng.uniform(0, 0.5 * strength),
+        loops=vary(rng, strength, 1.0, 0.2, 1.0),
+        corridor=(3, 3),
+    )
+    pillars = draw_pillars(rng, rooms, round(12 * strength), (32, 160))
+    starts, places = draw_places(rng, rooms, pillars, 9)
+    return Layout(
+        walls=rooms.walls() + sum((draw_pillar(rng, *one) for one in pillars), ()),
+        starts=starts,
+        height=round(vary(rng, strength, 104, 96, 240)),
+        parameters={"num_places": len(places), "last_spot": 9 + len(starts)},
+        places=places,
+        marked=True,
+    )
+
+
 SCENARIO = Scenario(
     id="health_gathering",
     title="Health Gathering",
@@ -177,6 +210,7 @@ SCENARIO = Scenario(
             "even_kit": '"Medikit"',
             "odd_kit": '"Medikit"',
             "map_size": 1216.0,
+            "num_places": 0,
             "num_kits": 16,
             "kit_delay": 30,
             "num_poisons": 0,
@@ -193,7 +227,9 @@ SCENARIO = Scenario(
         parameters={"last_spot": 10, "start_angle": 0.0},
         actors=_poison(1),
     ),
-    variety=Variety(entities=("Medikit",), entity_parameters=("even_kit", "odd_kit"), max_decorations=16),
+    variety=Variety(
+        entities=("Medikit",), entity_parameters=("even_kit", "odd_kit"), max_decorations=16, draw_layout=draw_hall
+    ),
     attributes=(
         Attribute(  # first, because textures and stimpacks change what it sets
             name="supreme",

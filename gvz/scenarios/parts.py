@@ -3,13 +3,12 @@
 from collections.abc import Iterable, Mapping
 
 from gvz.scenarios.base import Attribute, Content, Textures, Thing, Uniform
+from gvz.scenarios.layout import MAP_SPOT
 
 RESIZED = Content(entity={"ScaleX": Uniform(0.3, 3.0), "ScaleY": Uniform(0.3, 3.0)})
 """enemies or kits of any width and height"""
 COUNTED_MARINE = {"MarineChainsawVzd": "ACTOR MarineChainsawVzd : MarineChainsaw\n{\n  +COUNTKILL\n}\n"}
 """class name -> definition: a marine with a chainsaw whose death counts as a kill"""
-_MAP_SPOT = 9001
-"""editor number of a place that scripts find by its tid"""
 
 
 def retextured(name: str, wall: str, floor: str, ceiling: str) -> Attribute:
@@ -24,4 +23,4 @@ def things_at(places: Mapping[int, Iterable[tuple[float, float]]]) -> tuple[Thin
 
 def starts_at(places: Iterable[tuple[float, float]], first_tid: int) -> tuple[Thing, ...]:
     """Places for the agent to start at, map units; their tids are consecutive."""
-    return tuple(Thing(_MAP_SPOT, x, y, tid) for tid, (x, y) in enumerate(places, first_tid))
+    return tuple(Thing(MAP_SPOT, x, y, tid) for tid, (x, y) in enumerate(places, first_tid))

@@ -15,7 +15,10 @@ Known: about one enemy in a hundred appears in the walled-off notch at the map's
     happens to kits of health_gathering/supreme, and in the author's maps.
 """
 
+import random
+
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Variety, words
+from gvz.scenarios.layout import Layout, draw_pillar, draw_pillars, draw_places, draw_rooms, vary
 from gvz.scenarios.parts import COUNTED_MARINE, RESIZED, retextured, starts_at, things_at
 from gvz.scenarios.rewards import HISTORY_STEPS, Fell, Pace, Reward, Rose, death, living, moved
 from gvz.wad.udmf import UdmfMap
@@ -38,7 +41,15 @@ function int SpawnEnemy(int kind)
     int tid = next_tid;
     for (int tries = 0; tries < 100; tries++)
     {
-        if (Spawn(classes[kind], Random(1.0, $map_size - 1.0), Random(1.0, $map_size - 1.0), 0.0, tid) != 0)
+        int x = Random(1.0, $map_size - 1.0);
+        int y = Random(1.0, $map_size - 1.0);
+        if ($num_places > 0)
+        {
+            int place = Random(100, 99 + $num_places);
+            x = GetActorX(place);
+            y = GetActorY(place);
+        }
+        if (Spawn(classes[kind], x, y, 0.0, tid) != 0)
         {
             next_tid++;
             num_spawned++;
@@ -157,6 +168,28 @@ def drain_acid(maze: UdmfMap) -> None:
         del sector["special"]
 
 
+def draw_maze(rng: random.Random, strength: float) -> Layout:
+    """A maze of rooms and corridors: 2 to 5 rooms on each side of a square, of 3 tiles to all of their cell."""
+    rooms = draw_rooms(
+        rng,
+        size=round(vary(rng, strength, 27, 22, 32)),
+        across=round(vary(rng, strength, 4, 1.51, 5.49)),
+        shrink=rng.uniform(0, strength),
+        loops=vary(rng, strength, 0.7, 0.1, 1.0),
+        corridor=(2, 3),
+    )
+    pillars = draw_pillars(rng, rooms, round(8 * strength), (40, 144))
+    starts, places = draw_places(rng, rooms, pillars, 20)
+    return Layout(
+        walls=rooms.walls() + sum((draw_pillar(rng, *one) for one in pillars), ()),
+        starts=starts,
+        height=round(vary(rng, strength, 104, 96, 240)),
+        parameters={"num_places": len(places), "last_spot": 9 + len(starts)},
+        places=places,
+        marked=True,
+    )
+
+
 SCENARIO = Scenario(
     id="seek_and_kill",
     title="Seek and Kill",
@@ -172,12 +205,13 @@ SCENARIO = Scenario(
             "first_delay": 30,
             "spawn_delay": 30,
             "map_size": 1856.0,
+            "num_places": 0,
             "last_spot": 29,
         },
         entity={"Speed": 0.0},
     ),
     levdoom=Content(things={WAD: ()}, parameters={"first_delay": 0, "last_spot": 21}),
-    variety=Variety(entities=("Demon",), entity_parameters=("classes",), max_decorations=24),
+    variety=Variety(entities=("Demon",), entity_parameters=("classes",), max_decorations=24, draw_layout=draw_maze),
     attributes=(
         retextured("blue", "FIREBLU2", "FLAT14", "CEIL4_3"),
         retextured("red", "FIREWALL", "CRACKLE4", "DORED"),

@@ -34,7 +34,14 @@ def make_experiment(**changes) -> Experiment:
 
 
 def test_the_thesis_s_four_the_quick_one_and_the_gates_are_there():
-    assert set(ALL) == {*THESIS_AVERAGES, "quick_comparison", "gate_reuse", "gate_sight", "gate_world"}
+    assert set(ALL) == {
+        *THESIS_AVERAGES,
+        "quick_comparison",
+        "gate_reuse",
+        "gate_sight",
+        "gate_world",
+        "procedural_gap",
+    }
 
 
 def test_varied_maps_are_a_training_of_every_scenario():
@@ -42,6 +49,16 @@ def test_varied_maps_are_a_training_of_every_scenario():
     assert {run.tasks for run in runs} == {("defend_the_center/varied",), ("defend_the_center/varied-10",)}
     with pytest.raises(TaskError, match="1 to 1000 maps"):
         make_experiment(trainings=("varied-0",)).runs()
+
+
+def test_the_gap_is_between_the_maps_trained_on_and_those_of_procedural_test():
+    gap = experiments()["procedural_gap"]
+    run = gap.runs()[0]
+    assert run.tasks == ("defend_the_center/procedural-train-10",)
+    assert gap.evaluation_tasks(run) == ("defend_the_center/procedural-test", *run.tasks)
+    assert gap.table_tasks(run) == ("defend_the_center/procedural-test",)
+    with pytest.raises(ConfigError, match="evaluate_on 'procedural' wants columns 'config' or 'training'"):
+        dataclasses.replace(gap, columns="level")
 
 
 @pytest.mark.parametrize("name", ALL)

@@ -1,22 +1,19 @@
 """Varied maps: what is drawn, what never is; the same map everywhere; the game of the default task."""
 
-import dataclasses
 import hashlib
 import os
 import re
 import subprocess
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from math import dist, hypot
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gvz.core.env_config import EnvConfig
-from gvz.core.errors import EngineError, ResourceError
+from gvz.core.errors import EngineError
 from gvz.engine.engine import Engine
 from gvz.engine.probe import _faults
 from gvz.env import DoomEnv
@@ -25,10 +22,11 @@ from gvz.evaluation.play import play_episode
 from gvz.evaluation.players import ScriptedPlayer
 from gvz.evaluation.simple import player_env
 from gvz.run.config import RunConfig
-from gvz.scenarios import varied
+from gvz.scenarios import looks
 from gvz.scenarios.base import BOOKKEEPING, Content, Scenario, Task
 from gvz.scenarios.compiler import CompiledTask, compile_task, map_source, task_content
-from gvz.scenarios.varied import FLATS, LOOSE, SOLID, STYLES, WALLS
+from gvz.scenarios.looks import FLATS, LOOSE, SOLID, STYLES, WALLS
+from gvz.scenarios.map_set import MapSet
 from gvz.tasks import named_tasks, parse_task, scenarios
 from gvz.wad.lumps import read_maps, read_wad
 from gvz.wad.stock import stock_editor_numbers, stock_textures
@@ -39,6 +37,9 @@ from tests.scenarios.pictures import colours, moving, picture, thumbnail
 SCENARIOS = list(scenarios().values())
 LEAST_DIFFERENCE = 6.0
 """of two 16x16 thumbnails, 0 to 255, on average: FLOOR0_6 and FLOOR0_5 differ by 0.3, STONE3 and STONE2 by 5.2"""
+
+
+FIFTY = MapSet("varied", 50)
 
 
 @pytest.fixture
@@ -58,12 +59,12 @@ def named_textures() -> set[str]:
 
 
 def drawn_map(scenario: Scenario, number: int) -> UdmfMap:
-    return parse_textmap(map_source(Task(scenario, num_maps=50), "thesis", number).textmap)
+    return parse_textmap(map_source(Task(scenario, maps=FIFTY), "thesis", number).textmap)
 
 
 def look(scenario: Scenario, number: int) -> Content:
     """The content of a drawn map."""
-    return varied.draw_look(scenario, task_content(Task(scenario), "thesis"), drawn_map(scenario, number), number)
+    return looks.draw_look(scenario, task_content(Task(scenario), "thesis"), drawn_map(scenario, number), FIFTY, number)
 
 
 # --------------------------------------------------------------------------------------------- what never is drawn
@@ -137,10 +138,10 @@ def test_textures_can_be_seen_and_stand_still():
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=str)
 def test_nothing_but_looks_differs_from_the_default_task(scenario: Scenario, profile):
     default = task_content(Task(scenario), profile)
-    looks = {"ScaleX", "ScaleY", "RenderStyle", "Alpha", "StencilColor"}
+    drawn_properties = {"ScaleX", "ScaleY", "RenderStyle", "Alpha", "StencilColor"}
     for number in range(20):
-        content = varied.draw_look(scenario, default, drawn_map(scenario, number), number)
-        assert {k: v for k, v in content.entity.items() if k not in looks} == default.entity
+        content = looks.draw_look(scenario, default, drawn_map(scenario, number), FIFTY, number)
+        assert {k: v for k, v in content.entity.items() if k not in drawn_properties} == default.entity
         assert (content.agent, content.base_wad, content.things) == (default.agent, default.base_wad, default.things)
         for name, value in default.parameters.items():
             drawn = content.parameters[name]
@@ -177,7 +178,7 @@ def test_decorations_stand_inside_the_map_and_clear_of_starts_enemies_and_each_o
 def test_the_places_of_a_square_are_inside_it_and_know_how_far_its_walls_are():
     corners = [(0.0, 0.0), (64.0, 0.0), (64.0, 64.0), (0.0, 64.0)]
     square = tuple(zip(corners, corners[1:] + corners[:1], strict=True))
-    places = varied.open_places(square, (True,) * 4)
+    places = looks.open_places(square, (True,) * 4)
     assert {(x, y) for x, y, _ in places if x and y} == {(x, y) for x in (16, 32, 48) for y in (16, 32, 48)}
     assert {(x, y): to_wall for x, y, to_wall in places}[16, 32] == 16
 
@@ -186,15 +187,15 @@ def test_the_places_of_a_square_are_inside_it_and_know_how_far_its_walls_are():
 
 
 def digest(scenario: Scenario, numbers: range) -> str:
-    texts = [str(map_source(Task(scenario, num_maps=50), "thesis", number)) for number in numbers]
-    return hashlib.sha256("".join(texts).encode()).hexdigest()[:16]
+    sources = [map_source(Task(scenario, maps=FIFTY), "thesis", number) for number in numbers]
+    return hashlib.sha256("".join(one.textmap + one.decorate for one in sources).encode()).hexdigest()[:16]
 
 
 def test_a_map_is_drawn_from_its_number_alone():
     centre = SCENARIOS[0]
-    one = map_source(Task(centre, num_maps=10), "thesis", 7)
-    assert one == map_source(Task(centre, num_maps=1000), "thesis", 7)
-    texts = [map_source(Task(centre, num_maps=50), "thesis", number).textmap for number in range(50)]
+    one = map_source(Task(centre, maps=MapSet("varied", 10)), "thesis", 7)
+    assert one == map_source(Task(centre, maps=MapSet("varied")), "thesis", 7)
+    texts = [map_source(Task(centre, maps=FIFTY), "thesis", number).textmap for number in range(50)]
     assert len(set(texts)) == 50
     code = "import tests.scenarios.test_varied as t; print([t.digest(one, range(3)) for one in t.SCENARIOS])"
     env = {**os.environ, "PYTHONHASHSEED": "7"}
@@ -205,75 +206,42 @@ def test_a_map_is_drawn_from_its_number_alone():
 def test_the_first_maps_are_those_that_runs_were_trained_on():
     """If they change, say so in the changelog: a score over the number of training maps would not compare."""
     assert {one.id: digest(one, range(3)) for one in SCENARIOS} == {
-        "defend_the_center": "4bcf4c8692a684b0",
-        "dodge_projectiles": "e253bd10b8edd907",
-        "health_gathering": "7ea06c724b783534",
-        "seek_and_kill": "b597e6f7d3d30912",
+        "defend_the_center": "392c38852665036e",
+        "dodge_projectiles": "5f512baa8ce0c63f",
+        "health_gathering": "7e30c5f9275bdd64",
+        "seek_and_kill": "3aab033a1a5bc1a3",
     }
 
 
 @pytest.mark.usefixtures("cache")
 def test_an_episodes_map_is_its_seed_modulo_the_number_of_maps():
     compiled = compile_task(parse_task("defend_the_center/varied-3"))
-    assert len(set(compiled.map_magics)) == 3
-    assert [compiled.map_of(seed) for seed in (0, 1, 2, 3, 2**31 - 1)] == [
-        (f"VARY000{number}", compiled.map_magics[number]) for number in (0, 1, 2, 0, (2**31 - 1) % 3)
+    found = [compiled.map_of(seed) for seed in (0, 1, 2, 3, 2**31 - 1)]
+    numbers = [0, 1, 2, 0, (2**31 - 1) % 3]
+    assert [magic for _, magic in found] == [
+        map_source(compiled.task, "thesis", number).map_magic for number in numbers
     ]
-    maps = read_maps(read_wad(compiled.wad_path.read_bytes()))
-    assert list(maps) == ["VARY0000", "VARY0001", "VARY0002"]
-    for (name, lumps), magic in zip(maps.items(), compiled.map_magics, strict=True):
-        assert f"map_magic = {magic};" in lumps["SCRIPTS"].decode(), name
+    assert len({magic for _, magic in found}) == 3
+    assert found[0][1] == compiled.map_magic
+    for wad, magic in found:
+        assert wad is not None
+        names = [lump.name for lump in read_wad(wad)]
+        assert names == ["MAP01", "TEXTMAP", "BEHAVIOR", "SCRIPTS", "ENDMAP"]
+        assert f"map_magic = {magic};" in read_maps(read_wad(wad))["MAP01"]["SCRIPTS"].decode()
 
 
-# ----------------------------------------------------------------------------------------------------------- the cache
-
-
-@pytest.mark.usefixtures("cache")
-def test_the_file_of_all_maps_is_built_once():
-    task = parse_task("dodge_projectiles/varied-4")
-    path = compile_task(task).wad_path
-    written, whole = path.stat().st_mtime_ns, path.read_bytes()
-    assert compile_task(task) == CompiledTask(task=task, wad_path=path, map_magics=compile_task(task).map_magics)
-    assert path.stat().st_mtime_ns == written
-    assert compile_task(parse_task("dodge_projectiles/varied-5")).wad_path != path
-    for damage in (b"", whole[:-1], whole[:200] + b"x" + whole[201:]):
-        path.write_bytes(damage)
-        assert compile_task(task).wad_path == path
-        assert path.read_bytes() == whole
-
-
-@pytest.mark.usefixtures("cache")
-def test_another_code_that_draws_makes_another_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    task = parse_task("dodge_projectiles/varied-2")
-    path = compile_task(task).wad_path
-    code = tmp_path / "varied.py"
-    code.write_text(Path(varied.__file__).read_text() + "\n")
-    monkeypatch.setattr(varied, "__file__", str(code))
-    assert compile_task(task).wad_path != path
-
-
-def _compile(task_id: str) -> CompiledTask:
-    return compile_task(parse_task(task_id))
-
-
-def test_many_processes_build_one_file(cache: Path):
-    with ProcessPoolExecutor(3, mp_context=get_context("spawn")) as pool:
-        results = list(pool.map(_compile, ["health_gathering/varied-30"] * 6))
-    assert len({(one.wad_path, one.map_magics) for one in results}) == 1
-    assert list(cache.iterdir()) == [results[0].wad_path]
-
-
-def test_a_cache_that_cannot_be_written_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path / "file" / "below"))
-    with pytest.raises(ResourceError, match=r"map cache .*set GVZ_CACHE_DIR"):
-        compile_task(parse_task("dodge_projectiles/varied-2"))
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=str)
+def test_all_maps_of_a_set_have_the_same_classes(scenario: Scenario):
+    """The engine reads them once, from the task's own file."""
+    for maps in (FIFTY, MapSet("train"), MapSet("test", strengths=(("entities", 0.3),))):
+        task = Task(scenario, maps=maps)
+        assert len({map_source(task, "thesis", maps.number_of(seed)).decorate for seed in range(12)}) == 1
 
 
 def test_training_on_varied_maps_has_the_scenarios_range_of_returns():
     drawn = RunConfig(name="drawn", tasks=("seek_and_kill/varied", "seek_and_kill/varied-10"))
     default = RunConfig(name="default", tasks=("seek_and_kill/default",))
-    assert [task.num_maps for task in drawn.table.tasks] == [1000, 10]
+    assert [task.maps and task.maps.num_maps for task in drawn.table.tasks] == [1000, 10]
     assert drawn.support == default.support
 
 
@@ -284,7 +252,7 @@ def test_training_on_varied_maps_has_the_scenarios_range_of_returns():
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=str)
 def test_every_map_plays_and_is_the_right_one(scenario: Scenario):
     """The environment compares the running map's magic number with the one of the episode's map."""
-    with closing(DoomEnv(Task(scenario, num_maps=12), buffers=("labels",))) as env:
+    with closing(DoomEnv(Task(scenario, maps=MapSet("varied", 12)), buffers=("labels",))) as env:
         frames = []
         for number in (*range(12), 5):
             observation, info = env.reset(seed=None, options={"episode_seed": 12 + number})
@@ -299,22 +267,12 @@ def test_every_map_plays_and_is_the_right_one(scenario: Scenario):
 
 
 @pytest.mark.engine
-def test_another_map_than_the_episodes_is_noticed():
+def test_another_map_than_the_episodes_is_noticed(monkeypatch: pytest.MonkeyPatch):
     with closing(DoomEnv("defend_the_center/varied-3")) as env:
-        env._compiled = dataclasses.replace(env._compiled, map_magics=(1, 2, 3))
-        with pytest.raises(EngineError, match=r"varied-3: .* a map with magic number \d+, want 2, that of VARY0001"):
+        wad, magic = env._compiled.map_of(0)
+        monkeypatch.setattr(CompiledTask, "map_of", lambda *_: (wad, magic + 1))
+        with pytest.raises(EngineError, match=r"varied-3: .* magic number \d+, want \d+, that of .* episode seed 4"):
             env.reset(options={"episode_seed": 4})
-
-
-@pytest.mark.engine
-def test_a_map_that_is_not_in_the_file_is_an_error():
-    with closing(DoomEnv("defend_the_center/varied-3")) as env:
-        engine = Engine(env._engine_config)
-    with closing(engine):
-        for _ in range(2):
-            with pytest.raises(EngineError, match="got the map VARY0003, want one of the file"):
-                engine.new_episode(1, "VARY0003")
-            engine.new_episode(1, "VARY0002")
 
 
 @pytest.mark.engine
@@ -337,12 +295,12 @@ def test_an_engine_starts_episodes_on_the_map_it_is_told():
         engine = Engine(env._engine_config)
     with closing(engine):
         ran = []
-        for name in ("VARY0002", None, "VARY0000", "VARY0000", "VARY0001"):
-            state = engine.new_episode(1, name)
+        for number in (None, 2, None, 0, 0, 1):
+            state = engine.new_episode(1, None if number is None else compiled.map_of(number)[0])
             ran.append(engine.variable(BOOKKEEPING["MAP_MAGIC"]))
             np.testing.assert_array_equal(state.screen_buffer, engine.screen)
             assert engine.tic() == 10
-        assert ran == [compiled.map_magics[number] for number in (2, 2, 0, 0, 1)]
+        assert ran == [compiled.map_of(number)[1] for number in (0, 2, 2, 0, 0, 1)]
 
 
 @pytest.mark.engine

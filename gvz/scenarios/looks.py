@@ -1,7 +1,7 @@
-"""What the maps of a `varied` task look like: the default task's map, with textures, decorations, light, colours drawn.
+"""What drawn maps look like: textures, decorations, light, enemies or kits.
 
-Map n of a scenario is drawn from the scenario's id and n alone. It is the same in every process, and `varied-10` has
-the first 10 maps of `varied`. Choices are uniform unless said otherwise.
+Each part has a strength (gvz.scenarios.map_set): 0 leaves it as in the default task. With strength 1, which `varied`
+has, choices are uniform unless said otherwise:
 
 - Walls: 1 (half of the maps), 2 or 3 textures; each side of a wall has one of them. Of WALLS, a quarter of FLATS.
 - Floor, ceiling: one texture each, of FLATS, a quarter of WALLS.
@@ -9,23 +9,32 @@ the first 10 maps of `varied`. Choices are uniform unless said otherwise.
 - Light: a level of LIGHT, out of Doom's 0 to 255; half of the maps tinge it, by three channels of TINGE.
 - Decorations: 0 to the scenario's most, each of 1 to 4 kinds of this map, of SOLID and LOOSE, at any place of the map
   that is not too near to a wall, a start, an enemy's place or another decoration.
-- Enemies or kits: half of the maps change their size, by one factor of SCALE for width and height; half give each class
-  one of TINTS. Of 5 maps one draws them see-through, alpha of ALPHA, and one as a silhouette in one of SILHOUETTES.
+- Entities (enemies or kits): half of the maps change their size, by one factor of SCALE for width and height; half give
+  each class one of TINTS. Of 5 maps one draws them see-through, alpha of ALPHA, and one as a silhouette in one of
+  SILHOUETTES.
 
-Nothing else differs from the default task. Nothing of the look of any named task, for training or testing, in either
-profile, is in a pool: no texture or near copy of one, no kind of decoration, no render style. The test list draws sizes
-from 0.3 to 3, for width and height apart and for each enemy; here proportions stay, and a map has one size. Left out
-besides are textures with holes, of the sky, that move, with writing, and those that are very dark, bright or restless.
+A strength in between takes this share of every pool, moves every number this share of its way from the default, and
+multiplies these probabilities. HELD_OUT keeps a fifth of what is in the pools for `procedural-test` and a tenth for
+`procedural-validation`; `procedural-train` has the rest, and `varied`, whose test is the named tasks, all.
+
+Nothing of the look of any named task, for training or testing, in either profile, is in a pool: no texture or near copy
+of one, no kind of decoration, no render style. The test list draws sizes from 0.3 to 3, for width and height apart and
+for each enemy; here proportions stay, and a map has one size. Left out besides are textures with holes, of the sky,
+that move, with writing, and those that are very dark, bright or restless.
 """
 
 import math
 import random
 import re
-from functools import lru_cache
+from collections.abc import Iterable, Sequence
+from functools import cache, lru_cache
+from typing import TypeVar
 
 import numpy as np
 
 from gvz.scenarios.base import Content, Scenario, Value, Variety, words
+from gvz.scenarios.layout import Floor, Layout
+from gvz.scenarios.map_set import VARIED, MapSet
 from gvz.wad.udmf import NO_REFERENCE, UdmfMap, make_thing
 
 WALLS = words(
@@ -104,43 +113,107 @@ SILHOUETTES = (0xFF5050, 0x50FF50, 0x6090FF, 0xFFFF50, 0xFF50FF, 0x50FFFF, 0xFFF
 STYLES = ("STYLE_Translucent", "STYLE_Stencil")
 """render styles; most maps keep the normal one"""
 
+HELD_OUT = {
+    "test": frozenset(
+        words(
+            """
+            A-ASKIN5 A-BROCK2 A-BROK28 A-DBRI1 A-TILE AQBRIK01 AQCONC05 AQCONC12 AQPIPE06 AQPIPE07 AQPIPE10 AQPIPE14
+            AQTRIM08 CARLRT1 CEMENT3 CEMENT7 COMPUTE3 CR128HGB CR128LB CR128LG CR64HBB CR64SLGB CRLWDVS CRSMB DOKGRIR
+            ESPIBR2 ESPITAN3 GRAY2 GRAYBIG GRAYRED GRAYTAN0 GRAYTAN5 GRAYWARN MOD1 MOD2 MOD3 MOD5 PANEL2 PIPES PIPEWAL1
+            ROCK1 SILVER3 SKINFACE SKINMET2 SKINTEK1 SKSPINE2 SPACEW4 STARG1 STARG3 STARG4 STONE5 TEKWALL2 TEKWALL6
+            ZIMMER7
+            AQF020 AQF022 AQF045 AQF055 AQF057 AQF068 AQF075 DEM1_6 FLAT1_3 FLOOR4_5 FLOOR5_2 MFLR8_1 MFLR8_3 RROCK11
+            RROCK16
+            """
+        )
+    )
+    | {24, 41, 43, 54, 70}
+    | {TINTS[4], TINTS[5], TINTS[10]}
+    | {SILHOUETTES[5], SILHOUETTES[7]},
+    "validation": frozenset(
+        words(
+            """
+            A-ASKIN3 A-DBRI18 A-DBRI2 AQCONC03 AQMETL32 BIGDOOR2 BIGDOOR3 BIGDOOR4 BRICK3 BROVINE BROWNPIP DOORHI
+            MARBGRAY PIPEWAL2 SKINEDGE SKINLOW SKINMET1 STARBR1 STARBR2 STARG2 STARTAN1 WOOD4
+            AQF001 AQF008 AQF009 AQF013 AQF034 AQF076 CEIL3_2 FLAT20 FLAT5_2 FLAT9 FLOOR3_3 FLOOR4_1 SFLR6_4
+            """
+        )
+    )
+    | {34, 48, 76}
+    | {TINTS[8]}
+    | {SILHOUETTES[4]},
+}
+"""split -> the textures, decorations, tints and silhouettes that no other split of procedural maps has. A texture
+differs from those of other splits by at least 8 of 255, on average of two 16x16 thumbnails"""
+
 _GRID = 16
 """places of decorations lie on a grid of this many map units, moved by up to half of it"""
-_START_GAP, _GAP = 128, 112
-"""least distance of a decoration from a start of the agent, and from the next decoration"""
+_START_GAP, _GAP, _PLACE_GAP = 128, 112, 64
+"""least distance of a decoration from a start of the agent, from the next decoration, and from a drawn layout's places
+of enemies or kits"""
 _SOLID_WALL_GAP, _WALL_GAP = 80, 40
 """least distance from a wall: behind what is solid there is a way 64 units wide"""
+_SOLID_RADIUS = 32
 _TRIES = 20
 """places that are tried for one decoration"""
 
 
-def draw_look(scenario: Scenario, content: Content, room: UdmfMap, number: int) -> Content:
-    """Gives the default task's map another look.
+T = TypeVar("T")
+
+
+@cache
+def pool(members: tuple[T, ...], split: str, strength: float) -> tuple[T, ...]:
+    """Those of a pool that a split may have, and of them this share, at least one, the same for all maps."""
+    if split != VARIED:
+        others = frozenset[object]().union(*(held for name, held in HELD_OUT.items() if name != split))
+        own = HELD_OUT.get(split)
+        members = tuple(one for one in members if (one not in others if own is None else one in own))
+    order = sorted(range(len(members)), key=lambda n: random.Random(f"{members[n]}").random())
+    chosen = set(order[: math.ceil(strength * len(members))])
+    return tuple(one for n, one in enumerate(members) if n in chosen)
+
+
+def drawn_from(scenario: Scenario, maps: MapSet, number: int, part: str) -> random.Random:
+    """What draws a part of a map: parts are apart, so that a change of one leaves the others as they were."""
+    stem = scenario.id if maps.split == VARIED else f"procedural/{scenario.id}"
+    return random.Random(f"{stem}/{number}/{part}")
+
+
+def draw_look(
+    scenario: Scenario, content: Content, room: UdmfMap, maps: MapSet, number: int, layout: Layout | None = None
+) -> Content:
+    """Gives a map of the default task another look.
 
     Args:
         scenario: whose default task it is; it has a variety.
         content: of that task.
         room: its map; changed in place, before the content's things are added.
+        maps: the set with the map.
         number: of the map.
+        layout: of the map, if it has one of its own.
 
     Returns:
         The content with other looks of enemies or kits.
     """
     variety = scenario.variety
     assert variety is not None, "checked where the task was made"
-    surfaces, light, decorations, entities = (  # apart, so that a change of one part leaves the others as they were
-        random.Random(f"{scenario.id}/{number}/{part}") for part in ("surfaces", "light", "decorations", "entities")
-    )
-    _draw_surfaces(surfaces, room)
-    _draw_light(light, room)
-    starts = [(t.x, t.y) for t in content.things.get(content.base_wad or "", ())]
-    _draw_decorations(decorations, variety, room, starts)
-    return _draw_entities(entities, variety, content)
+
+    rngs = (drawn_from(scenario, maps, number, part) for part in ("surfaces", "light", "decorations", "entities"))
+    surfaces, light, decorations, entities = rngs
+    if strength := maps.strength("textures"):
+        _draw_surfaces(surfaces, room, *(pool(names, maps.split, strength) for names in (WALLS, FLATS)))
+    if strength := maps.strength("lights"):
+        _draw_light(light, room, strength)
+    if strength := maps.strength("decorations"):
+        starts = [(t.x, t.y) for t in content.things.get(content.base_wad or "", ())]
+        kinds = pool((*SOLID, *LOOSE), maps.split, strength)
+        _draw_decorations(decorations, variety, room, starts, kinds, round(strength * variety.max_decorations), layout)
+    return _draw_entities(entities, variety, content, maps)
 
 
-def _draw_surfaces(rng: random.Random, room: UdmfMap) -> None:
-    walls = [_texture(rng, WALLS, FLATS) for _ in range(rng.choice((1, 1, 2, 3)))]
-    floor, ceiling = _texture(rng, FLATS, WALLS), _texture(rng, FLATS, WALLS)
+def _draw_surfaces(rng: random.Random, room: UdmfMap, wall_pool: Sequence[str], flat_pool: Sequence[str]) -> None:
+    walls = [_texture(rng, wall_pool, flat_pool) for _ in range(rng.choice((1, 1, 2, 3)))]
+    floor, ceiling = _texture(rng, flat_pool, wall_pool), _texture(rng, flat_pool, wall_pool)
     wall_size, plane_size = (rng.choice((1.0, 1.0, 2.0)) for _ in range(2))
     for side in room.sidedefs:
         if "texturemiddle" in side:
@@ -152,20 +225,29 @@ def _draw_surfaces(rng: random.Random, room: UdmfMap) -> None:
             sector[name] = 1 / plane_size
 
 
-def _texture(rng: random.Random, usual: tuple[str, ...], other: tuple[str, ...]) -> str:
+def _texture(rng: random.Random, usual: Sequence[str], other: Sequence[str]) -> str:
     return rng.choice(other if rng.random() < 0.25 else usual)
 
 
-def _draw_light(rng: random.Random, room: UdmfMap) -> None:
+def _draw_light(rng: random.Random, room: UdmfMap, strength: float) -> None:
     level, colour = rng.randint(*LIGHT), 0xFFFFFF
     if rng.random() < 0.5:
-        red, green, blue = (rng.randint(*TINGE) for _ in range(3))
+        red, green, blue = (round(255 + strength * (rng.randint(*TINGE) - 255)) for _ in range(3))
         colour = red << 16 | green << 8 | blue
     for sector in room.sectors:
-        sector["lightlevel"], sector["lightcolor"] = level, colour
+        default = int(sector["lightlevel"])
+        sector["lightlevel"], sector["lightcolor"] = round(default + strength * (level - default)), colour
 
 
-def _draw_decorations(rng: random.Random, variety: Variety, room: UdmfMap, starts: list[tuple[float, float]]) -> None:
+def _draw_decorations(
+    rng: random.Random,
+    variety: Variety,
+    room: UdmfMap,
+    starts: Iterable[tuple[float, float]],
+    pool: Sequence[int],
+    most: int,
+    layout: Layout | None,
+) -> None:
     """Adds decorations; those for which no place is found are left out.
 
     Args:
@@ -173,12 +255,19 @@ def _draw_decorations(rng: random.Random, variety: Variety, room: UdmfMap, start
         variety: of the scenario.
         room: the map with its own things.
         starts: places of the agent that the content adds.
+        pool: kinds of decorations.
+        most: decorations of the map.
+        layout: of the map, if it has one of its own.
     """
-    starts = [*starts, *((float(thing["x"]), float(thing["y"])) for thing in room.things)]
-    places = open_places(*_walls(room))
-    kinds = [rng.choice((*SOLID, *LOOSE)) for _ in range(rng.randint(1, 4))]
+    if layout is None:
+        starts = [*starts, *((float(thing["x"]), float(thing["y"])) for thing in room.things)]
+        places, keep_clear, others = open_places(*_walls(room)), variety.keep_clear, ()
+    else:
+        starts, others = layout.starts, layout.places
+        places, keep_clear = Floor(room).places(starts[0]), layout.keep_clear
+    kinds = [rng.choice(pool) for _ in range(rng.randint(1, 4))]
     taken: list[tuple[float, float]] = []
-    for _ in range(rng.randint(0, variety.max_decorations)):
+    for _ in range(rng.randint(0, most)):
         kind = rng.choice(kinds)
         wall_gap = _SOLID_WALL_GAP if variety.solid and kind in SOLID else _WALL_GAP
         for _ in range(_TRIES):
@@ -188,12 +277,18 @@ def _draw_decorations(rng: random.Random, variety: Variety, room: UdmfMap, start
                 to_wall >= wall_gap + _GRID  # as far as it may have been moved, and more
                 and all(math.dist((x, y), place) >= _START_GAP for place in starts)
                 and all(math.dist((x, y), place) >= _GAP for place in taken)
-                and not (variety.keep_clear is not None and variety.keep_clear(x, y))
+                and all(math.dist((x, y), place) >= _PLACE_GAP for place in others)
+                and not (keep_clear is not None and keep_clear(x, y))
             ):
                 taken.append((x, y))
                 number = kind if variety.solid or kind in LOOSE else _PASSABLE + kind
                 room.things.append(make_thing(number, x, y, angle=rng.randrange(0, 360, 45)))
                 break
+
+
+def solid_places(room: UdmfMap) -> list[tuple[tuple[float, float], float]]:
+    """(Place, radius) of a map's solid decorations, with the largest radius of one."""
+    return [((float(t["x"]), float(t["y"])), _SOLID_RADIUS) for t in room.things if t["type"] in SOLID]
 
 
 Corner = tuple[float, float]
@@ -229,19 +324,23 @@ def open_places(
     return tuple(zip(x[inside].tolist(), y[inside].tolist(), distance[inside].tolist(), strict=True))
 
 
-def _draw_entities(rng: random.Random, variety: Variety, content: Content) -> Content:
-    """The content with other looks of enemies or kits, and with all classes that some map of the file needs."""
+def _draw_entities(rng: random.Random, variety: Variety, content: Content, maps: MapSet) -> Content:
+    """The content with other looks of enemies or kits, and with all classes that some map of the set needs."""
+    strength = maps.strength("entities")
     entity: dict[str, Value] = {}
-    if rng.random() < 0.5:
-        entity["ScaleX"] = entity["ScaleY"] = rng.uniform(*SCALE)
+    if rng.random() < 0.5 * strength:
+        entity["ScaleX"] = entity["ScaleY"] = 1 + strength * (rng.uniform(*SCALE) - 1)
     style = rng.choice((*STYLES, None, None, None))
+    if strength < 1 and rng.random() >= strength:
+        style = None
     if style == "STYLE_Translucent":
-        entity |= {"RenderStyle": style, "Alpha": rng.uniform(*ALPHA)}
+        entity |= {"RenderStyle": style, "Alpha": 1 + strength * (rng.uniform(*ALPHA) - 1)}
     elif style == "STYLE_Stencil":
-        entity |= {"RenderStyle": style, "StencilColor": rng.choice(SILHOUETTES)}
+        entity |= {"RenderStyle": style, "StencilColor": rng.choice(pool(SILHOUETTES, maps.split, strength))}
     names = {name: name for name in variety.entities}
-    if rng.random() < 0.5:
-        names = {name: _tinted(name, rng.randrange(len(TINTS))) for name in variety.entities}
+    if rng.random() < 0.5 * strength:
+        tints = pool(TINTS, maps.split, strength)
+        names = {name: _tinted(name, TINTS.index(rng.choice(tints))) for name in variety.entities}
     parameters = {name: _renamed(content.parameters[name], names) for name in variety.entity_parameters}
     actors = {
         _tinted(name, tint): f"ACTOR {_tinted(name, tint)} : {name}\n{{\n"

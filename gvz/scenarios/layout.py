@@ -1,0 +1,298 @@
+"""Layouts: the geometry of a drawn map, the rooms and pillars that scenarios draw, and the check that it can be played.
+
+A layout is one sector. Its walls are lines that are open on their right. A map is checked where the engine's data are
+made, from the lines and solid things alone, so a mistake of what drew them is found.
+"""
+
+import math
+import random
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from gvz.wad.udmf import NO_REFERENCE, Block, UdmfMap, make_thing
+
+Place = tuple[float, float]
+"""map units"""
+Segment = tuple[Place, Place]
+Box = tuple[int, int, int, int]
+"""x and y of the south-western corner, then of the north-eastern one, tiles"""
+
+MAP_SPOT = 9001
+"""editor number of a place that scripts find by its tid"""
+FIRST_SPOT, FIRST_PLACE = 10, 100
+"""tids of the first start, and of the first place where enemies or kits appear; the others follow"""
+NUM_PLACES = 64
+"""places where enemies or kits appear in a map of rooms"""
+TILE = 64
+"""map units; rooms and corridors are made of tiles"""
+_UNIT = 8
+"""map units that a pixel of a Floor is wide"""
+WAY = 96
+"""least gap between pillars, and between a pillar and a wall: the agent is 32 wide, enemies at most 60"""
+_TRIES = 20
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Layout:
+    """The geometry of a map, and the parameters of the scenario's script that go with it."""
+
+    walls: tuple[Segment, ...]
+    """each open on its right, seen from its first end"""
+    barriers: tuple[Segment, ...] = ()
+    """lines that only missiles cross"""
+    starts: tuple[Place, ...]
+    """where the agent may start. If there are several, each is a map spot, tids from FIRST_SPOT"""
+    height: int
+    """of the ceiling"""
+    parameters: Mapping[str, int | float | tuple[float, ...]] = field(default_factory=dict)
+    places: tuple[Place, ...] = ()
+    """where enemies or kits appear; all must be in reach of the starts"""
+    marked: bool = False
+    """whether the script finds the places as map spots, tids from FIRST_PLACE"""
+    radius: float = 16.0
+    """of who must reach them"""
+    keep_clear: Callable[[float, float], bool] | None = None
+    """as that of Variety, for this layout"""
+
+    def build(self, base: UdmfMap) -> UdmfMap:
+        """The map: walls, one sector like the first of the base map, and the starts."""
+        room = UdmfMap(base.namespace, sectors=[{**base.sectors[0], "heightceiling": self.height}])
+        numbers: dict[Place, int] = {}
+        for ends, is_wall in [(s, True) for s in self.walls] + [(s, False) for s in self.barriers]:
+            v1, v2 = (numbers.setdefault(end, len(numbers)) for end in ends)
+            line: Block = {"v1": v1, "v2": v2, "sidefront": len(room.sidedefs), "blocking": True}
+            room.sidedefs.append({"sector": 0, "texturemiddle": "-"} if is_wall else {"sector": 0})
+            if not is_wall:
+                line |= {"sideback": len(room.sidedefs), "twosided": True}
+                room.sidedefs.append({"sector": 0})
+            room.linedefs.append(line)
+        room.vertices = [{"x": float(x), "y": float(y)} for x, y in numbers]
+        room.things.append(make_thing(1, *self.starts[0]))
+        if len(self.starts) > 1:
+            room.things += [make_thing(MAP_SPOT, x, y, tid=tid) for tid, (x, y) in enumerate(self.starts, FIRST_SPOT)]
+        if self.marked:
+            room.things += [make_thing(MAP_SPOT, x, y, tid=tid) for tid, (x, y) in enumerate(self.places, FIRST_PLACE)]
+        return room
+
+    def problem(self, floor: "Floor") -> str | None:
+        """Why a map of this layout cannot be played; None if it can."""
+        radius = self.radius + _UNIT  # a place is known to a pixel
+        reached = floor.reached(self.starts[0], radius)
+        for name, places in (("start", self.starts), ("place", self.places)):
+            for place in places:
+                if floor.to_wall[floor.pixel(*place)] < radius:
+                    return f"the {name} {place} is in a wall"
+                if not reached[floor.pixel(*place)]:
+                    return f"the {name} {place} is out of reach of the start {self.starts[0]}"
+        return None
+
+
+class Floor:
+    """A raster of a map: how far each pixel is from the next wall or solid thing. Open lines are left out.
+
+    Attributes:
+        to_wall: f32[H, W], map units, exact to a pixel of 8 map units; rows from south to north.
+    """
+
+    def __init__(self, room: UdmfMap, solids: Iterable[tuple[Place, float]] = ()):
+        """`solids` are (place, radius) of things that stop the agent."""
+        corners = np.array([(vertex["x"], vertex["y"]) for vertex in room.vertices], float)
+        self._low = corners.min(axis=0) - 2 * _UNIT
+        pixels = np.rint((corners - self._low) / _UNIT).astype(np.int32)
+        width, height = pixels.max(axis=0) + 3
+        free = np.ones((height, width), np.uint8)
+        lines = [line for line in room.linedefs if line.get("sideback", NO_REFERENCE) == NO_REFERENCE]
+        cv2.polylines(free, [pixels[[line["v1"], line["v2"]]] for line in lines], False, 0)  # pyright: ignore
+        for (x, y), radius in solids:
+            row, column = self.pixel(x, y)
+            cv2.circle(free, (column, row), round(radius / _UNIT), 0, -1)
+        self.to_wall = cv2.distanceTransform(free, cv2.DIST_L2, 5) * _UNIT
+
+    def pixel(self, x: float, y: float) -> tuple[int, int]:
+        """(row, column) of a place."""
+        return round((y - self._low[1]) / _UNIT), round((x - self._low[0]) / _UNIT)
+
+    def reached(self, start: Place, radius: float) -> np.ndarray:
+        """bool[H, W]: where the middle of somebody of this radius can go from a start."""
+        _, parts = cv2.connectedComponents((self.to_wall >= radius).astype(np.uint8), connectivity=4)
+        part = parts[self.pixel(*start)]
+        return (parts == part) & (part > 0)
+
+    def places(self, start: Place) -> np.ndarray:
+        """f64[N, 3]: (x, y, distance to the next wall) of a grid of 16 map units, in the part with the start."""
+        rows, columns = np.nonzero(self.reached(start, _UNIT)[::2, ::2])
+        x, y = 2 * columns * _UNIT + self._low[0], 2 * rows * _UNIT + self._low[1]
+        return np.stack([x, y, self.to_wall[2 * rows, 2 * columns]], axis=1)
+
+
+# --------------------------------------------------------------------------------------------------- what layouts draw
+
+
+def vary(rng: random.Random, strength: float, default: float, low: float, high: float) -> float:
+    """A uniform draw of a range that lies round a default value and grows with the strength; 1 gives all of it."""
+    return rng.uniform(default + strength * (low - default), default + strength * (high - default))
+
+
+def ring(corners: Sequence[Place], *, solid: bool = False) -> tuple[Segment, ...]:
+    """The walls round a room whose corners are given clockwise, or with `solid` round a pillar."""
+    ends = [(round(x), round(y)) for x, y in (reversed(corners) if solid else corners)]
+    return tuple(zip(ends, ends[1:] + ends[:1], strict=True))
+
+
+def draw_pillar(rng: random.Random, middle: Place, radius: float) -> tuple[Segment, ...]:
+    """The walls of a regular pillar with 3 to 8 corners."""
+    num_corners, turn = rng.choice((3, 4, 4, 6, 8)), rng.random()
+    angles = [2 * math.pi * (turn - n / num_corners) for n in range(num_corners)]
+    x, y = middle
+    return ring([(x + radius * math.cos(a), y + radius * math.sin(a)) for a in angles], solid=True)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Rooms:
+    """Rooms and corridors in tiles, (x1, y1, x2, y2) each. All are connected."""
+
+    size: int
+    """tiles of the map's side"""
+    rooms: tuple[Box, ...]
+    corridors: tuple[Box, ...]
+
+    def walls(self) -> tuple[Segment, ...]:
+        """The edge of the tiles that belong to a room or corridor."""
+        grid = np.zeros((self.size + 2, self.size + 2), np.int8)  # [y, x], a tile of rock around
+        for x1, y1, x2, y2 in (*self.rooms, *self.corridors):
+            grid[y1 + 1 : y2 + 1, x1 + 1 : x2 + 1] = 1
+        found = []
+        for turned, tiles in ((False, grid), (True, grid.T)):  # walls along y, then along x
+            steps = np.diff(tiles, axis=1).T  # [edge, tile] 1: the tile of the higher coordinate is open
+            for kind in (1, -1):
+                ends = np.diff((steps == kind).astype(np.int8), axis=1)  # 1 before the first tile of a wall
+                lows, highs = (np.argwhere(ends == sign).tolist() for sign in (1, -1))
+                for (edge, low), (_, high) in zip(lows, highs, strict=True):
+                    one, other = (edge * TILE, low * TILE), (edge * TILE, high * TILE)
+                    if turned:
+                        one, other = one[::-1], other[::-1]
+                    found.append((one, other) if (kind == 1) != turned else (other, one))
+        return tuple(found)
+
+
+def draw_rooms(
+    rng: random.Random, *, size: int, across: int, shrink: float, loops: float, corridor: tuple[int, int]
+) -> Rooms:
+    """Draws a room in each cell of a square grid, and corridors along a spanning tree and to more neighbours.
+
+    Args:
+        rng: what draws.
+        size: tiles of the map's side.
+        across: cells of a side.
+        shrink: 0: rooms fill their cells; up to 1: each side of a room is cut by up to this part of what it may lose.
+        loops: probability of a corridor between neighbours that the tree does not join.
+        corridor: least and most width, tiles.
+    """
+    cuts = [round(n * size / across) for n in range(across + 1)]
+    rooms: dict[tuple[int, int], Box] = {}
+    for column in range(across):
+        for row in range(across):
+            spans = []
+            for cell in (column, row):
+                low, high = cuts[cell], cuts[cell + 1] - (cell < across - 1)  # a tile of rock before the next cell
+                length = high - low - round(rng.random() * shrink * (high - low - 3))
+                low += rng.randint(0, high - low - length)
+                spans.append((low, low + length))
+            rooms[column, row] = (spans[0][0], spans[1][0], spans[0][1], spans[1][1])
+    cells = list(rooms)
+    reached, pairs = {rng.choice(cells)}, []
+    while len(reached) < len(cells):  # a random spanning tree
+        edges = [(a, b) for a in cells if a in reached for b in _neighbours(a) if b in rooms and b not in reached]
+        pairs.append(edge := rng.choice(edges))
+        reached.add(edge[1])
+    joined = {frozenset(pair) for pair in pairs}
+    later = [(a, b) for a in cells for b in _neighbours(a)[:2] if b in rooms and frozenset((a, b)) not in joined]
+    pairs += [pair for pair in later if rng.random() < loops]
+    corridors = [box for a, b in pairs for box in _corridor(rng, rooms[a], rooms[b], a[0] == b[0], corridor)]
+    return Rooms(size=size, rooms=tuple(rooms.values()), corridors=tuple(corridors))
+
+
+def _neighbours(cell: tuple[int, int]) -> list[tuple[int, int]]:
+    x, y = cell
+    return [(x + 1, y), (x, y + 1), (x - 1, y), (x, y - 1)]
+
+
+def _corridor(
+    rng: random.Random,
+    one: Box,
+    other: Box,
+    vertical: bool,
+    widths: tuple[int, int],
+) -> list[Box]:
+    """A straight or bent way between neighbours in a row, or with `vertical` in a column."""
+    if vertical:
+        turned = _corridor(rng, _turned(one), _turned(other), False, widths)
+        return [_turned(box) for box in turned]
+    if one[0] > other[0]:
+        one, other = other, one
+    width = rng.randint(*widths)
+    first = rng.randint(one[1], one[3] - width)
+    last = rng.randint(other[1], other[3] - width)
+    if rng.random() < 0.5 or abs(first - last) < width:  # straight, if the rooms lie so
+        low, high = max(one[1], other[1]), min(one[3], other[3]) - width
+        if low <= high:
+            first = last = rng.randint(low, high)
+    west, east = one[2], other[0]
+    if first == last:
+        return [(west, first, east, first + width)]
+    if east - west < width:  # no room for a bend: it begins inside the rooms
+        west, east = west - width, east + width
+    bend = rng.randint(west, east - width)
+    low, high = min(first, last), max(first, last) + width
+    return [
+        (west, first, bend + width, first + width),
+        (bend, low, bend + width, high),
+        (bend, last, east, last + width),
+    ]
+
+
+def _turned(box: Box) -> Box:
+    return box[1], box[0], box[3], box[2]
+
+
+def draw_pillars(
+    rng: random.Random, rooms: Rooms, most: int, width: tuple[float, float]
+) -> tuple[tuple[Place, float], ...]:
+    """(Middle, radius) of at most so many pillars in rooms; a way is left round each of them."""
+    taken: list[tuple[Place, float]] = []
+    for _ in range(rng.randint(0, most)):
+        for _ in range(_TRIES):
+            x1, y1, x2, y2 = (TILE * edge for edge in rng.choice(rooms.rooms))
+            radius = rng.uniform(*width) / 2
+            gap = radius + WAY
+            if min(x2 - x1, y2 - y1) > 2 * gap:
+                place = rng.uniform(x1 + gap, x2 - gap), rng.uniform(y1 + gap, y2 - gap)
+                if all(math.dist(place, other) >= gap + other_radius for other, other_radius in taken):
+                    taken.append((place, radius))
+                    break
+    return tuple(taken)
+
+
+def draw_places(
+    rng: random.Random, rooms: Rooms, pillars: tuple[tuple[Place, float], ...], num_starts: int
+) -> tuple[tuple[Place, ...], tuple[Place, ...]]:
+    """(Starts, the NUM_PLACES others): middles of tiles in rooms, none next to a pillar; starts off walls first."""
+    tiles = {(x, y) for x1, y1, x2, y2 in rooms.rooms for x in range(x1, x2) for y in range(y1, y2)}
+    free = [
+        (x, y)
+        for x, y in sorted(tiles)
+        if all(math.dist(_middle(x, y), place) >= radius + 40 for place, radius in pillars)
+    ]
+    rng.shuffle(free)
+    free.sort(key=lambda tile: not {(tile[0] + dx, tile[1] + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)} <= tiles)
+    starts, others = free[:num_starts], free[num_starts:]
+    rng.shuffle(others)
+    middles = [_middle(x, y) for x, y in (*starts, *(others * NUM_PLACES)[:NUM_PLACES])]
+    return tuple(middles[: len(starts)]), tuple(middles[len(starts) :])
+
+
+def _middle(x: int, y: int) -> Place:
+    return TILE * (x + 0.5), TILE * (y + 0.5)
