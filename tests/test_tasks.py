@@ -243,6 +243,7 @@ def test_the_main_job_trains_on_default_gore_stone_wall_and_fast_enemies():
         ("seek_and_kill/procedural-test-2000000", "procedural-test-2000000: want 1 to 1000000 maps"),
         ("seek_and_kill/procedural-test-20-3", "want 'procedural-<split>-<number of maps>'"),
         ("seek_and_kill/procedural+layout=1.5", r"got layout=1.5, want a strength from 0 .* to 1"),
+        ("seek_and_kill/procedural+layout=0.1234", "got layout=0.1234, want .* with at most three decimals"),
         ("seek_and_kill/procedural+layout=nan", "got 'layout=nan' in .*strengths from 0 to 1"),
         ("seek_and_kill/procedural+gore", "got 'gore' in 'procedural[+]gore', want each at most once: '<part>="),
         ("seek_and_kill/procedural+layout=1+layout=0", "got 'layout=0' in .* at most once"),

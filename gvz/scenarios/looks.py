@@ -154,9 +154,9 @@ of enemies or kits"""
 _SOLID_WALL_GAP, _WALL_GAP = 80, 40
 """least distance from a wall: behind what is solid there is a way 64 units wide"""
 _SOLID_RADIUS = 32
+"""largest of SOLID, map units"""
 _TRIES = 20
 """places that are tried for one decoration"""
-
 
 T = TypeVar("T")
 
@@ -197,7 +197,6 @@ def draw_look(
     """
     variety = scenario.variety
     assert variety is not None, "checked where the task was made"
-
     rngs = (drawn_from(scenario, maps, number, part) for part in ("surfaces", "light", "decorations", "entities"))
     surfaces, light, decorations, entities = rngs
     if strength := maps.strength("textures"):

@@ -52,9 +52,10 @@ class MapSet:
                 raise TaskError(
                     f"{self._stem}: unknown part {part!r}{nearest(part, PARTS)}; want one of {', '.join(PARTS)}"
                 )
-            if not 0 <= strength <= 1:
+            if not 0 <= strength <= 1 or round(strength, 3) != strength:  # the name gives three decimals back
                 raise TaskError(
-                    f"{self._stem}: got {part}={strength:g}, want a strength from 0 (as in the default task) to 1"
+                    f"{self._stem}: got {part}={strength:g}, want a strength from 0 (as in the default task) to 1, "
+                    "with at most three decimals"
                 )
         given = {"layout": 0.0} if self.split == VARIED else dict(self.strengths)
         kept = tuple((part, float(given[part])) for part in PARTS if given.get(part, 1) != 1)
@@ -106,10 +107,9 @@ def parse_map_set(name: str) -> MapSet:
     """
     stem, *settings = name.split("+")
     kind, *words = stem.split("-")
+    split = VARIED if kind == VARIED else "train"
     if kind == PROCEDURAL and words and words[0]:
         split = words.pop(0)
-    else:
-        split = VARIED if kind == VARIED else "train"
     if (split == VARIED) != (kind == VARIED):
         raise _unknown_split(split)
     if len(words) > 1 or not all(re.fullmatch("[1-9][0-9]{0,9}", word) for word in words):
@@ -122,10 +122,10 @@ def parse_map_set(name: str) -> MapSet:
     strengths: dict[str, float] = {}
     for setting in settings:
         part, _, value = setting.partition("=")
-        if not re.fullmatch(r"[0-9]+(\.[0-9]{1,3})?", value) or part in strengths:
+        if not re.fullmatch(r"[0-9]+(\.[0-9]+)?", value) or part in strengths:
             raise TaskError(
                 f"got {setting!r} in {name!r}, want each at most once: '<part>=<strength>', parts {', '.join(PARTS)}, "
-                "strengths from 0 to 1 with at most three decimals, as 'layout=0.5'"
+                "strengths from 0 to 1, as 'layout=0.5'"
             )
         strengths[part] = float(value)
     return MapSet(split, int(words[0]) if words else 0, tuple(strengths.items()))  # pyright: ignore[reportArgumentType]
