@@ -209,9 +209,13 @@ def _draw_of_set(task: Task, maps: MapSet, content: Content, number: int) -> tup
         layout = scenario.variety.draw_layout(looks.drawn_from(scenario, maps, number, "layout"), strength)
         content = content.overlaid(Content(things={content.base_wad or "": ()}, parameters=layout.parameters))
     drawn = _draw(task, content, layout)
-    content = looks.draw_look(scenario, content, drawn, maps, number, layout)
-    if layout is not None and (problem := layout.problem(Floor(drawn, looks.solid_places(drawn)))) is not None:
-        raise TaskError(f"{task.id}, map {number}: {problem}; this is a mistake of the scenario's draw_layout")
+    floor = None if layout is None else Floor(drawn)
+    content = looks.draw_look(scenario, content, drawn, maps, number, layout, floor)
+    if layout is not None and floor is not None:
+        solids = looks.solid_places(drawn)
+        problem = layout.problem(Floor(drawn, solids) if solids else floor)
+        if problem is not None:
+            raise TaskError(f"{task.id}, map {number}: {problem}; this is a mistake of the scenario's draw_layout")
     return content, drawn
 
 

@@ -4,6 +4,7 @@ A layout is one sector. Its walls are lines that are open on their right. A map 
 made, from the lines and solid things alone, so a mistake of what drew them is found.
 """
 
+import itertools
 import math
 import random
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -77,13 +78,17 @@ class Layout:
             room.things += [make_thing(MAP_SPOT, x, y, tid=tid) for tid, (x, y) in enumerate(self.places, FIRST_PLACE)]
         return room
 
+    @property
+    def clearance(self) -> float:
+        """Least distance to walls, on a Floor, of places that can be reached: a place is known to a pixel."""
+        return self.radius + _UNIT
+
     def problem(self, floor: "Floor") -> str | None:
         """Why a map of this layout cannot be played; None if it can."""
-        radius = self.radius + _UNIT  # a place is known to a pixel
-        reached = floor.reached(self.starts[0], radius)
+        reached = floor.reached(self.starts[0], self.clearance)
         for name, places in (("start", self.starts), ("place", self.places)):
             for place in places:
-                if floor.to_wall[floor.pixel(*place)] < radius:
+                if floor.to_wall[floor.pixel(*place)] < self.clearance:
                     return f"the {name} {place} is in a wall"
                 if not reached[floor.pixel(*place)]:
                     return f"the {name} {place} is out of reach of the start {self.starts[0]}"
@@ -110,6 +115,7 @@ class Floor:
             row, column = self.pixel(x, y)
             cv2.circle(free, (column, row), round(radius / _UNIT), 0, -1)
         self.to_wall = cv2.distanceTransform(free, cv2.DIST_L2, 5) * _UNIT
+        self._reached: dict[tuple[Place, float], np.ndarray] = {}
 
     def pixel(self, x: float, y: float) -> tuple[int, int]:
         """(row, column) of a place."""
@@ -117,13 +123,15 @@ class Floor:
 
     def reached(self, start: Place, radius: float) -> np.ndarray:
         """bool[H, W]: where the middle of somebody of this radius can go from a start."""
-        _, parts = cv2.connectedComponents((self.to_wall >= radius).astype(np.uint8), connectivity=4)
-        part = parts[self.pixel(*start)]
-        return (parts == part) & (part > 0)
+        if (start, radius) not in self._reached:
+            _, parts = cv2.connectedComponents((self.to_wall >= radius).astype(np.uint8), connectivity=4)
+            part = parts[self.pixel(*start)]
+            self._reached[start, radius] = (parts == part) & (part > 0)
+        return self._reached[start, radius]
 
-    def places(self, start: Place) -> np.ndarray:
-        """f64[N, 3]: (x, y, distance to the next wall) of a grid of 16 map units, in the part with the start."""
-        rows, columns = np.nonzero(self.reached(start, _UNIT)[::2, ::2])
+    def places(self, start: Place, radius: float) -> np.ndarray:
+        """f64[N, 3]: (x, y, distance to the next wall) of the reached places of a grid of 16 map units."""
+        rows, columns = np.nonzero(self.reached(start, radius)[::2, ::2])
         x, y = 2 * columns * _UNIT + self._low[0], 2 * rows * _UNIT + self._low[1]
         return np.stack([x, y, self.to_wall[2 * rows, 2 * columns]], axis=1)
 
@@ -281,17 +289,20 @@ def draw_places(
 ) -> tuple[tuple[Place, ...], tuple[Place, ...]]:
     """(Starts, the NUM_PLACES others): middles of tiles in rooms, none next to a pillar; starts off walls first."""
     tiles = {(x, y) for x1, y1, x2, y2 in rooms.rooms for x in range(x1, x2) for y in range(y1, y2)}
-    free = [
-        (x, y)
-        for x, y in sorted(tiles)
-        if all(math.dist(_middle(x, y), place) >= radius + 40 for place, radius in pillars)
-    ]
-    rng.shuffle(free)
-    free.sort(key=lambda tile: not {(tile[0] + dx, tile[1] + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)} <= tiles)
-    starts, others = free[:num_starts], free[num_starts:]
-    rng.shuffle(others)
-    middles = [_middle(x, y) for x, y in (*starts, *(others * NUM_PLACES)[:NUM_PLACES])]
-    return tuple(middles[: len(starts)]), tuple(middles[len(starts) :])
+    shuffled = rng.sample(sorted(tiles), len(tiles))
+
+    def inner(tile: tuple[int, int]) -> bool:
+        return {(tile[0] + dx, tile[1] + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)} <= tiles
+
+    def free(tile: tuple[int, int]) -> bool:
+        return all(math.dist(_middle(*tile), place) >= radius + 40 for place, radius in pillars)
+
+    first = itertools.chain(filter(inner, shuffled), itertools.filterfalse(inner, shuffled))
+    starts = list(itertools.islice(filter(free, first), num_starts))
+    taken = set(starts)
+    others = list(itertools.islice((tile for tile in shuffled if tile not in taken and free(tile)), NUM_PLACES))
+    places = itertools.islice(itertools.cycle(others), NUM_PLACES)
+    return tuple(itertools.starmap(_middle, starts)), tuple(itertools.starmap(_middle, places))
 
 
 def _middle(x: int, y: int) -> Place:

@@ -180,7 +180,13 @@ def drawn_from(scenario: Scenario, maps: MapSet, number: int, part: str) -> rand
 
 
 def draw_look(
-    scenario: Scenario, content: Content, room: UdmfMap, maps: MapSet, number: int, layout: Layout | None = None
+    scenario: Scenario,
+    content: Content,
+    room: UdmfMap,
+    maps: MapSet,
+    number: int,
+    layout: Layout | None = None,
+    floor: Floor | None = None,
 ) -> Content:
     """Gives a map of the default task another look.
 
@@ -191,6 +197,7 @@ def draw_look(
         maps: the set with the map.
         number: of the map.
         layout: of the map, if it has one of its own.
+        floor: of this layout.
 
     Returns:
         The content with other looks of enemies or kits.
@@ -206,7 +213,8 @@ def draw_look(
     if strength := maps.strength("decorations"):
         starts = [(t.x, t.y) for t in content.things.get(content.base_wad or "", ())]
         kinds = pool((*SOLID, *LOOSE), maps.split, strength)
-        _draw_decorations(decorations, variety, room, starts, kinds, round(strength * variety.max_decorations), layout)
+        most = round(strength * variety.max_decorations)
+        _draw_decorations(decorations, variety, room, starts, kinds, most, layout, floor)
     return _draw_entities(entities, variety, content, maps)
 
 
@@ -246,6 +254,7 @@ def _draw_decorations(
     pool: Sequence[int],
     most: int,
     layout: Layout | None,
+    floor: Floor | None,
 ) -> None:
     """Adds decorations; those for which no place is found are left out.
 
@@ -257,13 +266,14 @@ def _draw_decorations(
         pool: kinds of decorations.
         most: decorations of the map.
         layout: of the map, if it has one of its own.
+        floor: of this layout.
     """
-    if layout is None:
+    if layout is None or floor is None:
         starts = [*starts, *((float(thing["x"]), float(thing["y"])) for thing in room.things)]
         places, keep_clear, others = open_places(*_walls(room)), variety.keep_clear, ()
     else:
         starts, others = layout.starts, layout.places
-        places, keep_clear = Floor(room).places(starts[0]), layout.keep_clear
+        places, keep_clear = floor.places(starts[0], layout.clearance), layout.keep_clear
     kinds = [rng.choice(pool) for _ in range(rng.randint(1, 4))]
     taken: list[tuple[float, float]] = []
     for _ in range(rng.randint(0, most)):

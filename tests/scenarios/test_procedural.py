@@ -281,10 +281,10 @@ def test_the_first_maps_are_those_that_runs_were_trained_on():
         one.id: [map_source(Task(one, maps=TRAIN), "thesis", FIRST + n).map_magic for n in (0, 1)] for one in SCENARIOS
     }
     assert found == {
-        "defend_the_center": [1636902147, 1566957425],
-        "dodge_projectiles": [1062853004, 2047865654],
-        "health_gathering": [1642263598, 1331136483],
-        "seek_and_kill": [130871494, 1641493254],
+        "defend_the_center": [608885887, 1853042810],
+        "dodge_projectiles": [1650083044, 2047865654],
+        "health_gathering": [2019063825, 551424503],
+        "seek_and_kill": [403963209, 1838909277],
     }
 
 
