@@ -20,7 +20,8 @@ from gvz.core.env_config import Profile
 from gvz.core.errors import ResourceError, TaskError, WadError, nearest
 from gvz.scenarios import looks
 from gvz.scenarios.base import Content, Task, Thing, Uniform, Value
-from gvz.scenarios.layout import Floor, Layout
+from gvz.scenarios.floor import Floor
+from gvz.scenarios.layout import Layout
 from gvz.scenarios.map_set import MapSet
 from gvz.wad.acs import compile_acs
 from gvz.wad.decorate import declared_actors, declared_numbers, used_sprites

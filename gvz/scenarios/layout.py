@@ -1,19 +1,20 @@
-"""Layouts: the geometry of a drawn map, the rooms and pillars that scenarios draw, and the check that it can be played.
+"""Layouts: the geometry of a drawn map, and the rooms and pillars that scenarios draw.
 
-A layout is one sector. Its walls are lines that are open on their right. A map is checked where the engine's data are
-made, from the lines and solid things alone, so a mistake of what drew them is found.
+A layout is one sector. Its walls are lines that are open on their right. Loads no numpy: scenarios import it, and a
+help text names them.
 """
 
 import itertools
 import math
 import random
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-import cv2
-import numpy as np
+from gvz.wad.udmf import Block, UdmfMap, make_thing
 
-from gvz.wad.udmf import NO_REFERENCE, Block, UdmfMap, make_thing
+if TYPE_CHECKING:
+    from gvz.scenarios.floor import Floor
 
 Place = tuple[float, float]
 """map units"""
@@ -29,7 +30,7 @@ NUM_PLACES = 64
 """places where enemies or kits appear in a map of rooms"""
 TILE = 64
 """map units; rooms and corridors are made of tiles"""
-_UNIT = 8
+FLOOR_UNIT = 8
 """map units that a pixel of a Floor is wide"""
 WAY = 96
 """least gap between pillars, and between a pillar and a wall: the agent is 32 wide, enemies at most 60"""
@@ -81,7 +82,7 @@ class Layout:
     @property
     def clearance(self) -> float:
         """Least distance to walls, on a Floor, of places that can be reached: a place is known to a pixel."""
-        return self.radius + _UNIT
+        return self.radius + FLOOR_UNIT
 
     def problem(self, floor: "Floor") -> str | None:
         """Why a map of this layout cannot be played; None if it can."""
@@ -93,47 +94,6 @@ class Layout:
                 if not reached[floor.pixel(*place)]:
                     return f"the {name} {place} is out of reach of the start {self.starts[0]}"
         return None
-
-
-class Floor:
-    """A raster of a map: how far each pixel is from the next wall or solid thing. Open lines are left out.
-
-    Attributes:
-        to_wall: f32[H, W], map units, exact to a pixel of 8 map units; rows from south to north.
-    """
-
-    def __init__(self, room: UdmfMap, solids: Iterable[tuple[Place, float]] = ()):
-        """`solids` are (place, radius) of things that stop the agent."""
-        corners = np.array([(vertex["x"], vertex["y"]) for vertex in room.vertices], float)
-        self._low = corners.min(axis=0) - 2 * _UNIT
-        pixels = np.rint((corners - self._low) / _UNIT).astype(np.int32)
-        width, height = pixels.max(axis=0) + 3
-        free = np.ones((height, width), np.uint8)
-        lines = [line for line in room.linedefs if line.get("sideback", NO_REFERENCE) == NO_REFERENCE]
-        cv2.polylines(free, [pixels[[line["v1"], line["v2"]]] for line in lines], False, 0)  # pyright: ignore
-        for (x, y), radius in solids:
-            row, column = self.pixel(x, y)
-            cv2.circle(free, (column, row), round(radius / _UNIT), 0, -1)
-        self.to_wall = cv2.distanceTransform(free, cv2.DIST_L2, 5) * _UNIT
-        self._reached: dict[tuple[Place, float], np.ndarray] = {}
-
-    def pixel(self, x: float, y: float) -> tuple[int, int]:
-        """(row, column) of a place."""
-        return round((y - self._low[1]) / _UNIT), round((x - self._low[0]) / _UNIT)
-
-    def reached(self, start: Place, radius: float) -> np.ndarray:
-        """bool[H, W]: where the middle of somebody of this radius can go from a start."""
-        if (start, radius) not in self._reached:
-            _, parts = cv2.connectedComponents((self.to_wall >= radius).astype(np.uint8), connectivity=4)
-            part = parts[self.pixel(*start)]
-            self._reached[start, radius] = (parts == part) & (part > 0)
-        return self._reached[start, radius]
-
-    def places(self, start: Place, radius: float) -> np.ndarray:
-        """f64[N, 3]: (x, y, distance to the next wall) of the reached places of a grid of 16 map units."""
-        rows, columns = np.nonzero(self.reached(start, radius)[::2, ::2])
-        x, y = 2 * columns * _UNIT + self._low[0], 2 * rows * _UNIT + self._low[1]
-        return np.stack([x, y, self.to_wall[2 * rows, 2 * columns]], axis=1)
 
 
 # --------------------------------------------------------------------------------------------------- what layouts draw
@@ -169,20 +129,20 @@ class Rooms:
 
     def walls(self) -> tuple[Segment, ...]:
         """The edge of the tiles that belong to a room or corridor."""
-        grid = np.zeros((self.size + 2, self.size + 2), np.int8)  # [y, x], a tile of rock around
-        for x1, y1, x2, y2 in (*self.rooms, *self.corridors):
-            grid[y1 + 1 : y2 + 1, x1 + 1 : x2 + 1] = 1
+        tiles = {
+            (x, y) for x1, y1, x2, y2 in (*self.rooms, *self.corridors) for x in range(x1, x2) for y in range(y1, y2)
+        }
         found = []
-        for turned, tiles in ((False, grid), (True, grid.T)):  # walls along y, then along x
-            steps = np.diff(tiles, axis=1).T  # [edge, tile] 1: the tile of the higher coordinate is open
-            for kind in (1, -1):
-                ends = np.diff((steps == kind).astype(np.int8), axis=1)  # 1 before the first tile of a wall
-                lows, highs = (np.argwhere(ends == sign).tolist() for sign in (1, -1))
-                for (edge, low), (_, high) in zip(lows, highs, strict=True):
-                    one, other = (edge * TILE, low * TILE), (edge * TILE, high * TILE)
-                    if turned:
-                        one, other = one[::-1], other[::-1]
-                    found.append((one, other) if (kind == 1) != turned else (other, one))
+        for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):  # from a tile to rock
+            edges = {(x, y) for x, y in tiles if (x + dx, y + dy) not in tiles}
+            along_x, along_y = abs(dy), abs(dx)
+            for x, y in sorted(edges):
+                if (x - along_x, y - along_y) in edges:
+                    continue  # of a wall that began before
+                length = next(n for n in itertools.count(1) if (x + n * along_x, y + n * along_y) not in edges)
+                low = ((x + (dx > 0)) * TILE, (y + (dy > 0)) * TILE)
+                high = (low[0] + along_x * length * TILE, low[1] + along_y * length * TILE)
+                found.append((low, high) if dx < 0 or dy > 0 else (high, low))
         return tuple(found)
 
 

@@ -33,7 +33,8 @@ from typing import TypeVar
 import numpy as np
 
 from gvz.scenarios.base import Content, Scenario, Value, Variety, words
-from gvz.scenarios.layout import Floor, Layout
+from gvz.scenarios.floor import Floor
+from gvz.scenarios.layout import Layout
 from gvz.scenarios.map_set import VARIED, MapSet
 from gvz.wad.udmf import NO_REFERENCE, UdmfMap, make_thing
 
