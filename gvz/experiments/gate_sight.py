@@ -18,7 +18,7 @@ EXPERIMENT = Experiment(
         "memory": {"agent.past_actions": 16, "agent.game_variables": True, "agent.hidden_input_share": 0.2},
     },
     scenarios=("defend_the_center", "dodge_projectiles"),
-    trainings=("varied",),
+    trainings=("train8",),
     seeds=(1111, 2222),
     total_updates=60_000,
     max_processor_s=400.0,

@@ -33,15 +33,8 @@ def make_experiment(**changes) -> Experiment:
     return dataclasses.replace(experiments()["quick_comparison"], **changes)
 
 
-def test_the_thesis_s_four_the_quick_one_and_the_gates_are_there():
-    assert set(ALL) == {
-        *THESIS_AVERAGES,
-        "quick_comparison",
-        "gate_reuse",
-        "gate_sight",
-        "gate_world",
-        "procedural_gap",
-    }
+def test_the_thesis_s_four_are_there():
+    assert set(THESIS_AVERAGES) < set(ALL)
 
 
 def test_varied_maps_are_a_training_of_every_scenario():
