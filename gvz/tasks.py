@@ -1,5 +1,6 @@
 """Tasks by name: ids, levels, the named tasks, training and test sets."""
 
+import itertools
 from functools import cache
 from typing import Literal, get_args
 
@@ -86,6 +87,20 @@ def named_tasks(
     return tuple(
         task for task in tasks if level in (None, task.level) and (split != "gate" or task.level == GATE_LEVEL)
     )
+
+
+def attribute_tasks(scenario: str) -> tuple[Task, ...]:
+    """The default task, then one with each attribute alone, then one with each two of different groups.
+
+    Raises:
+        TaskError: an unknown scenario.
+    """
+    one = scenario_named(scenario)
+    names = [attribute.name for attribute in one.attributes]
+    pairs = [
+        (a.name, b.name) for a, b in itertools.combinations(one.attributes, 2) if not set(a.groups) & set(b.groups)
+    ]
+    return tuple(Task(one, attributes) for attributes in ((), *((name,) for name in names), *pairs))
 
 
 def _names(scenario: Scenario, split: TaskSet | None) -> tuple[str, ...]:

@@ -94,6 +94,22 @@ def mean_over_scenarios(*scores: np.ndarray) -> np.ndarray:
     return np.mean(np.stack([mean(one) for one in scores]), axis=0)
 
 
+def attribute_loss(scores: np.ndarray) -> np.ndarray:
+    """What an attribute costs, [..., S, 2] -> [...]: scores on the default task and on the one with the attribute."""
+    default, alone = np.moveaxis(np.mean(scores, axis=-2), -1, 0)
+    return default - alone
+
+
+def attribute_interaction(scores: np.ndarray) -> np.ndarray:
+    """What two attributes cost together beyond the sum of what each costs alone, [..., S, 4] -> [...].
+
+    Args:
+        scores: on the default task, with the first, with the second, and with both.
+    """
+    default, first, second, both = np.moveaxis(np.mean(scores, axis=-2), -1, 0)
+    return first + second - default - both
+
+
 def difference(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
     """Difference of two agents' means, [..., S, T] and [..., S', T'] -> [...]."""
     return mean(ours) - mean(theirs)

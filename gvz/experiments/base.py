@@ -18,12 +18,12 @@ from gvz.run.config import RunConfig
 from gvz.run.config_files import load_config
 from gvz.scenarios.base import Split
 from gvz.scenarios.map_set import PROCEDURAL, VARIED, names_map_set
-from gvz.tasks import LEVELS, Task, named_tasks, parse_task, scenario_named, scenarios
+from gvz.tasks import LEVELS, Task, attribute_tasks, named_tasks, parse_task, scenario_named, scenarios
 
 EACH_TASK = "each"
 """as a training: every named task of the scenario, alone"""
 
-EvaluateOn = Literal["own", "test", "all", "gate", "procedural"]
+EvaluateOn = Literal["own", "test", "all", "gate", "procedural", "attributes"]
 Columns = Literal["level", "training", "config"]
 
 SET_BY_EXPERIMENT = (
@@ -124,7 +124,8 @@ class Experiment:
     """evaluation episodes of a task"""
     evaluate_on: EvaluateOn
     """own: the task trained on; test: the scenario's test set; all: its named tasks; gate: its gate set and the tasks
-    trained on, with a table over each; procedural: `procedural-test` and the tasks trained on, likewise"""
+    trained on, with a table over each; procedural: `procedural-test` and the tasks trained on, likewise; attributes: the
+    default task, every attribute alone, every two of them"""
     tasks_per_level: int | None = None
     """only this many tasks of a level are used, in the thesis's order; None: all (see `scale`)"""
     table_checkpoints: int = 5
@@ -251,6 +252,8 @@ class Experiment:
                 return self._thinned(named_tasks(run.scenario, split="test"))
             case "all":
                 return self._thinned(named_tasks(run.scenario))
+            case "attributes":
+                return self._thinned(attribute_tasks(run.scenario))
             case "gate":
                 return tuple(dict.fromkeys((*self._thinned(named_tasks(run.scenario, split="gate")), *run.tasks)))
             case "procedural":

@@ -77,6 +77,33 @@ def draw_curves(
         return _written(picture, out, id, caption)
 
 
+def draw_matrix(out: Path, id: str, title: str, names: Sequence[str], values: np.ndarray, caption: str) -> Figure:
+    """A square matrix of numbers around 0.
+
+    Args:
+        out, id, title, caption: as of `draw_curves`.
+        names: of rows and columns.
+        values: float64[N, N]; red above 0, blue below, NaN where there is none.
+    """
+    with mpl.rc_context({**STYLE, "axes.grid": False}):
+        inches = 1.6 + 0.36 * len(names)
+        picture = Picture(figsize=(max(PANEL_INCHES[0], inches), inches))
+        axes = picture.subplots()
+        limit = max(1.0, float(np.nanmax(np.abs(values))))
+        axes.imshow(values, cmap="RdBu_r", vmin=-limit, vmax=limit)
+        for (row, column), value in np.ndenumerate(values):
+            if not np.isnan(value):
+                shade = "white" if abs(value) > 0.6 * limit else "black"
+                axes.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=8, color=shade)
+        axes.set_xticks(range(len(names)), names, rotation=90)
+        axes.set_yticks(range(len(names)), names)
+        axes.xaxis.tick_top()
+        axes.tick_params(length=0, labelsize=8)
+        axes.spines[:].set_visible(False)
+        axes.set_title(title, fontsize=10)
+        return _written(picture, out, id, caption, wide=True)
+
+
 def draw_histogram(out: Path, id: str, title: str, scores: Mapping[str, np.ndarray], caption: str) -> Figure:
     """How agents' episodes spread over the scores, an outline each.
 

@@ -10,6 +10,7 @@ import polars as pl
 
 from gvz.evaluation.dataset import REWARD_PREFIX
 from gvz.evaluation.statistics import Statistic, generalization_gap, interquartile_mean, mean, median, solved
+from gvz.reports.attribute_tables import attribute_figure, attribute_tables
 from gvz.reports.curves import learning_curve, level_curves
 from gvz.reports.document import Block, Cell, Figure, Section, Table, count, missing, words
 from gvz.reports.draw import draw_curves, draw_heat_map, draw_histogram, draw_rewards
@@ -52,8 +53,13 @@ def _section(results: Results, scenario: Scenario, out: Path) -> Section:
             tables.append(own_kills_table(scenario, own, tasks))
         if gaps := gap_table(results, scenario, scores, tasks):
             tables.append(gaps)
+        tables += attribute_tables(scenario, scores, tasks)
         final = episodes.filter("final")
         pictures = [_heat_map(scenario, scores, tasks, out)]
+        for agent, one in scores.items():
+            id = f"attributes_{scenario.id}_{what_id(agent)}"
+            if figure := attribute_figure(scenario, agent, one, tasks, out, id):
+                pictures.append(figure)
         pictures += _histograms(scenario, final, agents, out)
         pictures += _rewards(scenario, final, agents, out)
         text = (

@@ -19,7 +19,7 @@ def test_own_kills_stand_below_the_scores_by_task_and_by_level(tmp_path):
     ]
     (tmp_path / "rows.jsonl").write_text("".join(json.dumps({"schema": 1, **row}) + "\n" for row in rows))
     (section,) = scenario_sections(read_results([tmp_path]), tmp_path)
-    levels, tasks, own_kills = section.blocks[0].tables
+    levels, tasks, own_kills, _ = section.blocks[0].tables
     assert (levels.id, tasks.id) == ("seek_and_kill_levels", "seek_and_kill_tasks")
     assert own_kills.columns == ("task", "level", "idle", "scripted")
     assert [[cell.text for cell in row] for row in own_kills.rows] == [
