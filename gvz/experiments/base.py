@@ -124,8 +124,8 @@ class Experiment:
     """evaluation episodes of a task"""
     evaluate_on: EvaluateOn
     """own: the task trained on; test: the scenario's test set; all: its named tasks; gate: its gate set and the tasks
-    trained on, with a table over each; procedural: `procedural-test` and the tasks trained on, likewise; attributes: the
-    default task, every attribute alone, every two of them"""
+    trained on, with a table over each; procedural: `procedural-test` and the tasks trained on, likewise; attributes:
+    the default task, every attribute alone, every two of them"""
     tasks_per_level: int | None = None
     """only this many tasks of a level are used, in the thesis's order; None: all (see `scale`)"""
     table_checkpoints: int = 5
