@@ -62,6 +62,17 @@ def test_the_next_level_opens_when_every_task_of_the_last_is_learned():
     np.testing.assert_allclose(lessons.probabilities(), [1 / 4] * 4)
 
 
+def test_drawn_maps_open_by_their_strength():
+    names = [f"procedural-train+layout={x}+textures={x}+decorations={x}+lights={x}+entities={x}" for x in (0.5, 0)]
+    table = task_table(("health_gathering/procedural", *(f"health_gathering/{n}" for n in names)), EnvConfig(), 0.99)
+    lessons = Curriculum(CurriculumConfig(kind="level", window_episodes=2, learned_percent=50.0), table, 7)
+    for opened in ([0, 0, 1], [0, 0.5, 0.5], [1 / 3] * 3):
+        np.testing.assert_allclose(lessons.probabilities(), opened)
+        newest = np.flatnonzero(opened)[0] if opened[0] else len(opened) - np.count_nonzero(opened)
+        for _ in range(2):
+            lessons.next_task(ended(int(newest)), 60.0)
+
+
 def test_progress_draws_where_the_score_moves_most():
     lessons = curriculum(kind="progress", staleness_share=0.0)
     counts = np.bincount(play(lessons, lambda task, number: number / 20 if task == 2 else 30.0, 2_000), minlength=4)
