@@ -14,6 +14,9 @@ from gvz.tasks import LEVELS, parse_task
 WINDOW_EPISODES = 30
 """training episodes in a running mean, as in the trainer's own KPI"""
 
+SHARE_EPISODES = 200
+"""training episodes of which a curriculum's shares are shown"""
+
 GRID_POINTS = 100
 """gradient steps at which learning curves of several runs are averaged"""
 
@@ -25,7 +28,7 @@ class Curve:
     label: str
     updates: np.ndarray
     values: np.ndarray
-    """percent of the upper bound"""
+    """percent, of the upper bound or of episodes"""
     low: np.ndarray
     high: np.ndarray
     points: tuple[np.ndarray, np.ndarray] | None = None
@@ -73,6 +76,16 @@ def learning_curve(label: str, runs: Sequence[Run], tasks: Sequence[str]) -> Cur
     if len(complete) == 1:
         points = (np.concatenate([updates for updates, _ in series]), np.concatenate([scores for _, scores in series]))
     return Curve(label=label, updates=grid, values=lines.mean(axis=0), low=low, high=high, points=points)
+
+
+def share_curve(run: Run, task: str) -> Curve | None:
+    """The task's share of the run's episodes, in percent of the last SHARE_EPISODES; None without any episode."""
+    rows = run.training_episodes.sort("num_updates")
+    if rows.is_empty():
+        return None
+    shares = running_mean(100.0 * (rows["task"] == task).to_numpy(), SHARE_EPISODES)
+    updates = rows["num_updates"].to_numpy().astype(np.float64)
+    return Curve(label=task, updates=updates, values=shares, low=shares, high=shares)
 
 
 def _held(series: tuple[np.ndarray, np.ndarray], grid: np.ndarray) -> np.ndarray:

@@ -47,6 +47,7 @@ def draw_curves(
     curves: Sequence[Curve | None],
     caption: str,
     levels: Mapping[str, float] | None = None,
+    what: str = "score, % of the bound",
 ) -> Figure:
     """Lines over gradient steps with their bands; dots where a line is of one run.
 
@@ -57,9 +58,10 @@ def draw_curves(
         curves: in the order of their colours; None keeps a colour free, so that panels side by side agree.
         caption: below it.
         levels: name and score of players that do not learn, drawn as level lines.
+        what: what the values are.
     """
     with mpl.rc_context(STYLE):
-        picture, axes = _panel(title, "gradient steps", "score, % of the bound")
+        picture, axes = _panel(title, "gradient steps", what)
         for number, curve in enumerate(curves):
             if curve is None:
                 continue

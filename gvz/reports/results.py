@@ -58,6 +58,12 @@ class Run:
         return int(self.config["seed"])
 
     @property
+    def curriculum(self) -> str:
+        """How tasks were given to games; older runs had no choice."""
+        lessons = self.config.get("curriculum")
+        return str(lessons.get("kind", "fixed")) if isinstance(lessons, dict) else "fixed"
+
+    @property
     def total_updates(self) -> int:
         return int(self.config["learner"]["total_updates"])
 
@@ -177,7 +183,7 @@ def _read_run(file: Path, results: Path) -> tuple[Run | None, list[str]]:
             ),
             starts=tuple(starts),
         )
-        _ = run.name, run.seed, run.total_updates, run.training
+        _ = run.name, run.seed, run.total_updates, run.training, run.curriculum
     except (OSError, ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError) as error:
         return None, [f"{file}: not a configuration of ours ({type(error).__name__}: {error}); the run is left out"]
     return run, [*problems, *more, *unread]

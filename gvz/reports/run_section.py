@@ -9,7 +9,10 @@ from typing import Any
 import polars as pl
 
 from gvz.evaluation.dataset import evaluation_files
-from gvz.reports.document import Block, Link, Section, Table, count, missing, words
+from gvz.reports.curves import SHARE_EPISODES, share_curve
+from gvz.reports.document import Block, Figure, Link, Section, Table, count, missing, words
+from gvz.reports.draw import draw_curves
+from gvz.reports.experiment_section import what_id
 from gvz.reports.results import Results, Run, training_time_s
 
 _VIDEOS = (".mp4", ".gif", ".webp", ".webm")
@@ -26,7 +29,19 @@ def run_sections(results: Results, out: Path) -> list[Section]:
         sections.append(
             Section(id="configuration", title="Configuration", blocks=(Block(tables=(_configurations(results),)),))
         )
+    if figures := [_shares(run, out) for run in results.runs if run.curriculum != "fixed"]:
+        text = "Scores of these tasks over time are among the curves of their scenarios."
+        sections.append(
+            Section(id="curriculum", title="Curriculum", blocks=(Block(text=(text,), figures=tuple(figures)),))
+        )
     return [*sections, Section(id="records", title="Raw records", blocks=(_links(results, out),))]
+
+
+def _shares(run: Run, out: Path) -> Figure:
+    """Which tasks were played when."""
+    curves = [share_curve(run, task) for task in run.tasks]
+    caption = f"{run.id}, curriculum {run.curriculum}: share of each task in the last {SHARE_EPISODES} episodes."
+    return draw_curves(out, f"shares_{what_id(run.id)}", run.id, curves, caption, what="share of episodes, %")
 
 
 def _rates(runs: Sequence[Run]) -> Table:

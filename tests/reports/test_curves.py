@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from gvz.reports.curves import evaluation_curve, learning_curve, running_mean
+from gvz.reports.curves import evaluation_curve, learning_curve, running_mean, share_curve
 from gvz.reports.results import Run
 
 
@@ -43,6 +43,14 @@ def test_a_curve_of_one_seed_shows_its_episodes():
     assert curve is not None
     assert curve.points is not None
     assert curve.points[1].tolist() == [10.0, 30.0]
+
+
+def test_the_share_of_a_task_is_of_the_episodes_before():
+    run = run_of(1, [(1, "a/x", 10.0), (2, "a/y", 30.0), (3, "a/x", 0.0), (4, "a/y", 0.0)])
+    curve = share_curve(run, "a/y")
+    assert curve is not None
+    assert curve.values == pytest.approx([0, 50, 100 / 3, 50])
+    assert share_curve(run_of(1, []), "a/y") is None
 
 
 def test_without_episodes_of_a_task_there_is_no_curve():

@@ -10,6 +10,7 @@ import pytest
 from gvz.core.errors import ConfigError
 from gvz.experiments.plan import Plan
 from gvz.reports.results import EACH, read_results, training_time_s
+from gvz.reports.run_section import run_sections
 
 
 @pytest.fixture(scope="module")
@@ -141,3 +142,13 @@ def test_values_of_another_type_are_left_out_and_starts_told_of(a_run):
     told = "\n".join(results.problems)
     assert f"starts.jsonl, row 2: not the start of a run (memory_bytes is {2**80})" in told
     assert "starts.jsonl, row 3: not the start of a run (versions is '1')" in told
+
+
+def test_a_curriculum_s_shares_are_a_figure(a_run, tmp_path):
+    (tmp_path / "figures").mkdir()
+    assert [s.id for s in run_sections(read_results([a_run]), tmp_path)] == ["runs", "configuration", "records"]
+    file = a_run / "config.json"
+    file.write_text(file.read_text().replace('"kind": "fixed"', '"kind": "level"'))
+    results = read_results([a_run])
+    assert [s.id for s in run_sections(results, tmp_path)] == ["runs", "configuration", "curriculum", "records"]
+    assert list((tmp_path / "figures").glob("shares_*.png"))
