@@ -16,7 +16,7 @@ from benchmarks.rounds import Budget, Row, alternate, rates, seconds_per_call
 GAMES = 8
 CAPACITY = 10_000
 """of the replay; its size hardly matters for the speed"""
-QUICK_NAMES = ("layer_norm", "small")
+QUICK_NAMES = ("small",)
 
 
 def measure(budget: Budget) -> list[Row]:
