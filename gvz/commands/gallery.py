@@ -20,7 +20,7 @@ class Gallery:
     """gallery: the named tasks; varied, procedural: the first maps of such a task; augmented: the default task under
     each augmentation that a learner can train with"""
     moving: bool = False
-    """also agents.webp: the scripted agents of all scenarios at play, level after level"""
+    """also agents.webp: agents of all scenarios at play, level after level; policies of the zoo where it has any"""
 
     def run(self) -> int:
         """Writes the pictures and says where they are."""

@@ -1,25 +1,28 @@
-"""Pictures of the tasks: a contact sheet of each scenario, and a moving picture of the scripted agents.
+"""Pictures of the tasks: a contact sheet of each scenario, and a moving picture of agents at play.
 
 All frames of one map have the same episode seed, the same place and direction of view, and the same moment.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from gvz.core.env_config import EnvConfig
 from gvz.engine.engine import Engine, EngineConfig
 from gvz.engine.probe import ensure_loads
-from gvz.env import TICS_PER_SECOND, DoomEnv
+from gvz.env import TICS_PER_SECOND
+from gvz.evaluation.choice import EpisodeChoice
+from gvz.evaluation.episode_log import simple_player
 from gvz.evaluation.panel import LEVEL_COLOURS
-from gvz.evaluation.play import episode_seed
-from gvz.evaluation.players import ScriptedPlayer
+from gvz.evaluation.play import Episode, PlayerSpec
+from gvz.evaluation.playback import perform
 from gvz.evaluation.scenarios.base import Moment, Moving, stated
-from gvz.evaluation.simple import player_env
+from gvz.evaluation.zoo import PREFIX, zoo_names
 from gvz.scenarios.base import Scenario, Task
 from gvz.scenarios.compiler import CompiledTask, compile_task, map_source, task_content
 from gvz.scenarios.layout import FIRST_PLACE, MAP_SPOT
@@ -191,38 +194,35 @@ def write_contact_sheet(scenario: Scenario, directory: Path, kind: str = "galler
     return file
 
 
-def scripted_frames(task: Task, first: int, count: int) -> list[np.ndarray]:
-    """The screen at decisions `first` .. `first + count - 1` of the scripted agent's evaluation episode 0.
+def moving_frames(player_spec: PlayerSpec, task: Task, first: int, count: int) -> list[np.ndarray]:
+    """The screen at decisions `first` .. `first + count - 1` of the player's evaluation episode 0.
 
     Returns: uint8[FRAME_HEIGHT, FRAME_WIDTH, 3] each; fewer if the episode ends before.
     """
-    config = replace(player_env("scripted", EnvConfig()), render_width=FRAME_WIDTH, render_height=FRAME_HEIGHT)
-    player, seed, frames = ScriptedPlayer(), episode_seed(task.id, 0), []
-    with closing(DoomEnv(task, config, render_mode="rgb_array")) as env:
-        observation, info = env.reset(options={"episode_seed": seed})
-        player.begin(env, observation, info, seed)
-        for decision in range(first + count):
-            observation, _, terminated, truncated, info = env.step(np.int64(player.act()))
-            player.observe(observation, info)
-            screen = env.render()
-            if decision >= first and screen is not None:
-                frames.append(screen)
-            if terminated or truncated:
-                break
-    return frames
+    with closing(perform(player_spec, Episode(task.id, 0))) as moments:
+        screens = (moment.screen for moment in moments if moment.decided)
+        shown = itertools.islice(screens, first + 1, first + 1 + count)
+        return [cv2.resize(screen, (FRAME_WIDTH, FRAME_HEIGHT), interpolation=cv2.INTER_AREA) for screen in shown]
+
+
+def moving_player(scenario: Scenario) -> PlayerSpec:
+    """Who plays in the moving picture: the policy of the zoo that has the scenario's name, or else its script."""
+    if scenario.id not in zoo_names():
+        return simple_player("scripted", EnvConfig())
+    return EpisodeChoice(run_dir=Path(f"{PREFIX}{scenario.id}")).resolve()[0]
 
 
 def write_moving_picture(file: Path) -> Path:
-    """Writes the scripted agents of all scenarios side by side, level after level, as an animated WebP."""
+    """Writes the players of all scenarios side by side, level after level, as an animated WebP."""
     columns: list[list[tuple[np.ndarray, str, int]]] = []
     for scenario in scenarios().values():
         moving: Moving | None = stated(scenario.id, "MOVING")
         if moving is None:
             continue
-        column = []
+        column, player_spec = [], moving_player(scenario)
         for level, name in enumerate(moving.tasks):
             task = parse_task(f"{scenario.id}/{name}")
-            frames = scripted_frames(task, moving.first, LEVEL_DECISIONS)
+            frames = moving_frames(player_spec, task, moving.first, LEVEL_DECISIONS)
             column += [(frame, f"{task.scenario.title}, level {level}: {name}", level) for frame in frames]
         columns.append(column)
     pictures = [tiled(cells, 2) for cells in zip(*columns, strict=True)]

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gvz.core.env_config import EnvConfig
+from gvz.evaluation.episode_log import simple_player
 from gvz.evaluation.gallery import (
     COLUMNS,
     FRAME_HEIGHT,
     FRAME_WIDTH,
-    scripted_frames,
+    moving_frames,
     task_frame,
     task_sight,
     tiled,
@@ -110,9 +112,10 @@ def test_a_tile_shows_what_the_attributes_change(task):
 
 
 @pytest.mark.engine
-def test_frames_of_the_scripted_agent_are_those_of_its_evaluation_episode():
+def test_moving_frames_are_those_of_an_evaluation_episode():
     task = parse_task("defend_the_center/default")
-    whole, part = scripted_frames(task, 0, 12), scripted_frames(task, 8, 4)
+    player_spec = simple_player("scripted", EnvConfig())
+    whole, part = moving_frames(player_spec, task, 0, 12), moving_frames(player_spec, task, 8, 4)
     assert len(whole) == 12
     np.testing.assert_array_equal(whole[8:], part)
 
