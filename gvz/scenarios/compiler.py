@@ -8,6 +8,7 @@ keeps it. Nothing here starts an engine.
 
 import hashlib
 import os
+import re
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,12 +26,17 @@ from gvz.scenarios.layout import Layout
 from gvz.scenarios.map_set import MapSet
 from gvz.wad.acs import compile_acs
 from gvz.wad.decorate import declared_actors, declared_numbers, used_sprites
-from gvz.wad.lumps import read_maps, read_wad, write_map_wad, write_wad
+from gvz.wad.lumps import read_maps, read_wad, write_map_wad
 from gvz.wad.stock import scenario_wad, stock_editor_numbers, stock_sprites, stock_textures
 from gvz.wad.textures import check_textures
 from gvz.wad.udmf import UdmfMap, is_inside, make_thing, parse_textmap, write_textmap
 
 MAP_NAME = "MAP01"
+
+_NUMBER = re.compile(r"(?<![\w.-])(?:[0-9]+\.[0-9]+|[0-9]{7,})(?![\w.])")
+"""a fixed-point number or a large integer in a script"""
+_MARK = 23117
+"""what stands for a number while a script is compiled: a fixed-point one near this, or an integer of the same bits"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -83,8 +89,35 @@ def compile_task(task: Task, profile: Profile = "thesis") -> CompiledTask:
 def _drawn_map(task: Task, profile: Profile, number: int) -> tuple[bytes, int]:
     """(The WAD of a map alone, its magic number). The classes of all maps are in the task's own file."""
     source = map_source(task, profile, number)
-    _, *lumps = read_wad(build_wad(source))
-    return write_wad(lumps), source.map_magic
+    behavior = _compiled_by_form(source.script, source.decorate)
+    return write_map_wad(textmap=source.textmap, behavior=behavior, scripts=source.script), source.map_magic
+
+
+def _compiled_by_form(script: str, decorate: str) -> bytes:
+    """The same bytes as `compile_acs`, from a compiled script that differs in numbers only, if there was one.
+
+    Most scripts of drawn maps differ in numbers only, and to compile one takes as long as to draw the map.
+    """
+    values: list[tuple[int, int]] = []  # (that of a mark, that of the number in its place)
+
+    def mark(match: re.Match[str]) -> str:
+        whole, point, fraction = match[0].partition(".")
+        value = int(whole) if not point else (int(whole) << 16) + (int(fraction) << 16) // 10 ** len(fraction)
+        if value < 256:  # the compiler has shorter code for them
+            return match[0]
+        place = len(values) + 1
+        values.append(((_MARK << 16) + place, value))
+        return str((_MARK << 16) + place) if not point else f"{_MARK}.{(2 * place + 1) * 10**8 >> 17:08}"
+
+    compiled = _compile_form(_NUMBER.sub(mark, script), decorate)
+    for marked, value in values:
+        compiled = compiled.replace(marked.to_bytes(4, "little"), value.to_bytes(4, "little"))
+    return compiled
+
+
+@lru_cache(maxsize=1000)
+def _compile_form(script: str, decorate: str) -> bytes:
+    return compile_acs(script, actor_classes=declared_actors(decorate))
 
 
 def task_content(task: Task, profile: Profile) -> Content:
@@ -138,7 +171,7 @@ def map_source(task: Task, profile: Profile, number: int | None = None) -> MapSo
     return MapSource(textmap=textmap, script=script, decorate=decorate, map_magic=magic)
 
 
-def build_wad(source: MapSource, map_name: str = MAP_NAME) -> bytes:
+def build_wad(source: MapSource) -> bytes:
     """The bytes of a WAD file with one map; the same source gives the same bytes.
 
     Raises:
@@ -150,7 +183,6 @@ def build_wad(source: MapSource, map_name: str = MAP_NAME) -> bytes:
         behavior=behavior,
         scripts=source.script,
         decorate=source.decorate,
-        map_name=map_name,
     )
 
 

@@ -4,6 +4,7 @@
 `step` to a limit that no noise on a busy machine reaches.
 """
 
+import itertools
 import time
 from collections.abc import Callable, Iterator
 
@@ -13,6 +14,8 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from gvz.engine.engine import Engine
 from gvz.env import DoomEnv
+from gvz.scenarios.compiler import compile_task
+from gvz.tasks import parse_task
 
 pytestmark = pytest.mark.engine
 
@@ -88,6 +91,12 @@ def test_a_steps_cost(env: DoomEnv, benchmark: BenchmarkFixture):
 
 def test_a_resets_cost(env: DoomEnv, benchmark: BenchmarkFixture):
     benchmark.pedantic(env.reset, rounds=1 if benchmark.disabled else 100, warmup_rounds=2)
+
+
+@pytest.mark.parametrize("scenario", ["defend_the_center", "seek_and_kill"])
+def test_what_it_costs_to_draw_and_compile_a_map(scenario: str, benchmark: BenchmarkFixture):
+    compiled, seeds = compile_task(parse_task(f"{scenario}/procedural")), itertools.count()
+    benchmark.pedantic(lambda: compiled.map_of(next(seeds)), rounds=1 if benchmark.disabled else 100, warmup_rounds=2)
 
 
 def test_from_make_to_the_first_frame(benchmark: BenchmarkFixture):

@@ -18,12 +18,15 @@ from gvz.evaluation.players import ScriptedPlayer
 from gvz.evaluation.simple import player_env
 from gvz.scenarios import layout, looks
 from gvz.scenarios.base import Content, Scenario, Task
-from gvz.scenarios.compiler import map_source, task_content
+from gvz.scenarios.compiler import compile_task, map_source, task_content
 from gvz.scenarios.floor import Floor
 from gvz.scenarios.layout import FIRST_PLACE, NUM_PLACES, Layout, Rooms, ring
 from gvz.scenarios.looks import FLATS, LOOSE, SILHOUETTES, SOLID, TINTS, WALLS
 from gvz.scenarios.map_set import NUMBERS, PARTS, MapSet
 from gvz.tasks import parse_task, scenarios
+from gvz.wad.acs import compile_acs
+from gvz.wad.decorate import declared_actors
+from gvz.wad.lumps import read_maps, read_wad
 from gvz.wad.udmf import NO_REFERENCE, UdmfMap, is_inside, parse_textmap
 from tests.scenarios.pictures import thumbnail
 
@@ -287,6 +290,21 @@ def test_the_first_maps_are_those_that_runs_were_trained_on():
         "health_gathering": [2019063825, 1640217535],
         "seek_and_kill": [1532806442, 1122951589],
     }
+
+
+@pytest.mark.parametrize("profile", ["thesis", "levdoom"])
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=str)
+def test_the_script_of_a_drawn_map_is_what_the_compiler_makes_of_it(scenario: Scenario, profile):
+    """Although its numbers are written into a script that was compiled for another map."""
+    for maps in (TRAIN, MapSet("varied")):
+        task = Task(scenario, maps=maps)
+        compiled = compile_task(task, profile)
+        for seed in range(30):
+            wad, _ = compiled.map_of(seed)
+            source = map_source(task, profile, maps.number_of(seed))
+            assert wad is not None
+            behavior = read_maps(read_wad(wad))["MAP01"]["BEHAVIOR"]
+            assert behavior == compile_acs(source.script, actor_classes=declared_actors(source.decorate))
 
 
 def test_evaluation_episode_n_draws_the_same_map_for_every_player():
