@@ -1,8 +1,9 @@
 """Reference scores: the committed records of simple players, and the tables of docs/BENCHMARK.md that come from them.
 
-    python -m benchmarks.reference [RECORDS ...]
+    python -m benchmarks.reference [--extended] [RECORDS ...]
 
-packs the given record files of `gvz evaluate` into results/reference/ and writes the tables of all records there.
+packs the given record files of `gvz evaluate` into results/reference/ and writes the tables of all records there; with
+--extended, into results/reference/extended/, and the tables of the scenarios of the extended suite.
 """
 
 import gzip
@@ -27,6 +28,8 @@ from gvz.tasks import LEVELS, named_tasks, scenarios
 
 RECORDS = ROOT / "results" / "reference"
 PAGE = ROOT / "docs" / "BENCHMARK.md"
+EXTENDED = "scores of later scenarios"
+"""the part of the page that has the tables of the extended suite"""
 PLAYERS = ("random", "idle", "sweep", "scripted")
 """in the order of the tables' columns"""
 COLUMNS = (
@@ -87,8 +90,13 @@ def estimate(scores: Scores, player: str, tasks: Sequence[Task], column: str = "
     return bootstrap(strata, num_resamples=1000)
 
 
+def extended_tables(scores: Scores) -> str:
+    """The tables of the extended suite as Markdown."""
+    return "\n\n".join(_task_table(scores, scenario) for scenario in scenarios("extended").values())
+
+
 def tables(scores: Scores) -> str:
-    """All tables as Markdown."""
+    """The tables of the core suite as Markdown."""
     parts = [_test_table(scores), _level_table(scores)]
     for scenario in scenarios().values():
         parts.append(_task_table(scores, scenario))
@@ -137,13 +145,14 @@ def _level_table(scores: Scores) -> str:
 
 
 def _task_table(scores: Scores, scenario: Scenario) -> str:
-    """The scenario's score by task."""
+    """The scenario's score by task, for the tasks that all players have played."""
     rows, bound = [], scenario.upper_bound("thesis")
-    for task in named_tasks(scenario.id):
+    played = [task for task in named_tasks(scenario.id) if all((player, task.id) in scores for player in PLAYERS)]
+    for task in played:
         cells = [estimate(scores, player, [task]) for player in PLAYERS]
         rows.append((task.name, task.level, *cells, estimate(scores, "scripted", [task], scale=100 / bound)))
     unit = scenario.metric.replace("_", " ")
-    episodes = {player: {len(scores[player, t.id]) for t in named_tasks(scenario.id)} for player in PLAYERS}
+    episodes = {player: {len(scores[player, task.id]) for task in played} for player in PLAYERS}
     counts = ", ".join(f"{player} {'-'.join(map(str, sorted(n)))}" for player, n in episodes.items())
     title = f"**{scenario.title}**: {unit}, upper bound {bound:g}; mean [95% interval]. Episodes a task: {counts}."
     return _table(title, ("task", "level", *PLAYERS, "scripted, % of the bound"), rows)
@@ -163,21 +172,27 @@ def _own_kills_table(scores: Scores, scenario: Scenario) -> str:
     return _table(title, ("task", "level", *PLAYERS), rows)
 
 
-def write_page(page: str, text: str) -> str:
+def write_page(page: str, text: str, section: str = "reference scores") -> str:
     """The page with the tables `text` in their place.
 
     Raises:
         ConfigError: the markers are missing.
     """
-    return between(page, PAGE, "reference scores", text, "python -m benchmarks.reference")
+    command = "python -m benchmarks.reference" + (" --extended" if section == EXTENDED else "")
+    return between(page, PAGE, section, text, command)
 
 
 def main(arguments: Sequence[str]) -> None:
     """Packs the given record files, then writes the tables."""
+    extended = "--extended" in arguments
+    directory = RECORDS / "extended" if extended else RECORDS
     for file in arguments:
-        for written in pack(Path(file)):
-            print(written)
-    PAGE.write_text(write_page(PAGE.read_text(), tables(read_reference())))
+        if file != "--extended":
+            for written in pack(Path(file), directory):
+                print(written)
+    scores = read_reference(directory)
+    text = write_page(PAGE.read_text(), extended_tables(scores), EXTENDED) if extended else None
+    PAGE.write_text(text or write_page(PAGE.read_text(), tables(scores)))
     print(PAGE)
 
 

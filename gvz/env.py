@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 TICS_PER_SECOND = 35
 _WEAPON_UP_TIC = 10
 """tic at which the weapon is ready: episodes with a weapon start there, as LevDoom's do"""
+_COUNTED = {"kills": "KILLCOUNT", "goals": "GOALS"}
+"""metric -> the variable that counts it"""
 _SOLVED_EPISODES = 10
 _MAX_CRASHES = 3
 """crashes in a row, without a complete episode in between, after which the environment raises an error"""
@@ -313,8 +315,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
     def _info(self, components: dict[str, float], terminated: bool, truncated: bool) -> dict[str, Any]:
         variables, scenario = self._variables, self.task.scenario
         score = float(self._frames)
-        if scenario.metric == "kills":  # enemies that kill each other can raise the count above the bound
-            score = min(variables["KILLCOUNT"], self._upper_bound)
+        if (counted := _COUNTED.get(scenario.metric)) is not None:  # KILLCOUNT also has what enemies kill
+            score = min(variables[counted], self._upper_bound)
         info = {
             "task": self.task.id,
             "score": score,

@@ -37,6 +37,7 @@ _CLASS_OF_CATEGORY = {
     "Gore": "scenery",
     "LightSource": "scenery",
     "Gibs": "effect",
+    "Key": "key",
 }
 """category of vizdoom.Label -> class"""
 

@@ -20,12 +20,12 @@ def gymnasium_id(task: "Task") -> str:
 
 
 def register_envs() -> None:
-    """Registers every named task in Gymnasium."""
+    """Registers the named tasks of every suite in Gymnasium."""
     import gymnasium
 
-    from gvz.tasks import named_tasks
+    from gvz.tasks import all_scenarios, named_tasks
 
-    for task in named_tasks():
+    for task in (task for scenario in all_scenarios() for task in named_tasks(scenario)):
         name = gymnasium_id(task)
         if name not in gymnasium.registry:
             gymnasium.register(name, entry_point="gvz.env:DoomEnv", kwargs={"task": task.id})

@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 from gvz.core.errors import TaskError, nearest
 from gvz.core.registry import discover
-from gvz.scenarios.base import MAX_LEVEL, Scenario, Split, Task
+from gvz.scenarios.base import MAX_LEVEL, Scenario, Split, Suite, Task
 from gvz.scenarios.map_set import names_map_set, parse_map_set
 
 LEVELS = range(MAX_LEVEL + 1)
@@ -18,11 +18,17 @@ GATE_LEVEL = 2
 
 
 @cache
-def scenarios() -> dict[str, Scenario]:
-    """All scenarios by id: the modules of gvz.scenarios that have a SCENARIO."""
+def all_scenarios() -> dict[str, Scenario]:
+    """The scenarios of every suite by id: the modules of gvz.scenarios that have a SCENARIO."""
     found = {n: m.SCENARIO for n, m in discover("gvz.scenarios").items() if hasattr(m, "SCENARIO")}
     assert all(name == scenario.id for name, scenario in found.items()), "a scenario's id is its file name"
     return found
+
+
+@cache
+def scenarios(suite: Suite = "core") -> dict[str, Scenario]:
+    """The scenarios of a suite by id."""
+    return {name: scenario for name, scenario in all_scenarios().items() if scenario.suite == suite}
 
 
 def scenario_named(name: str) -> Scenario:
@@ -31,7 +37,7 @@ def scenario_named(name: str) -> Scenario:
     Raises:
         TaskError: there is none; the message lists all and names the nearest.
     """
-    known = scenarios()
+    known = all_scenarios()
     if name not in known:
         raise TaskError(f"unknown scenario {name!r}{nearest(name, list(known))}; want one of {', '.join(known)}")
     return known[name]
@@ -52,7 +58,7 @@ def parse_task(text: str) -> Task:
     if not slash or not name:
         raise TaskError(
             f"task: got {text!r}, want '<scenario>/<task>', for example 'defend_the_center/gore+mossy_bricks'; "
-            f"scenarios: {', '.join(scenarios())}"
+            f"scenarios: {', '.join(all_scenarios())}"
         )
     scenario = scenario_named(scenario_id)
     whole_sets = {"default": (), "complete": scenario.complete}
@@ -66,14 +72,15 @@ def parse_task(text: str) -> Task:
 
 
 def named_tasks(
-    scenario: str | None = None, level: int | None = None, split: TaskSet | None = None
+    scenario: str | None = None, level: int | None = None, split: TaskSet | None = None, suite: Suite = "core"
 ) -> tuple[Task, ...]:
-    """The named tasks: scenarios in alphabetical order, the tasks of a scenario in the thesis's order.
+    """The named tasks of a suite or scenario: scenarios in alphabetical order, tasks in the order of their file.
 
     Args:
-        scenario: only tasks of this scenario.
+        scenario: only tasks of this scenario, whatever its suite.
         level: only tasks of this level, 0..4.
         split: only tasks of this training or test set, or of the gate set.
+        suite: whose scenarios, if none is named.
 
     Raises:
         TaskError: an unknown scenario, level or split.
@@ -82,7 +89,7 @@ def named_tasks(
         raise TaskError(f"level: got {level!r}, want 0..{MAX_LEVEL}")
     if split is not None and split not in get_args(TaskSet):
         raise TaskError(f"split: got {split!r}, want one of {', '.join(get_args(TaskSet))}")
-    chosen = scenarios().values() if scenario is None else (scenario_named(scenario),)
+    chosen = scenarios(suite).values() if scenario is None else (scenario_named(scenario),)
     tasks = (parse_task(f"{one.id}/{name}") for one in chosen for name in _names(one, split))
     return tuple(
         task for task in tasks if level in (None, task.level) and (split != "gate" or task.level == GATE_LEVEL)

@@ -6,7 +6,7 @@ import pytest
 
 from gvz.actions import AXES_V1, UNIFIED_V1, action_buttons, action_mask
 from gvz.core.env_config import ActionSet
-from gvz.tasks import scenario_named, scenarios
+from gvz.tasks import all_scenarios, scenario_named
 
 LISTED = """
 -
@@ -45,7 +45,7 @@ def test_defend_the_center_by_hand():
     )
 
 
-@pytest.mark.parametrize("scenario", scenarios().values(), ids=scenarios())
+@pytest.mark.parametrize("scenario", all_scenarios().values(), ids=all_scenarios())
 def test_action_sets_hold_only_the_scenarios_buttons(scenario):
     for action_set in get_args(ActionSet):
         actions = action_buttons(scenario, action_set)
@@ -65,7 +65,7 @@ def test_version_1_is_frozen():
     ) == AXES_V1
 
 
-@pytest.mark.parametrize("scenario", scenarios().values(), ids=scenarios())
+@pytest.mark.parametrize("scenario", all_scenarios().values(), ids=all_scenarios())
 def test_a_unified_action_is_the_same_everywhere_or_forbidden(scenario):
     held, mask = action_buttons(scenario, "unified_v1"), action_mask(scenario, "unified_v1")
     assert [one for one, allowed in zip(held, mask, strict=True) if allowed] == [

@@ -94,3 +94,11 @@ def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys,
     assert err.startswith("error: ")
     assert message in err
     assert "Traceback" not in err
+
+
+def test_tasks_of_later_scenarios_are_listed_by_their_suite(capsys):
+    assert cli.main(["tasks", "--suite", "extended", "--json"]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert {row["scenario"] for row in rows} == {"find_the_key"}
+    assert len(rows) == 22
+    assert rows[0]["gymnasium_id"] == "GViZDoom/FindTheKey-Default-v0"

@@ -10,13 +10,18 @@ from gymnasium.utils.env_checker import check_env
 
 from gvz.env import DoomEnv
 from gvz.registration import gymnasium_id
-from gvz.tasks import named_tasks, parse_task
+from gvz.tasks import named_tasks, parse_task, scenarios
 from tests.episodes import TURN
 
 pytestmark = pytest.mark.engine
 
 
-@pytest.mark.parametrize("task", named_tasks(), ids=str)
+LATER = tuple(
+    parse_task(f"{scenario}/{name}") for scenario in scenarios("extended") for name in ("default", "complete")
+)
+
+
+@pytest.mark.parametrize("task", [*named_tasks(), *LATER], ids=str)
 def test_gymnasiums_checker_passes(task):
     env = DoomEnv(task)
     check_env(env, skip_render_check=True)
@@ -47,7 +52,7 @@ def test_ids_are_names():
 
 
 def test_every_named_task_is_registered():
-    for task in named_tasks():
+    for task in (*named_tasks(), *named_tasks(suite="extended")):
         spec = gymnasium.spec(gymnasium_id(task))
         assert spec.kwargs == {"task": task.id}
     env = gymnasium.make("GViZDoom/DefendTheCenter-Gore-v0", frame_skip=2, render_mode="rgb_array")

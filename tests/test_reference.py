@@ -7,7 +7,18 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.reference import PAGE, PLAYERS, estimate, pack, read_reference, tables, write_page
+from benchmarks.reference import (
+    EXTENDED,
+    PAGE,
+    PLAYERS,
+    RECORDS,
+    estimate,
+    extended_tables,
+    pack,
+    read_reference,
+    tables,
+    write_page,
+)
 from gvz.core.errors import ConfigError
 from gvz.evaluation.play import episode_seed
 from gvz.experiments.base import experiment_named
@@ -39,6 +50,14 @@ def test_no_score_is_above_its_bound():
 def test_the_tables_of_the_page_are_what_the_records_give():
     page = PAGE.read_text()
     assert write_page(page, tables(SCORES)) == page
+
+
+def test_the_tables_of_later_scenarios_are_what_their_records_give():
+    page, scores = PAGE.read_text(), read_reference(RECORDS / "extended")
+    assert write_page(page, extended_tables(scores), EXTENDED) == page
+    for (_, task), rows in scores.items():
+        assert all(row["seed"] == episode_seed(task, row["episode"]) for row in rows)
+        assert all(0 <= row["score"] <= 25 for row in rows)
 
 
 def mean(player: str, task: str, column: str = "score") -> float:

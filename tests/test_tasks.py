@@ -19,7 +19,7 @@ from gvz.core.errors import TaskError
 from gvz.scenarios.base import Attribute, Content, Task, Textures
 from gvz.scenarios.compiler import task_content
 from gvz.scenarios.map_set import PARTS, MapSet
-from gvz.tasks import named_tasks, parse_task, scenario_named, scenarios
+from gvz.tasks import all_scenarios, named_tasks, parse_task, scenario_named, scenarios
 
 LEVELS = {  # tasks of level 0, 1, 2, 3, 4
     "defend_the_center": (1, 7, 6, 3, 1),
@@ -36,13 +36,15 @@ TEST_SETS = {
     "resized+shadows+invulnerable, complete",
     "dodge_projectiles": "revenants, city+resized_agent, barons+flaming_skulls, flames+flaming_skulls+mancubus, "
     "resized_agent+revenants, city+arachnotron, complete",
+    "find_the_key": "moss+obstacles, glowing+skulls, maze+decoys, bricks+maze+short_agent, obstacles+moss+skulls, "
+    "decoys+resized+glowing, complete",
 }
 
 
 @st.composite
 def attribute_sets(draw: st.DrawFn) -> tuple[str, list[str]]:
     """A scenario and some of its attributes, at most one of a group, in any order."""
-    scenario = draw(st.sampled_from(sorted(scenarios().values(), key=lambda one: one.id)))
+    scenario = draw(st.sampled_from(sorted(all_scenarios().values(), key=lambda one: one.id)))
     chosen: list[str] = []
     taken: set[str] = set()
     for attribute in draw(st.permutations(scenario.attributes)):
@@ -59,6 +61,18 @@ def test_there_are_76_named_tasks_with_the_levels_of_the_thesis():
         assert tuple(len(named_tasks(scenario, level=level)) for level in range(5)) == counts
 
 
+def test_later_scenarios_are_in_a_suite_of_their_own():
+    """What published scores are of does not grow when a scenario is added."""
+    assert set(scenarios()) == set(LEVELS)
+    assert set(scenarios("extended")) == {"find_the_key"} == set(all_scenarios()) - set(scenarios())
+    assert {task.scenario.id for task in named_tasks()} == set(LEVELS)
+    later = named_tasks(suite="extended")
+    assert {task.scenario.id for task in later} == {"find_the_key"}
+    assert later == named_tasks("find_the_key")
+    assert tuple(len(named_tasks("find_the_key", level=level)) for level in range(5)) == (1, 10, 7, 3, 1)
+    assert len(named_tasks("find_the_key", split="gate")) == 4
+
+
 def test_revenants_and_arachnotron_are_level_2_though_one_attribute():
     assert parse_task("dodge_projectiles/revenants").level == 2
     assert parse_task("dodge_projectiles/arachnotron").level == 2
@@ -67,12 +81,12 @@ def test_revenants_and_arachnotron_are_level_2_though_one_attribute():
 
 def test_four_and_more_attributes_are_level_4():
     assert parse_task("seek_and_kill/blue+obstacles+shadows+mixed_enemies").level == 4
-    for scenario in scenarios():
+    for scenario in all_scenarios():
         assert parse_task(f"{scenario}/complete").level == 4
 
 
 def test_complete_has_exactly_one_attribute_of_every_group():
-    for scenario in scenarios().values():
+    for scenario in all_scenarios().values():
         groups = [group for name in scenario.complete for group in scenario.attribute(name).groups]
         assert sorted(groups) == sorted({group for one in scenario.attributes for group in one.groups})
 
@@ -92,7 +106,7 @@ def test_any_set_with_at_most_one_attribute_a_group_is_a_task_in_any_order(chose
 
 @pytest.mark.parametrize("pickler", [pickle, cloudpickle], ids=["pickle", "cloudpickle"])
 def test_tasks_and_scenarios_survive_pickling(pickler):
-    for scenario in scenarios().values():
+    for scenario in all_scenarios().values():
         assert pickle.loads(pickler.dumps(scenario)) == scenario
     for task in named_tasks():
         again = pickle.loads(pickler.dumps(task))
@@ -130,7 +144,7 @@ def test_ids_are_canonical():
 
 
 def test_a_varied_task_has_a_number_of_maps_and_is_none_of_the_named_ones():
-    for scenario in scenarios():
+    for scenario in all_scenarios():
         varied, ten = parse_task(f"{scenario}/varied"), parse_task(f"{scenario}/varied-10")
         assert varied.maps is not None
         assert ten.maps is not None
@@ -181,7 +195,7 @@ def test_all_of_complete_spelled_out_is_complete():
 
 
 def test_training_sets_grow_and_share_nothing_with_the_test_set():
-    for scenario in scenarios():
+    for scenario in all_scenarios():
         one, four, eight = (
             set(named_tasks(scenario, split="train1")),
             set(named_tasks(scenario, split="train4")),
@@ -266,7 +280,7 @@ def test_unknown_selections_of_named_tasks_are_refused():
 
 def test_attributes_of_different_groups_do_not_fight_over_a_value():
     """In profile thesis, what a task is does not depend on the order its attributes stand in."""
-    for scenario in scenarios().values():
+    for scenario in all_scenarios().values():
         for one in scenario.attributes:
             for other in scenario.attributes:
                 if one is other or set(one.groups) & set(other.groups) or "supreme" in (one.name, other.name):

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from gvz.core.errors import ConfigError
-from gvz.tasks import scenario_named, scenarios
+from gvz.tasks import all_scenarios, scenario_named
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,11 +20,11 @@ class Gallery:
     """gallery: the named tasks; varied, procedural: the first maps of such a task; augmented: the default task under
     each augmentation that a learner can train with"""
     moving: bool = False
-    """also agents.webp: agents of all scenarios at play, level after level; policies of the zoo where it has any"""
+    """also agents.webp: agents of the core scenarios at play, level after level; policies of the zoo if there are"""
 
     def run(self) -> int:
         """Writes the pictures and says where they are."""
-        chosen = scenarios().values() if self.scenario is None else [scenario_named(self.scenario)]
+        chosen = all_scenarios().values() if self.scenario is None else [scenario_named(self.scenario)]
         try:
             self.out.mkdir(parents=True, exist_ok=True)
         except OSError as error:

@@ -213,7 +213,7 @@ def moving_player(scenario: Scenario) -> PlayerSpec:
 
 
 def write_moving_picture(file: Path) -> Path:
-    """Writes the players of all scenarios side by side, level after level, as an animated WebP."""
+    """Writes the players of the core scenarios side by side, level after level, as an animated WebP."""
     columns: list[list[tuple[np.ndarray, str, int]]] = []
     for scenario in scenarios().values():
         moving: Moving | None = stated(scenario.id, "MOVING")

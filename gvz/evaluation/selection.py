@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gvz.core.errors import ConfigError
-from gvz.scenarios.base import Task
+from gvz.scenarios.base import Suite, Task
 from gvz.tasks import TaskSet, named_tasks, parse_task
 
 
 @dataclass(frozen=True, kw_only=True)
 class TaskSelection:
-    """Which tasks: all named ones, or these."""
+    """Which tasks: all named ones of the core suite, or these."""
 
     tasks: tuple[str, ...] = ()
     """ids, for example defend_the_center/gore+mossy_bricks; not only named tasks"""
@@ -18,6 +18,8 @@ class TaskSelection:
     """the named tasks of this scenario"""
     split: TaskSet | None = None
     """the named tasks of this training or test set; gate: those of level 2 that are in none of them"""
+    suite: Suite = "core"
+    """whose named tasks, if no scenario is given; core: the thesis's four scenarios; extended: later ones"""
     level: int | None = None
     """the named tasks of this level, 0..4"""
 
@@ -49,9 +51,9 @@ class TaskSelection:
         Raises:
             ConfigError: there is none.
         """
-        chosen = [task for one in scenarios for task in named_tasks(scenario=one, level=self.level, split=self.split)]
+        chosen = [task for one in scenarios for task in named_tasks(one, self.level, self.split, self.suite)]
         if not chosen:
-            raise ConfigError(f"--level, --split: no task of {self.split} has level {self.level}")
+            raise ConfigError(f"--level, --split: no task of {self.split or self.suite} has level {self.level}")
         return tuple(chosen)
 
 

@@ -11,7 +11,7 @@ from gvz.reports.document import count
 from gvz.reports.results import Results
 from gvz.reports.scenario_section import agents_of, played_tasks
 from gvz.reports.scores import Scores, agent_scores, estimate_groups
-from gvz.tasks import named_tasks, scenario_named, scenarios
+from gvz.tasks import all_scenarios, named_tasks, scenario_named
 
 ENOUGH_SEEDS = 3
 """training seeds of the thesis's protocol; with fewer, the report begins with a warning"""
@@ -49,7 +49,7 @@ def what_beats_what(results: Results) -> list[str]:
     then the best of them with the players that do not learn.
     """
     sentences = []
-    for name in scenarios():
+    for name in all_scenarios():
         episodes = results.episodes.filter(scenario=name).drop_nulls("normalized_score")
         scores = {agent: agent_scores(episodes, agent) for agent in agents_of(episodes)}
         tasks = _common_tasks(name, episodes, scores)

@@ -20,7 +20,7 @@ from gvz.experiments.inventory import PROCESSOR_S
 from gvz.experiments.plan import read_plan
 from gvz.reports.document import count
 from gvz.scenarios.base import Split
-from gvz.tasks import named_tasks, scenarios
+from gvz.tasks import all_scenarios, named_tasks
 
 EACH = "each task alone"
 """training of agents each of which was trained on one task"""
@@ -196,7 +196,7 @@ def _run_id(directory: Path, results: Path) -> str:
 
 @cache
 def _task_ids(scenario: str, split: Split) -> set[str]:
-    return {task.id for task in named_tasks(scenario, split=split)} if scenario in scenarios() else set()
+    return {task.id for task in named_tasks(scenario, split=split)} if scenario in all_scenarios() else set()
 
 
 def _agents(runs: Sequence[Run]) -> dict[str, str]:

@@ -18,14 +18,14 @@ from gvz.reports.experiment_section import what_id
 from gvz.reports.results import Results, Run
 from gvz.reports.scores import Scores, agent_scores, estimate, pick
 from gvz.scenarios.base import Scenario, Task
-from gvz.tasks import LEVELS, named_tasks, parse_task, scenario_named, scenarios
+from gvz.tasks import LEVELS, all_scenarios, named_tasks, parse_task, scenario_named
 
 
 def scenario_sections(results: Results, out: Path) -> list[Section]:
     """A section for each scenario that has evaluated episodes or runs."""
     played = set(results.episodes.drop_nulls("level")["scenario"])
     played.update(*(run.scenarios for run in results.runs))
-    return [_section(results, scenario_named(name), out) for name in scenarios() if name in played]
+    return [_section(results, scenario_named(name), out) for name in all_scenarios() if name in played]
 
 
 def agents_of(episodes: pl.DataFrame) -> list[str]:
@@ -37,7 +37,7 @@ def agents_of(episodes: pl.DataFrame) -> list[str]:
 def played_tasks(episodes: pl.DataFrame) -> list[Task]:
     """The known tasks among the rows, named ones first in the thesis's order."""
     ids = set(episodes.drop_nulls("level")["task"])
-    order = [task.id for task in named_tasks()]
+    order = [task.id for name in all_scenarios() for task in named_tasks(name)]
     return [parse_task(id) for id in sorted(ids, key=lambda id: (order.index(id) if id in order else len(order), id))]
 
 

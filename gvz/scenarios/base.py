@@ -34,9 +34,10 @@ array, with quoted strings."""
 BOOKKEEPING: Mapping[str, str] = MappingProxyType(
     {
         "PLAYER_KILLS": "USER1",  # enemies killed by the agent itself; KILLCOUNT also counts infighting
-        "SPAWNED": "USER2",  # enemies or kits put on the map so far
-        "KITS_TAKEN": "USER3",
-        "POISONS_TAKEN": "USER4",
+        "SPAWNED": "USER2",  # enemies, kits or other things to find that were put on the map so far
+        "KITS_TAKEN": "USER3",  # kits, or keys
+        "POISONS_TAKEN": "USER4",  # vials of poison, or other things that hurt
+        "GOALS": "USER5",  # how often the agent did what the metric `goals` counts
         "MAP_MAGIC": "USER60",  # `CompiledTask.map_magic`: checks that the right map runs
     }
 )
@@ -44,6 +45,9 @@ BOOKKEEPING: Mapping[str, str] = MappingProxyType(
 does not use stay 0. USERn is the script's `global int n`."""
 
 Split = Literal["train1", "train4", "train8", "test"]
+Suite = Literal["core", "extended"]
+"""core: the four scenarios of the thesis, which published scores are of; extended: later ones"""
+Metric = Literal["frames_alive", "kills", "goals"]
 
 MAX_LEVEL = 4
 """Tasks of four or more attributes are level 4 (thesis 3.2: with more than three, difficulty hardly increases)."""
@@ -144,6 +148,8 @@ class Scenario:
 
     id: str
     title: str
+    suite: Suite = "extended"
+    """what it is measured with; scores over several scenarios are of one suite"""
     content: Content
     """contents of the default task's map"""
     levdoom: Content
@@ -171,7 +177,7 @@ class Scenario:
     """buttons that action set `combinations` combines; default: all"""
     game_variables: tuple[str, ...]
     """variables that the agent may see beside pixels"""
-    metric: Literal["frames_alive", "kills"]
+    metric: Metric
     render_weapon: bool
     timeouts: Mapping[Profile, int]
     upper_bounds: Mapping[Profile, float]

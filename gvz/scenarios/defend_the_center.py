@@ -143,6 +143,7 @@ def _is_hidden(place: Place, pillars: list[tuple[Place, float]]) -> bool:
 SCENARIO = Scenario(
     id="defend_the_center",
     title="Defend the Center",
+    suite="core",
     script=SCRIPT,
     content=Content(
         base_wad=WAD,

@@ -141,6 +141,7 @@ def draw_room(rng: random.Random, strength: float) -> Layout:
 SCENARIO = Scenario(
     id="dodge_projectiles",
     title="Dodge Projectiles",
+    suite="core",
     script=SCRIPT,
     draw_map=draw_cage,
     content=Content(

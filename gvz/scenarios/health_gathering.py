@@ -201,6 +201,7 @@ def draw_hall(rng: random.Random, strength: float) -> Layout:
 SCENARIO = Scenario(
     id="health_gathering",
     title="Health Gathering",
+    suite="core",
     script=SCRIPT,
     content=Content(
         base_wad=WAD,

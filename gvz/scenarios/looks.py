@@ -339,7 +339,8 @@ def _draw_entities(rng: random.Random, variety: Variety, content: Content, maps:
     strength = maps.strength("entities")
     entity: dict[str, Value] = {}
     if rng.random() < 0.5 * strength:
-        entity["ScaleX"] = entity["ScaleY"] = 1 + strength * (rng.uniform(*SCALE) - 1)
+        scale = 1 + strength * (rng.uniform(*SCALE) - 1)
+        entity |= {name: scale * _number(content.entity.get(name, 1.0)) for name in ("ScaleX", "ScaleY")}
     style = rng.choice((*STYLES, None, None, None))
     if strength < 1 and rng.random() >= strength:
         style = None
@@ -364,6 +365,11 @@ def _draw_entities(rng: random.Random, variety: Variety, content: Content, maps:
             for kind, name in SOLID.items()
         }
     return content.overlaid(Content(entity=entity, parameters=parameters, actors=actors))
+
+
+def _number(value: Value) -> float:
+    assert isinstance(value, int | float), "the default task's sizes are fixed"
+    return float(value)
 
 
 def _tinted(name: str, tint: int) -> str:

@@ -193,6 +193,7 @@ def draw_maze(rng: random.Random, strength: float) -> Layout:
 SCENARIO = Scenario(
     id="seek_and_kill",
     title="Seek and Kill",
+    suite="core",
     script=SCRIPT,
     draw_map=drain_acid,
     content=Content(

@@ -5,10 +5,10 @@ import pytest
 from gvz.actions import action_buttons
 from gvz.core.errors import ConfigError
 from gvz.evaluation.human import key_buttons, key_help, nearest_action
-from gvz.tasks import scenarios
+from gvz.tasks import all_scenarios
 
 
-@pytest.mark.parametrize("scenario", scenarios().values(), ids=str)
+@pytest.mark.parametrize("scenario", all_scenarios().values(), ids=str)
 def test_every_action_has_its_keys(scenario):
     actions = action_buttons(scenario, "combinations")
     key_of = {button: key for key, button in key_buttons(actions).items()}

@@ -11,7 +11,7 @@ from gvz.evaluation.play import play_episode
 from gvz.evaluation.players import CLASSES, FramePlayer, IdlePlayer
 from gvz.evaluation.scenarios.base import script_of, stated
 from gvz.evaluation.simple import player_env
-from gvz.tasks import scenarios
+from gvz.tasks import all_scenarios
 
 
 def play(kind: str, task: str, **fields) -> dict:
@@ -23,8 +23,8 @@ def play(kind: str, task: str, **fields) -> dict:
 
 
 def test_every_scenario_has_a_script_and_a_sweep_of_its_buttons():
-    assert discover("gvz.evaluation.scenarios").keys() == {*scenarios(), "base"}
-    for scenario in scenarios().values():
+    assert discover("gvz.evaluation.scenarios").keys() == {*all_scenarios(), "base"}
+    for scenario in all_scenarios().values():
         assert {button for button, _ in stated(scenario.id, "SWEEP")} <= set(scenario.buttons)
         assert callable(script_of(scenario.id))
 
@@ -41,7 +41,7 @@ def test_the_script_of_dodge_projectiles_is_the_sweep_episode_by_episode():
 
 
 @pytest.mark.engine
-@pytest.mark.parametrize("scenario", list(scenarios()))
+@pytest.mark.parametrize("scenario", list(all_scenarios()))
 def test_a_script_outdoes_doing_nothing(scenario):
     idle, scripted = (play(kind, f"{scenario}/default") for kind in ("idle", "scripted"))
     assert scripted["score"] > 1.5 * idle["score"]

@@ -17,7 +17,7 @@ from gvz.evaluation.players import CLASSES
 from gvz.evaluation.simple import player_env
 from gvz.scenarios.base import Scenario
 from gvz.scenarios.rewards import Pace, Reward, living, return_range
-from gvz.tasks import scenario_named, scenarios
+from gvz.tasks import all_scenarios, scenario_named, scenarios
 
 ALIVE = {"KILLCOUNT": 0, "PLAYER_KILLS": 0, "AMMO2": 26, "HEALTH": 100, "POSITION_X": 0, "POSITION_Y": 0}
 ALIVE |= {"POISONS_TAKEN": 0, "KITS_TAKEN": 0}
@@ -184,7 +184,7 @@ def test_the_page_says_which_ranges_there_are_and_how_wide_an_atom_is():
     table = re.findall(r"^\| (\w+) \| (-[\d.]+) \| ([\d.]+) \| ([\d.]+) \|", page, re.MULTILINE)
     said = {scenario: tuple(map(float, numbers)) for scenario, *numbers in table}
     wanted = {}
-    for scenario in scenarios().values():
+    for scenario in all_scenarios().values():
         low, high = scenario.return_range(EnvConfig(), 0.99)
         wanted[scenario.id] = (low, high, (high - low) / 50)
     assert said == {name: pytest.approx(numbers, abs=0.005) for name, numbers in wanted.items()}
@@ -194,7 +194,7 @@ def test_the_page_says_which_ranges_there_are_and_how_wide_an_atom_is():
 
 def test_an_atom_is_half_a_main_event_at_most_but_in_seek_and_kill_it_is_wider_than_a_kill():
     atoms = {}
-    for scenario in scenarios().values():
+    for scenario in all_scenarios().values():
         low, high = scenario.return_range(EnvConfig(), 0.99)
         atoms[scenario.id] = (high - low) / 50
     assert atoms.pop("seek_and_kill") > 1.0
@@ -202,6 +202,7 @@ def test_an_atom_is_half_a_main_event_at_most_but_in_seek_and_kill_it_is_wider_t
         ("defend_the_center", "kill"),
         ("health_gathering", "health_gained"),
         ("dodge_projectiles", "health_lost"),
+        ("find_the_key", "left"),
     ):
         assert atoms[scenario] <= abs(scenario_named(scenario).rewards[event].weight) / 2
 
@@ -211,6 +212,7 @@ TASKS = {
     "health_gathering": {"scripted": "poison+stimpacks", "sweep": "stimpacks", "idle": "poison"},
     "seek_and_kill": {"scripted": "invulnerable", "sweep": "mixed_enemies", "idle": "mixed_enemies"},
     "dodge_projectiles": {"scripted": "mancubus", "sweep": "default", "idle": "arachnotron"},
+    "find_the_key": {"scripted": "default", "sweep": "decoys", "idle": "default"},
 }
 """scenario -> player -> the task in which most of what is rewarded happens to it"""
 PLAYED_STEPS = 300
@@ -221,6 +223,7 @@ FILLED_SHARES = {
     "health_gathering": (0.15, 0.15),
     "seek_and_kill": (0.08, 0.3),
     "dodge_projectiles": (0.45, 0.1),
+    "find_the_key": (0.2, 0.15),
 }
 """How much of v_min and of v_max the three players reach, at least, in profile thesis at frame skip 4.
 
@@ -277,7 +280,7 @@ def ends_reached(scenario: Scenario, env: EnvConfig, events: np.ndarray, discoun
 @pytest.mark.engine
 @pytest.mark.parametrize("frame_skip", [1, 4, 7])
 @pytest.mark.parametrize("profile", get_args(Profile))
-@pytest.mark.parametrize("scenario", scenarios().values(), ids=str)
+@pytest.mark.parametrize("scenario", all_scenarios().values(), ids=str)
 def test_returns_of_real_games_lie_in_the_range(scenario: Scenario, profile: Profile, frame_skip: int):
     plain, reached = EnvConfig(profile=profile, frame_skip=frame_skip), []
     for player in ("scripted", "sweep") if frame_skip != 4 else ("scripted", "sweep", "idle"):
