@@ -11,7 +11,7 @@ from typing import Literal
 from actors.config import MAX_LANES, ActorsConfig
 from gvz.core.env_config import EnvConfig, leaves
 from gvz.core.errors import ConfigError
-from gvz.run.curriculum import CurriculumConfig, check_curriculum
+from gvz.run.curriculum_config import CurriculumConfig, check_curriculum
 from gvz.scenarios.base import Split
 from gvz.task_table import TaskTable, task_table
 from gvz.tasks import named_tasks

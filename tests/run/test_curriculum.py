@@ -9,7 +9,8 @@ import pytest
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError
 from gvz.run.config_files import load_config
-from gvz.run.curriculum import Curriculum, CurriculumConfig
+from gvz.run.curriculum import Curriculum
+from gvz.run.curriculum_config import CurriculumConfig
 from gvz.task_table import task_table
 from gvz.transport.messages import EpisodeStats
 

@@ -12,7 +12,7 @@ from gvz.core import records
 from gvz.core.env_config import EnvConfig
 from gvz.core.stop import StopRequest
 from gvz.run.config import LogConfig, RunConfig
-from gvz.run.curriculum import CurriculumConfig
+from gvz.run.curriculum_config import CurriculumConfig
 from gvz.run.rundir import RunDir
 from gvz.run.train import train
 from learner.agents.configs.dqn import DQNConfig
