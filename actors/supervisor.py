@@ -6,10 +6,11 @@ import msgspec
 import numpy as np
 
 from actors.config import ActorsConfig
-from actors.process import ActorProcess, log_path
+from actors.process import log_path, start_actor
 from gvz.core import janitor, records
 from gvz.core.errors import TransportError, WorkerError
 from gvz.transport.broadcast import BroadcastWriter
+from gvz.transport.child import ChildProcess
 from gvz.transport.messages import ActorSpec, Assign, EpisodeStats, Fault, Message, Ready
 from gvz.transport.ring import RingReader, WriterState
 
@@ -37,7 +38,7 @@ class SupervisedActor:
         """`params` is the queue that the actor takes its parameters from; None for random play."""
         name = f"gvz-ring-{spec.actor}"
         self.ring = RingReader.create(name, spec.ring_capacity, spec.frame_shape, spec.record_dtype)
-        self.process: ActorProcess | None = None
+        self.process: ChildProcess | None = None
         self.next_episodes = list(spec.first_episodes)
         self.restarts = 0
         self.failure: WorkerError | None = None
@@ -58,7 +59,7 @@ class SupervisedActor:
 
     def start(self) -> None:
         """Starts a process; does not wait for it."""
-        self.process = ActorProcess(self._spec, self.ring, self._params)
+        self.process = start_actor(self._spec, self.ring, self._params)
         self._ready_at, self._kill_at, self._silent_s = None, None, 0.0
         self._heartbeat_ns = self.ring.writer_status().heartbeat_ns
 

@@ -6,17 +6,14 @@ Everything that goes wrong becomes a `Fault` message and a non-zero exit.
 """
 
 import contextlib
-import faulthandler
 import os
-import signal
-import socket
 import sys
 import time
 import traceback
 
 from actors.loop import ActorLoop
-from gvz.core import janitor
 from gvz.core.errors import EngineError, WaitTimeoutError
+from gvz.transport import child
 from gvz.transport.broadcast import BroadcastReader
 from gvz.transport.channel import Channel
 from gvz.transport.messages import ActorSpec, Assign, Fault, Ready, Stop
@@ -96,12 +93,7 @@ class Worker:
 def main() -> int:
     """Entry point of the process; returns its exit code."""
     parent_pid, descriptor, ring, *params = map(int, sys.argv[1:])
-    janitor.die_with_parent(parent_pid)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the learner's to decide about
-    signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
-    faulthandler.enable()
-    faulthandler.register(signal.SIGUSR1, all_threads=True)
-    channel = Channel(socket.socket(fileno=descriptor), peer="the learner")
+    channel = child.begin(parent_pid, descriptor, parent="the learner")
     spec = channel.wait_for_message()
     if not isinstance(spec, ActorSpec):
         raise TypeError(f"first message: got {type(spec).__name__}, want ActorSpec")

@@ -24,8 +24,8 @@ def measure(budget: Budget) -> list[Row]:
     import jax
     import jax.numpy as jnp
 
-    from actors.process import one_core
     from gvz.run.assemble import assemble
+    from gvz.transport.child import one_core
     from learner.export import flatten_params
 
     cores, config = len(os.sched_getaffinity(0)), workload.run_config(budget)

@@ -27,6 +27,7 @@ GOALS = {
     7: ("growth", "Growth"),
     8: ("startup", "Start-up"),
     9: ("encoders", "Encoders"),
+    10: ("vector", "Vector environment"),
 }
 """number -> (benchmark, title); a benchmark may have figures and no goal"""
 RATES = ("decisions", "frames", "updates", "samples")

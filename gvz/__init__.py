@@ -16,9 +16,10 @@ if TYPE_CHECKING:
     from gvz.env import DoomEnv
     from gvz.multi_task import MultiTaskEnv
     from gvz.scenarios.base import Task
+    from gvz.vector.env import DoomVectorEnv
 
 __version__ = "0.1.0"
-__all__ = ["LABEL_CLASSES", "__version__", "make"]
+__all__ = ["LABEL_CLASSES", "__version__", "make", "make_vec"]
 
 
 @overload
@@ -39,6 +40,21 @@ def make(task: "str | Task | Sequence[str | Task]", **options: Any) -> "DoomEnv 
     from gvz.scenarios.base import Task
 
     return DoomEnv(task, **options) if isinstance(task, str | Task) else MultiTaskEnv(task, **options)
+
+
+def make_vec(
+    tasks: "Task | str | Sequence[Task | str]", num_envs: int | None = None, **options: Any
+) -> "DoomVectorEnv":
+    """Several games as one Gymnasium vector environment, played by worker processes.
+
+    Args:
+        tasks: a task, or several; game i plays tasks[i % len(tasks)].
+        num_envs: number of games; by default one for each task.
+        **options: arguments of gvz.vector.env.DoomVectorEnv and fields of gvz.core.env_config.EnvConfig.
+    """
+    from gvz.vector.env import DoomVectorEnv
+
+    return DoomVectorEnv(tasks, num_envs, **options)
 
 
 register_with_gymnasium()

@@ -33,7 +33,8 @@ _COUNTED = {"kills": "KILLCOUNT", "goals": "GOALS"}
 _SOLVED_EPISODES = 10
 _MAX_CRASHES = 3
 """crashes in a row, without a complete episode in between, after which the environment raises an error"""
-_EPISODE_SEEDS = 2**31
+EPISODE_SEEDS = 2**31
+"""an episode's seed is smaller than this"""
 
 
 class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
@@ -162,9 +163,9 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         if options and "episode_seed" in options:
             self._episode_seed = int(options["episode_seed"])
         else:
-            self._episode_seed = int(self.np_random.integers(_EPISODE_SEEDS))
-        if not 0 <= self._episode_seed < _EPISODE_SEEDS:
-            raise ValueError(f"reset: episode_seed {self._episode_seed}, want 0..{_EPISODE_SEEDS - 1}")
+            self._episode_seed = int(self.np_random.integers(EPISODE_SEEDS))
+        if not 0 <= self._episode_seed < EPISODE_SEEDS:
+            raise ValueError(f"reset: episode_seed {self._episode_seed}, want 0..{EPISODE_SEEDS - 1}")
         if self._recycle_episodes and self._engine_episodes >= self._recycle_episodes:
             self._stop_engine()
         engine, crash = self._begin()

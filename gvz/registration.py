@@ -28,7 +28,12 @@ def register_envs() -> None:
     for task in (task for scenario in all_scenarios() for task in named_tasks(scenario)):
         name = gymnasium_id(task)
         if name not in gymnasium.registry:
-            gymnasium.register(name, entry_point="gvz.env:DoomEnv", kwargs={"task": task.id})
+            gymnasium.register(
+                name,
+                entry_point="gvz.env:DoomEnv",
+                vector_entry_point="gvz.vector.env:of_task",
+                kwargs={"task": task.id},
+            )
 
 
 def register_with_gymnasium() -> None:

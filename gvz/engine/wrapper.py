@@ -26,7 +26,7 @@ def main(owner_pid: int, directory: str, log: str, engine: str, arguments: list[
         for queue in ("MQCtr", "MQDoom"):
             Path(f"/dev/shm/ViZDoom{queue}{instance_id}").unlink(missing_ok=True)
         sys.exit(1)
-    os.setsid()  # the terminal's Ctrl-C is for the owner, who then ends the engine in order
+    os.setpgid(0, 0)  # the terminal's Ctrl-C is for the owner. No session: see gvz/transport/child.py
     os.chdir(directory)  # the engine writes _vizdoom/ here ...
     os.environ["HOME"] = directory  # ... and would look for its settings in the user's home
     start = Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]

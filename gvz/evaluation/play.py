@@ -20,13 +20,13 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from actors.process import one_core
 from gvz.core import janitor
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import EngineError, GvzError, WaitTimeoutError
 from gvz.core.stop import StopRequest
 from gvz.core.watchdog import AwakeClock
 from gvz.evaluation.players import Player
+from gvz.transport.child import one_core
 
 if TYPE_CHECKING:
     from gvz.env import DoomEnv

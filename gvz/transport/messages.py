@@ -1,4 +1,5 @@
-"""The data between actors and learner: the step record (shared memory) and control messages (msgpack).
+"""The data between actors and learner: the step record (shared memory) and control messages (msgpack). Control messages
+between a vector environment and its workers are here, too.
 
 The step record is aligned on arrival, as in dm_env and in the papers' subscripts: record t holds the frame o_t,
 the reward and the end flags that *came with* o_t, and the action a_t taken *at* o_t. An episode of T decisions is
@@ -189,7 +190,76 @@ class ActorSpec(Play, frozen=True, kw_only=True, tag="actor_spec"):
     """private directory for the engines' files and the worker's logs"""
 
 
-Message = EpisodeStats | Ready | Fault | Stop | Assign | ActorSpec
+class VectorSpec(_Message, frozen=True, tag="vector_spec"):
+    """What a worker of a vector environment plays, environment -> worker, sent once as the first message."""
+
+    worker: Count
+    games: list[Count]
+    """their rows in the shared arrays"""
+    tasks: list[str]
+    """id of each game's task"""
+    num_envs: Count
+    """rows of the shared arrays"""
+    num_workers: Count
+    env_config: dict[str, Any]
+    """of plain types"""
+    options: dict[str, Any]
+    """other arguments of DoomEnv"""
+    same_step: bool
+    """a game that ends begins its next episode within the same decision"""
+    answer_after: Count
+    """outcomes that are sent together; fewer only if no decision is left"""
+
+
+class Decision(msgspec.Struct, frozen=True, array_like=True):
+    """What one game does next."""
+
+    game: Count
+    half: Count
+    """which half of the shared arrays the observation goes into, 0 or 1"""
+    action: Count | None
+    """None begins an episode"""
+    episode_seed: Count
+    """of the episode that begins, if one does"""
+
+
+class Decisions(_Message, frozen=True, tag="decisions"):
+    """The next decisions of some games, environment -> worker."""
+
+    decisions: list[Decision]
+
+
+class Outcome(msgspec.Struct, frozen=True, array_like=True):
+    """What a decision came to. The observation is in shared memory."""
+
+    game: Count
+    reward: float
+    terminated: bool
+    truncated: bool
+    info: dict[str, Any]
+    final_info: dict[str, Any] | None = None
+    """of the step that ended the episode, if the next one has begun within the same decision"""
+
+
+class Outcomes(_Message, frozen=True, tag="outcomes"):
+    """The outcomes of some decisions, worker -> environment."""
+
+    outcomes: list[Outcome]
+
+
+class Render(_Message, frozen=True, tag="render"):
+    """Asks for the last rendered screen of every game, environment -> worker."""
+
+
+class Screens(_Message, frozen=True, tag="screens"):
+    """The answer, worker -> environment: u8[render_height render_width 3] of each game."""
+
+    screens: list[bytes]
+
+
+Message = (
+    EpisodeStats | Ready | Fault | Stop | Assign | ActorSpec | VectorSpec | Decisions | Outcomes | Render | Screens
+)
 _DECODER = msgspec.msgpack.Decoder(Message)
 
 

@@ -43,10 +43,18 @@ class Segment:
         self.payload = memoryview(mapping)[HEADER_BYTES:]
 
     @classmethod
-    def create(cls, name: str, payload_bytes: int, *, layout_hash: int) -> "Segment":
+    def create(
+        cls,
+        name: str,
+        payload_bytes: int,
+        *,
+        layout_hash: int,
+        advice: str = "lower actors.ring_capacity or actors.num_actors",
+    ) -> "Segment":
         """Creates a segment. Its memory is allocated at once and filled with POISON. Its size can never change.
 
-        Several segments may have the same name. `attach` must pass the same `layout_hash`, a u64.
+        Several segments may have the same name. `attach` must pass the same `layout_hash`, a u64. `advice` says how a
+        user makes it smaller.
 
         Raises:
             ResourceError: there is not enough memory.
@@ -54,10 +62,7 @@ class Segment:
         total = HEADER_BYTES + payload_bytes
         available = _available_bytes()
         if total > available:  # the kernel would not refuse, but kill processes to make room
-            raise ResourceError(
-                f"segment {name}: got {available} bytes of available memory, want {total}; "
-                "lower actors.ring_capacity or actors.num_actors"
-            )
+            raise ResourceError(f"segment {name}: got {available} bytes of available memory, want {total}; {advice}")
         descriptor = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         try:
             os.posix_fallocate(descriptor, 0, total)

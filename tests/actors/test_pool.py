@@ -27,7 +27,7 @@ def test_records_come_from_all_actors_and_episodes_are_reported(tmp_path: Path):
         run = Run(pool, pool_config)
         pids = run.until_all_ready()
         for pid in pids:
-            assert os.getsid(pid) == pid, "a terminal's Ctrl-C does not reach the actors"
+            assert os.getpgid(pid) == pid, "a terminal's Ctrl-C does not reach the actors"
             os.kill(pid, signal.SIGINT)  # and another's changes nothing
         run.play(2000)
         stats = pool.statistics()

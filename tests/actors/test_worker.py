@@ -16,7 +16,7 @@ from fake_env import FRAME_SHAPE, config, export_act
 from actors import worker
 from actors.pool import lanes_to_begin_with
 from actors.preprocess import ObservationBatch
-from actors.process import ActorProcess, log_path
+from actors.process import log_path, start_actor
 from actors.worker import Worker
 from gvz.core import records
 from gvz.core.errors import WaitTimeoutError
@@ -102,7 +102,7 @@ def test_a_worker_whose_parent_has_gone_ends_at_once():
 
 def test_told_to_stop_it_ends_well(spec: ActorSpec, ring: RingReader, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_max_isa=AVX2")
-    process = ActorProcess(spec, ring, None)
+    process = start_actor(spec, ring, None)
     try:
         while not any(isinstance(message, Ready) for message in process.channel.receive()):
             assert process.exit_text() is None

@@ -15,7 +15,24 @@ from gvz.core.errors import TransportError, WaitTimeoutError
 from gvz.transport import broadcast
 from gvz.transport.broadcast import BroadcastReader, BroadcastWriter
 from gvz.transport.channel import MAX_MESSAGE_BYTES, Channel
-from gvz.transport.messages import ActorSpec, Assign, EpisodeStats, Fault, ParamsHeader, Ready, Stop, decode, encode
+from gvz.transport.messages import (
+    ActorSpec,
+    Assign,
+    Decision,
+    Decisions,
+    EpisodeStats,
+    Fault,
+    Outcome,
+    Outcomes,
+    ParamsHeader,
+    Ready,
+    Render,
+    Screens,
+    Stop,
+    VectorSpec,
+    decode,
+    encode,
+)
 from gvz.transport.ring import RingReader, WriterState
 from gvz.transport.segment import HEADER_BYTES, Segment
 from tests.fuzz.target import Target
@@ -65,6 +82,21 @@ MESSAGES = [
         layout_hash=2**64 - 1,
         work_dir="/x",
     ),
+    VectorSpec(
+        worker=0,
+        games=[0, 1],
+        tasks=["a/b", "a/c"],
+        num_envs=4,
+        num_workers=2,
+        env_config={"k": [1, None]},
+        options={"render_mode": None},
+        same_step=True,
+        answer_after=2,
+    ),
+    Decisions(decisions=[Decision(0, 1, None, 5), Decision(1, 0, 2, 6)]),
+    Outcomes(outcomes=[Outcome(0, 0.5, False, True, {"score": 1.0}, {"score": 2.0})]),
+    Render(),
+    Screens(screens=[b"\0\1"]),
 ]
 
 

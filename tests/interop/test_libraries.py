@@ -48,6 +48,11 @@ def test_a_cleanrl_style_dqn_plays_and_learns(tmp_path):
     assert "of 1100, epsilon" in out
 
 
+def test_a_cleanrl_style_ppo_learns_from_the_vector_environment(tmp_path):
+    out = run("cleanrl_style_ppo.py", "--steps", "1280", "--num-envs", "4", "--num-steps", "160", where=tmp_path)
+    assert ": score " in out
+
+
 def test_tianshou_trains_and_tests(tmp_path):
     out = run("tianshou_dqn.py", "--epochs", "1", "--epoch-steps", "48", where=tmp_path)
     assert "best reward of a test episode: " in out

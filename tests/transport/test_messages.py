@@ -40,10 +40,12 @@ def values(kind: Any) -> st.SearchStrategy[Any]:
         return st.tuples(*map(values, args))
     if type(None) in args:
         return st.none() | values(args[0])
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        return messages_of(kind)
     return KINDS[kind]
 
 
-def messages_of(cls: type[Message]) -> st.SearchStrategy[Message]:
+def messages_of(cls: type[Any]) -> st.SearchStrategy[Any]:
     hints = typing.get_type_hints(cls)
     return st.builds(cls, **{field.name: values(hints[field.name]) for field in msgspec.structs.fields(cls)})
 

@@ -1,0 +1,113 @@
+"""What a user gives to a vector environment, checked."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from gvz.core.env_config import typed
+from gvz.core.errors import ConfigError
+from gvz.env import EPISODE_SEEDS
+from gvz.scenarios.base import Task
+
+
+def task_ids(tasks: Task | str | Sequence[Task | str]) -> list[str]:
+    """Ids of one task or of several.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    several = [tasks] if isinstance(tasks, Task | str) else list(tasks)
+    if not several:
+        raise ConfigError("make_vec: got no task, want at least one, for example 'defend_the_center/gore'")
+    return [task.id if isinstance(task, Task) else task for task in several]
+
+
+def number(name: str, value: int | None, *, default: int, most: int | None = None) -> int:
+    """A number of things.
+
+    Raises:
+        ConfigError: it is no int, or outside 1..most.
+    """
+    count: int = default if value is None else typed(int, value, f"make_vec: {name}")
+    if count < 1 or (most is not None and count > most):
+        raise ConfigError(f"make_vec: got {name}={count}, want {'1 or more' if most is None else f'1..{most}'}")
+    return count
+
+
+def autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    """Gymnasium's mode, or the one with this value.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    values = [known.value for known in AutoresetMode]
+    if mode not in (*AutoresetMode, *values):
+        raise ConfigError(f"make_vec: got autoreset_mode {mode!r}, want one of {', '.join(values)}")
+    return AutoresetMode(mode)
+
+
+def game_numbers(env_ids: np.ndarray | None, num_envs: int) -> np.ndarray:
+    """int[B], each game at most once; None stands for all.
+
+    Raises:
+        ValueError: no such game, or one twice.
+    """
+    if env_ids is None:
+        return np.arange(num_envs)
+    games = np.asarray(env_ids)
+    if games.ndim != 1 or not np.issubdtype(games.dtype, np.integer) or not np.isin(games, np.arange(num_envs)).all():
+        raise ValueError(f"env_ids: got {games.tolist()}, want a list of numbers from 0 to {num_envs - 1}")
+    if len(np.unique(games)) < len(games):
+        raise ValueError(f"env_ids: got {games.tolist()}, want each game once")
+    return games
+
+
+def action_numbers(actions: np.ndarray, games: np.ndarray, num_actions: int) -> list[int]:
+    """One action for each of these games.
+
+    Raises:
+        ValueError: another number of actions, another type, or no such action.
+    """
+    actions = np.asarray(actions)
+    if actions.shape != games.shape or not np.issubdtype(actions.dtype, np.integer):
+        raise ValueError(f"actions: got {actions.dtype}{list(actions.shape)}, want int{list(games.shape)}")
+    if ((actions < 0) | (actions >= num_actions)).any():
+        raise ValueError(f"actions: got {actions.tolist()}, want 0..{num_actions - 1}")
+    return actions.tolist()
+
+
+def seeds(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:
+    """The seed of each game: seed + i, or seed[i].
+
+    Raises:
+        ValueError: not one seed for each game.
+    """
+    if seed is None:
+        return [None] * num_envs
+    if isinstance(seed, int | np.integer):
+        return [int(seed) + game for game in range(num_envs)]
+    if len(seed) != num_envs:
+        raise ValueError(f"reset: got {len(seed)} seeds, want {num_envs}, one for each game")
+    return list(seed)
+
+
+def reset_options(options: dict[str, object] | None, num_envs: int) -> tuple[int | None, np.ndarray]:
+    """(episode seed, mask bool[N] of the games to reset) of the options of `reset`.
+
+    Raises:
+        ValueError: an unknown option, an episode seed outside [0, 2^31), or what is no mask.
+    """
+    options = options or {}
+    if unknown := options.keys() - {"episode_seed", "reset_mask"}:
+        raise ValueError(f"reset: unknown options {sorted(unknown)}, want episode_seed or reset_mask")
+    episode_seed, mask = options.get("episode_seed"), options.get("reset_mask")
+    if episode_seed is not None:
+        episode_seed = int(episode_seed)  # pyright: ignore[reportArgumentType]  # what is none raises ValueError here
+        if not 0 <= episode_seed < EPISODE_SEEDS:
+            raise ValueError(f"reset: episode_seed {episode_seed}, want 0..{EPISODE_SEEDS - 1}")
+    if mask is None:
+        return episode_seed, np.ones(num_envs, bool)
+    if not isinstance(mask, np.ndarray) or mask.dtype != bool or mask.shape != (num_envs,) or not mask.any():
+        raise ValueError(f"reset: reset_mask {mask!r}, want a numpy array bool[{num_envs}] with at least one True")
+    return episode_seed, mask

@@ -1,0 +1,243 @@
+"""`gvz.make_vec` beside gymnasium's SyncVectorEnv over the same games, and its own way of `send` and `recv`."""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError, ResetNeeded
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import gvz
+from gvz.core.errors import ConfigError, TaskError
+from gvz.env import DoomEnv
+from gvz.vector.env import DoomVectorEnv
+from gvz.vector.infos import batch_infos
+
+TASKS = ("defend_the_center/gore", "health_gathering/default", "dodge_projectiles/default")
+MODES = tuple(AutoresetMode)
+
+
+def assert_same(ours: Any, theirs: Any, where: str = "") -> None:
+    """Equal in type, dtype and value, through dicts and arrays of objects."""
+    if isinstance(theirs, dict):
+        assert ours.keys() == theirs.keys(), where
+        for key, value in theirs.items():
+            assert_same(ours[key], value, f"{where}/{key}")
+    elif isinstance(theirs, np.ndarray) and theirs.dtype == object:
+        assert ours.shape == theirs.shape, where
+        for index, value in enumerate(theirs):
+            assert_same(ours[index], value, f"{where}[{index}]")
+    else:
+        assert type(ours) is type(theirs), where
+        assert np.asarray(ours).dtype == np.asarray(theirs).dtype, where
+        np.testing.assert_array_equal(ours, theirs, where)
+
+
+def without_ids(infos: dict[str, Any], tasks: tuple[str, ...]) -> dict[str, Any]:
+    """Infos as gymnasium has them; checks what we add to them."""
+    infos = dict(infos)
+    mask = infos.pop("_task")
+    np.testing.assert_array_equal(infos.pop("_env_id"), mask)
+    np.testing.assert_array_equal(infos.pop("env_id"), np.where(mask, np.arange(len(tasks)), 0))
+    assert [task for task, there in zip(infos.pop("task"), mask, strict=True) if there] == [
+        task for task, there in zip(tasks, mask, strict=True) if there
+    ]
+    return infos
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("mode", MODES)
+def test_it_equals_gymnasiums_over_the_same_games(mode: AutoresetMode):
+    """Tasks of three scenarios, a dict of observations, seeds of all kinds, some episodes of every game."""
+    fields = {"action_set": "unified", "buffers": ("labels",), "frame_skip": 35, "grayscale": True}
+    ours = gvz.make_vec(TASKS, autoreset_mode=mode, num_workers=2, **fields)
+    theirs = SyncVectorEnv([partial(DoomEnv, task, **fields) for task in TASKS], autoreset_mode=mode)
+    try:
+        assert ours.metadata == theirs.metadata
+        assert ours.observation_space == theirs.observation_space
+        assert ours.action_space == theirs.action_space
+        rng, num_ends = np.random.default_rng(1), np.zeros(len(TASKS), int)
+        for start in ({"seed": 7}, {"seed": [3, None, 5]}, {"options": {"episode_seed": 11}}, {}):
+            (observations, infos), wanted = ours.reset(**start), theirs.reset(**start)
+            assert_same(observations, wanted[0])
+            assert_same(without_ids(infos, TASKS), wanted[1])
+            for _ in range(30):
+                actions = rng.integers(ours.single_action_space.n, size=len(TASKS))
+                *batch, infos = ours.step(actions)
+                *wanted, wanted_infos = theirs.step(actions)
+                for got, want in zip(batch, wanted, strict=True):
+                    assert_same(got, want)
+                assert_same(without_ids(infos, TASKS), wanted_infos)
+                ended = batch[2] | batch[3]
+                num_ends += ended
+                if ended.any() and mode is AutoresetMode.DISABLED:
+                    observations, infos = ours.reset(options={"reset_mask": ended})
+                    wanted = theirs.reset(options={"reset_mask": ended})
+                    assert_same(observations, wanted[0])
+                    assert_same(without_ids(infos, TASKS), wanted[1])
+        assert (num_ends > 0).all()
+    finally:
+        ours.close()
+        theirs.close()
+
+
+@pytest.fixture(scope="module")
+def envs() -> Iterator[DoomVectorEnv]:
+    """Three games of one worker and one of another, in batches of two."""
+    made = gvz.make_vec("defend_the_center/default", 3, batch_size=2, num_workers=2, frame_skip=35)
+    yield made
+    made.close()
+
+
+@pytest.mark.engine
+def test_recv_gives_a_batch_of_those_that_are_ready_and_every_game_its_own_way(envs: DoomVectorEnv):
+    alone = [DoomEnv("defend_the_center/default", frame_skip=35) for _ in range(3)]
+    first, _ = envs.reset(seed=4)
+    for game, env in enumerate(alone):
+        np.testing.assert_array_equal(first[game], env.reset(seed=4 + game)[0])
+    over, num_answers = [False] * 3, [0] * 3
+    envs.send(np.full(3, 1))
+    for _ in range(40):
+        observations, rewards, terminated, truncated, infos = envs.recv()
+        games = infos["env_id"]
+        assert games.tolist() in ([0, 1], [0, 2], [1, 2])
+        assert observations.shape == (2, 84, 84, 3)
+        assert infos["task"].tolist() == ["defend_the_center/default"] * 2
+        assert infos["_score"].tolist() == [True, True]
+        for row, game in enumerate(games.tolist()):
+            env = alone[game]
+            want = (env.reset()[0], 0.0, False, False) if over[game] else env.step(1)[:4]
+            np.testing.assert_array_equal(observations[row], want[0])
+            assert (rewards[row], terminated[row], truncated[row]) == want[1:]
+            over[game] = terminated[row] or truncated[row]
+            num_answers[game] += 1
+        envs.send(np.full(2, 1), games)
+    assert min(num_answers) > 5
+    assert envs.reset(seed=4)[0].tobytes() == first.tobytes(), "reset drops what is on its way"
+    for env in alone:
+        env.close()
+
+
+@pytest.mark.engine
+def test_calls_out_of_turn_are_errors_and_change_nothing(envs: DoomVectorEnv):
+    envs.reset(seed=1)
+    with pytest.raises(NoAsyncCallError, match="recv: 0 games have an action, want 2; send first"):
+        envs.recv()
+    for actions, env_ids, message in (
+        ([0, 1], None, r"actions: got int64\[2\], want int\[3\]"),
+        ([0.0, 1.0, 1.0], None, r"actions: got float64\[3\], want int\[3\]"),
+        ([0, 1, 3], None, r"actions: got \[0, 1, 3\], want 0..2"),
+        ([0], [3], r"env_ids: got \[3\], want a list of numbers from 0 to 2"),
+        ([0, 0], [1, 1], r"env_ids: got \[1, 1\], want each game once"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            envs.send(np.array(actions), env_ids if env_ids is None else np.array(env_ids))
+    envs.send(np.array([1]), np.array([2]))
+    with pytest.raises(AlreadyPendingCallError, match=r"send: recv has not taken the answers of games \[2\]"):
+        envs.step(np.array([1, 1, 1]))
+    for options, message in (
+        ({"seed": 1}, "unknown options \\['seed'\\], want episode_seed or reset_mask"),
+        ({"episode_seed": -1}, "episode_seed -1, want 0..2147483647"),
+        ({"reset_mask": [True] * 3}, r"want a numpy array bool\[3\] with at least one True"),
+        ({"reset_mask": np.zeros(3, bool)}, r"want a numpy array bool\[3\] with at least one True"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            envs.reset(options=options)
+    with pytest.raises(ValueError, match="reset: got 2 seeds, want 3, one for each game"):
+        envs.reset(seed=[1, 2])
+    _, infos = envs.reset(seed=1)
+    assert infos["episode_frames"].tolist() == [0, 0, 0]
+
+
+@pytest.mark.engine
+def test_views_show_the_shared_memory_and_last_until_the_call_after_the_next_one():
+    copies, views = (
+        gvz.make_vec("defend_the_center/default", 2, copy=copy, render_mode="rgb_array") for copy in (True, False)
+    )
+    with pytest.raises(ResetNeeded, match=r"send: games \[0, 1\] have not begun; call reset first"):
+        views.step(np.array([1, 1]))
+    before_copy, before_view = copies.reset(seed=1)[0], views.reset(seed=1)[0]
+    for _ in range(3):
+        copy, view = copies.step(np.array([1, 2]))[0], views.step(np.array([1, 2]))[0]
+        np.testing.assert_array_equal(view, copy)
+        np.testing.assert_array_equal(before_view, before_copy)
+        before_copy, before_view = copy, view
+    mask = np.array([False, True])
+    copy, view = (envs.reset(options={"reset_mask": mask, "episode_seed": 9})[0] for envs in (copies, views))
+    np.testing.assert_array_equal(view, copy)
+    np.testing.assert_array_equal(view[0], before_copy[0], "it was not reset")
+    assert view.base is not None
+    assert copy.base is None or copy.base.nbytes == copy.nbytes
+    screens = views.render()
+    assert screens is not None
+    assert [screen.shape for screen in screens] == [(144, 256, 3)] * 2
+    env = DoomEnv("defend_the_center/default", render_mode="rgb_array")
+    env.reset(options={"episode_seed": 9})
+    np.testing.assert_array_equal(screens[1], env.render())
+    env.close()
+    for envs in (copies, views):
+        envs.close()
+        envs.close()
+    assert view.shape == (2, 84, 84, 3), "a view outlives the environment"
+    with pytest.raises(ClosedEnvironmentError, match="send: the vector environment was closed"):
+        views.step(np.array([1, 1]))
+
+
+@pytest.mark.engine
+def test_gymnasium_makes_it_by_the_tasks_id():
+    envs = gymnasium.make_vec(
+        "GViZDoom/DefendTheCenter-Gore-v0", num_envs=2, vectorization_mode="vector_entry_point", grayscale=True
+    )
+    assert isinstance(envs, DoomVectorEnv)
+    assert envs.tasks == ("defend_the_center/gore",) * 2
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(envs)
+    assert envs.reset(seed=1)[0].shape == (2, 84, 84, 1)
+    assert envs.step(np.array([1, 1]))[4]["task"].tolist() == ["defend_the_center/gore"] * 2
+    envs.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        (([],), ConfigError, "got no task, want at least one"),
+        (("defend_the_center/gor", 2), TaskError, "did you mean"),
+        (("defend_the_center/gore", 0), ConfigError, "got num_envs=0, want 1 or more"),
+        (("defend_the_center/gore", 2, None, {"batch_size": 3}), ConfigError, "got batch_size=3, want 1..2"),
+        (("defend_the_center/gore", 2, None, {"num_workers": 3}), ConfigError, "got num_workers=3, want 1..2"),
+        (("defend_the_center/gore", 2, None, {"num_workers": 1.0}), ConfigError, "num_workers: got 1.0, want int"),
+        (("defend_the_center/gore", 2, None, {"autoreset_mode": "next"}), ConfigError, "want one of NextStep, SameSt"),
+        (("defend_the_center/gore", 2, None, {"copy": False, "batch_size": 1}), ConfigError, "batch_size=1, want 2"),
+        (("defend_the_center/gore", 2, None, {"render_mode": "human"}), ConfigError, "want None or 'rgb_array'"),
+        (("defend_the_center/gore", 2, None, {"frame_skp": 4}), ConfigError, "unknown options"),
+        (
+            (("defend_the_center/default", "seek_and_kill/default"),),
+            ConfigError,
+            "has 3 actions and seek_and_kill/d.* has 5",
+        ),
+    ],
+)
+def test_wrong_arguments_are_refused_before_a_process_starts(arguments: tuple, error: type[Exception], message: str):
+    positional, options = arguments[:3], arguments[3] if len(arguments) > 3 else {}
+    with pytest.raises(error, match=message):
+        DoomVectorEnv(*positional, **options)
+
+
+def test_infos_of_some_games_have_masks():
+    batch = batch_infos([{"a": 1, "b": {"c": 0.5}, "final_obs": {"x": 1}}, None, {"a": 2, "d": "text", "b": {}}])
+    assert_same(
+        batch,
+        {
+            "a": np.array([1, 0, 2]),
+            "_a": np.array([True, False, True]),
+            "b": {"c": np.array([0.5, 0.0, 0.0]), "_c": np.array([True, False, False])},
+            "_b": np.array([True, False, True]),
+            "final_obs": np.array([{"x": 1}, None, None], object),
+            "_final_obs": np.array([True, False, False]),
+            "d": np.array([None, None, "text"], object),
+            "_d": np.array([False, False, True]),
+        },
+    )
