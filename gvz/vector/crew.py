@@ -97,6 +97,8 @@ class Crew:
         """of games whose episode was lost with their worker, until the next one has begun"""
         self._begin_errors: dict[int, str] = {}
         """by game: how the worker died that was to begin its episode"""
+        self._lost: dict[int, str] = {}
+        """by game: how its worker died while the game waited for a decision"""
         self._workers: list[_Worker] = []
         self._worker_of: dict[int, _Worker] = {}
         try:
@@ -121,7 +123,11 @@ class Crew:
     def send(self, decisions: Sequence[Decision]) -> None:
         """Hands decisions to the workers of their games; each game's last one has been answered."""
         for worker in self._workers:
-            mine = [decision for decision in decisions if self._worker_of[decision.game] is worker]
+            mine = []
+            for decision in decisions:
+                if self._worker_of[decision.game] is worker:
+                    error = self._lost.pop(decision.game, None)
+                    mine += [decision] if error is None else self._cut(decision, error)
             if mine:
                 worker.send(mine)
 
@@ -180,13 +186,13 @@ class Crew:
         poll = select.poll()
         for worker in busy:
             poll.register(worker.process.channel, select.POLLIN)
-        if not poll.poll(1000 * _POLL_S):
-            for worker in busy:
-                silent_s = worker.silent_s(int(self._frames.progress[worker.spec.worker]))
-                if silent_s > SILENCE_TIMEOUT_S:
-                    worker.process.dump_stacks()
-                    worker.process.wait(_DUMP_S)
-                    self._replace(worker, f"finished no decision in {silent_s:.0f} s")
+        poll.poll(1000 * _POLL_S)
+        for worker in busy:
+            silent_s = worker.silent_s(int(self._frames.progress[worker.spec.worker]))
+            if silent_s > SILENCE_TIMEOUT_S:
+                worker.process.dump_stacks()
+                worker.process.wait(_DUMP_S)
+                self._replace(worker, f"finished no decision in {silent_s:.0f} s")
 
     def _hear(self, worker: _Worker) -> None:
         """Takes the outcomes that have come from a worker; replaces it if it has ended."""
@@ -216,8 +222,8 @@ class Crew:
         self._outcomes.append(outcome)
 
     def _replace(self, worker: _Worker, what: str) -> None:
-        """Ends what is left of a worker, starts the next, and answers for the decisions that were lost."""
-        lost, worker.pending = worker.pending, {}
+        """Ends what is left of a worker, starts the next, and sees to the games that it had."""
+        pending, worker.pending = worker.pending, {}
         what = f"worker {worker.spec.worker} (pid {worker.process.pid}) {what}"
         worker.process.end(grace_s=0.0)
         janitor.clean_dead_instances()
@@ -228,24 +234,26 @@ class Crew:
                 f"between{worker.log_tail()}"
             )
         worker.start()
-        again = []
-        for game, decision in lost.items():
-            if decision.action is None:
-                if game not in self._final_infos:
-                    self._begin_errors[game] = what
-                again.append(decision)
-                continue
-            info = _crash_info(self._last_infos[game], what)
-            self._frames.repeat(game, decision.half)
-            if worker.spec.same_step:
-                for name, part in self._frames.halves.items():
-                    self._frames.final[name][game] = part[decision.half, game]
-                self._final_infos[game] = info
-                again.append(msgspec.structs.replace(decision, action=None))
-            else:
-                self._outcomes.append(Outcome(game, 0.0, False, True, info))
-        if again:
+        waiting = self._last_infos.keys() & set(worker.spec.games) - pending.keys()
+        self._lost |= dict.fromkeys(waiting, what)
+        if again := [one for decision in pending.values() for one in self._cut(decision, what)]:
             worker.send(again)
+
+    def _cut(self, decision: Decision, error: str) -> list[Decision]:
+        """Answers for a worker that died with the game's episode; returns what its successor is to do."""
+        game = decision.game
+        if decision.action is None:
+            if game not in self._final_infos:
+                self._begin_errors[game] = error
+            return [decision]
+        info = _crash_info(self._last_infos[game], error)
+        self._frames.repeat(game, decision.half)
+        if not self._frames.final:
+            self._outcomes.append(Outcome(game, 0.0, False, True, info))
+            return []
+        self._frames.repeat_final(game, decision.half)
+        self._final_infos[game] = info
+        return [msgspec.structs.replace(decision, action=None)]
 
 
 def _crash_info(last: dict[str, Any], error: str) -> dict[str, Any]:

@@ -239,7 +239,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
 
         Raises:
             ClosedEnvironmentError, GvzError: as `recv`.
-            ResetNeeded: a game has not begun. AlreadyPendingCallError: as `send`.
+            ResetNeeded: a game has not begun, or its worker has died. AlreadyPendingCallError: as `send`.
         """
         self._require_open("render")
         if self.render_mode is None:
@@ -249,6 +249,8 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         self._require_idle("render", games)
         with self._closed_by_errors():
             screens = self._crew.render()
+        if lost := [game for game, screen in screens.items() if not screen]:
+            raise ResetNeeded(f"render: games {lost} have rendered nothing since their worker died; play on, or reset")
         shape = (self._config.render_height, self._config.render_width, 3)
         return tuple(np.frombuffer(screens[game], np.uint8).reshape(shape) for game in games.tolist())
 
@@ -334,7 +336,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
     def _closed_by_errors(self) -> Generator[None, None, None]:
         try:
             yield
-        except GvzError:
+        except (GvzError, OSError):
             self.close()
             raise
 

@@ -100,6 +100,11 @@ class Frames:
         for part in self.halves.values():
             part[half, game] = part[1 - half, game]
 
+    def repeat_final(self, game: int, half: int) -> None:
+        """The observation in this half is the last of its episode."""
+        for name, part in self.halves.items():
+            self.final[name][game] = part[half, game]
+
     def copy(self, games: np.ndarray, halves: np.ndarray) -> Observation:
         """Copies of the observations of some games, uint8[B, H, W, C]; `halves` int[B] says where each one is."""
         return self._observation({name: part[halves, games] for name, part in self.halves.items()})

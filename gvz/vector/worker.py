@@ -8,12 +8,15 @@ When the environment's process ends, however it ends, the kernel sends SIGTERM. 
 removes their files.
 """
 
+import contextlib
 import os
 import select
 import signal
 import sys
 import traceback
 from collections import deque
+
+from gymnasium.error import ResetNeeded
 
 from gvz.core.env_config import EnvConfig
 from gvz.env import DoomEnv, make_env
@@ -77,9 +80,13 @@ class Worker:
         return Outcome(game, reward, terminated, truncated, info, final_info)
 
     def _render(self) -> None:
-        screens = [self._envs[game].render() for game in self._spec.games]
-        assert all(screen is not None for screen in screens), "render mode is rgb_array"
-        self._channel.send(Screens(screens=[screen.tobytes() for screen in screens if screen is not None]))
+        screens = []
+        for game in self._spec.games:
+            with contextlib.suppress(ResetNeeded):  # of a worker that was replaced
+                screens.append(self._envs[game].render())
+                continue
+            screens.append(None)
+        self._channel.send(Screens(screens=[b"" if screen is None else screen.tobytes() for screen in screens]))
 
 
 def main() -> int:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-from gymnasium.error import ClosedEnvironmentError
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.vector import AutoresetMode
 
 import gvz
@@ -107,6 +107,27 @@ def test_same_step_gives_the_lost_episode_its_end_and_begins_the_next():
     assert infos["engine_crash"].tolist() == [False, False]
     assert infos["episode_frames"].tolist() == [0, 0]
     assert infos["episode_seed"].tolist() == [second_seeds(1)[1], second_seeds(2)[1]]
+    envs.close()
+
+
+def test_games_that_waited_for_an_action_when_their_worker_died_are_cut_too():
+    envs = gvz.make_vec(TASK, 2, num_workers=1, batch_size=1, render_mode="rgb_array")
+    envs.reset(seed=1)
+    envs.send(TURN)
+    (waiting,) = envs.recv()[4]["env_id"]
+    before = envs._frames.copy(np.array([waiting]), envs._halves[[waiting]])
+    os.kill(envs._crew.pids[0], signal.SIGKILL)
+    infos = envs.recv()[4]
+    assert infos["env_id"].tolist() == [1 - waiting]
+    with pytest.raises(ResetNeeded, match=rf"render: games \[.*{waiting}.*\] have rendered nothing since their worker"):
+        envs.render()
+    envs.send(TURN[:1], [waiting])
+    observation, reward, terminated, truncated, infos = envs.recv()
+    np.testing.assert_array_equal(observation, before)
+    assert (reward[0], terminated[0], truncated[0], infos["engine_crash"][0]) == (0.0, False, True, True)
+    envs.send(TURN[:1], [waiting])
+    infos = envs.recv()[4]
+    assert (infos["episode_frames"][0], infos["engine_crash"][0]) == (0, False)
     envs.close()
 
 
