@@ -89,4 +89,4 @@ def _recv_per_s(envs: "DoomVectorEnv", seconds: float) -> float:
 
 def _random_actions(envs: "DoomVectorEnv") -> np.ndarray:
     """int[1000, N]"""
-    return np.random.default_rng().integers(len(envs.action_meanings), size=(1000, envs.num_envs))
+    return np.array([envs.action_space.sample() for _ in range(1000)])

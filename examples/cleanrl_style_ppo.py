@@ -22,7 +22,7 @@ def main(scenario: str = "defend_the_center", steps: int = 100_000, num_envs: in
     """Trains on the training set of 4 tasks; prints the score of every episode."""
     envs = gvz.make_vec(named_tasks(scenario, split="train4"), num_envs, grayscale=True, autoreset_mode="SameStep")
     convs = (nn.Conv2d(4, 32, 8, 4), nn.ReLU(), nn.Conv2d(32, 64, 4, 2), nn.ReLU(), nn.Flatten())
-    network = nn.Sequential(*convs, nn.Linear(5184, 512), nn.ReLU(), nn.Linear(512, len(envs.action_meanings) + 1))
+    network = nn.Sequential(*convs, nn.Linear(5184, 512), nn.ReLU(), nn.Linear(512, envs.single_action_space.n + 1))
     optimizer = torch.optim.Adam(network.parameters(), lr=2.5e-4, eps=1e-5)
     stacks = torch.zeros(num_steps, num_envs, 4, 84, 84, dtype=torch.uint8)
     actions, (log_probs, r, v, gamma, advantages) = stacks[..., 0, 0, 0].long(), torch.zeros(5, num_steps, num_envs)

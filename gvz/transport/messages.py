@@ -217,8 +217,8 @@ class Decision(msgspec.Struct, frozen=True, array_like=True):
     game: Count
     half: Count
     """which half of the shared arrays the observation goes into, 0 or 1"""
-    action: Count | None
-    """None begins an episode"""
+    action: Count | list[Count] | None
+    """a list if the actions are MultiDiscrete; None begins an episode"""
     episode_seed: Count
     """of the episode that begins, if one does"""
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from gymnasium.spaces import Discrete, MultiDiscrete
 from gymnasium.vector import AutoresetMode
 
 from gvz.core.env_config import typed
@@ -63,17 +64,19 @@ def game_numbers(env_ids: np.ndarray | None, num_envs: int) -> np.ndarray:
     return games
 
 
-def action_numbers(actions: np.ndarray, games: np.ndarray, num_actions: int) -> list[int]:
-    """One action for each of these games.
+def action_numbers(actions: np.ndarray, games: np.ndarray, space: Discrete | MultiDiscrete) -> list[int | list[int]]:
+    """One action of `space` for each of these games.
 
     Raises:
         ValueError: another number of actions, another type, or no such action.
     """
     actions = np.asarray(actions)
-    if actions.shape != games.shape or not np.issubdtype(actions.dtype, np.integer):
-        raise ValueError(f"actions: got {actions.dtype}{list(actions.shape)}, want int{list(games.shape)}")
-    if ((actions < 0) | (actions >= num_actions)).any():
-        raise ValueError(f"actions: got {actions.tolist()}, want 0..{num_actions - 1}")
+    numbers = np.asarray(space.nvec if isinstance(space, MultiDiscrete) else space.n)
+    shape = (*games.shape, *numbers.shape)
+    if actions.shape != shape or not np.issubdtype(actions.dtype, np.integer):
+        raise ValueError(f"actions: got {actions.dtype}{list(actions.shape)}, want int{list(shape)}")
+    if ((actions < 0) | (actions >= numbers)).any():
+        raise ValueError(f"actions: got {actions.tolist()}, want integers from 0 to {(numbers - 1).tolist()}")
     return actions.tolist()
 
 

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError, ResetNeeded
+from gymnasium.spaces import Discrete, MultiDiscrete
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -35,7 +36,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
       observations, rewards, ends and infos as `gymnasium.vector.SyncVectorEnv` of the same `DoomEnv`s.
     - `send` and `recv` play the games that are ready, as EnvPool does: `recv` returns as soon as `batch_size` games
       have answered.
-    - Infos have two more keys: `task`, and `env_id`, the number of the game.
+    - Infos have one more key: `env_id`, the number of the game.
     - An engine that crashes truncates its episode, as in `DoomEnv`. So does a worker that dies; it is replaced. After
       any other error in a worker the environment is closed.
     - Workers and engines end with this object, with this process, however it ends, and with the thread that made this
@@ -43,7 +44,6 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
 
     Attributes:
         tasks: id of each game's task.
-        action_meanings: buttons that each action holds, as `DoomEnv.action_meanings`.
         batch_size: games that `recv` waits for, B.
     """
 
@@ -95,20 +95,20 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         options = {"render_mode": render_mode, "recycle_episodes": recycle_episodes}
         envs = {task: DoomEnv(task, config, **options, **fields) for task in dict.fromkeys(ids)}
         first = envs[ids[0]]
-        for env in envs.values():
-            if env.action_space != first.action_space:
-                raise ConfigError(
-                    f"make_vec: {first.task.id} has {len(first.action_meanings)} actions and {env.task.id} has "
-                    f"{len(env.action_meanings)}, want the same; action_set='unified' gives all scenarios the same"
-                )
+        scenarios = sorted({env.task.scenario.id for env in envs.values()})
+        if len(scenarios) > 1 and first.config.action_set not in ("unified_v1", "multi_discrete_v1"):
+            raise ConfigError(
+                f"make_vec: got tasks of {', '.join(scenarios)}, whose actions differ; want one scenario, or "
+                'action_set="unified_v1"'
+            )
         self.tasks = tuple(envs[ids[game % len(ids)]].task.id for game in range(self.num_envs))
         self.render_mode = render_mode
         self.metadata = {**first.metadata, "autoreset_mode": self._mode}
-        self.single_observation_space, self.single_action_space = first.observation_space, first.action_space
+        self.single_observation_space = first.observation_space
+        self.single_action_space: Discrete | MultiDiscrete = first.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._config, self._copy = first.config, copy
-        self.action_meanings = first.action_meanings
         self._rngs: list[np.random.Generator | None] = [None] * self.num_envs
         self._next_seeds: list[int | None] = [None] * self.num_envs  # drawn, and not used by an episode yet
         self._begun, self._ended, self._pending = np.zeros((3, self.num_envs), bool)
@@ -178,7 +178,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         """One decision in every game.
 
         Args:
-            actions: int[N].
+            actions: int[N], or int[N, axes] with `action_set="multi_discrete_v1"`.
 
         Returns:
             Observations, rewards, terminated, truncated and infos of all games.
@@ -204,7 +204,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         """
         self._require_open("send")
         games = arguments.game_numbers(env_ids, self.num_envs)
-        numbers: list[int | None] = [*arguments.action_numbers(actions, games, len(self.action_meanings))]
+        numbers: list[int | list[int] | None] = [*arguments.action_numbers(actions, games, self.single_action_space)]
         self._require_begun("send", games)
         over = self._ended[games]
         if over.any() and self._mode is AutoresetMode.DISABLED:
@@ -259,7 +259,9 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         del kwargs
         self._end()
 
-    def _send(self, games: np.ndarray, actions: Sequence[int | None], episode_seed: int | None = None) -> None:
+    def _send(
+        self, games: np.ndarray, actions: Sequence[int | list[int] | None], episode_seed: int | None = None
+    ) -> None:
         self._require_idle("send", games)
         decisions = [
             Decision(
@@ -314,7 +316,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
 
     def _info(self, outcome: Outcome) -> dict[str, Any]:
         game = outcome.game
-        info = {**outcome.info, "task": self.tasks[game], "env_id": game}
+        info = {**outcome.info, "env_id": game}
         if outcome.final_info is not None:
             info |= {"final_obs": self._frames.final_copy(game), "final_info": outcome.final_info}
         return info

@@ -16,6 +16,7 @@ import sys
 import traceback
 from collections import deque
 
+import numpy as np
 from gymnasium.error import ResetNeeded
 
 from gvz.core.env_config import EnvConfig
@@ -71,7 +72,7 @@ class Worker:
         if decision.action is None:
             observation, info = env.reset(options=options)
         else:
-            observation, reward, terminated, truncated, info = env.step(decision.action)
+            observation, reward, terminated, truncated, info = env.step(np.array(decision.action))
             if self._spec.same_step and (terminated or truncated):
                 final_info = info
                 self._frames.write_final(game, observation)
