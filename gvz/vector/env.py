@@ -104,8 +104,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         self.tasks = tuple(envs[ids[game % len(ids)]].task.id for game in range(self.num_envs))
         self.render_mode = render_mode
         self.metadata = {**first.metadata, "autoreset_mode": self._mode}
-        self.single_observation_space = first.observation_space
-        self.single_action_space: Discrete | MultiDiscrete = first.action_space
+        self.single_observation_space, self.single_action_space = first.observation_space, first.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._config, self._copy = first.config, copy
@@ -204,7 +203,9 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         """
         self._require_open("send")
         games = arguments.game_numbers(env_ids, self.num_envs)
-        numbers: list[int | list[int] | None] = [*arguments.action_numbers(actions, games, self.single_action_space)]
+        space = self.single_action_space
+        assert isinstance(space, Discrete | MultiDiscrete), "DoomEnv's action space"
+        numbers: list[int | list[int] | None] = [*arguments.action_numbers(actions, games, space)]
         self._require_begun("send", games)
         over = self._ended[games]
         if over.any() and self._mode is AutoresetMode.DISABLED:
