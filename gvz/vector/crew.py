@@ -11,7 +11,7 @@ from typing import IO, Any
 import msgspec
 
 from gvz.core import errors, janitor
-from gvz.core.errors import GvzError, WorkerError
+from gvz.core.errors import GvzError, TransportError, WorkerError
 from gvz.core.watchdog import AwakeClock
 from gvz.transport.child import ChildProcess
 from gvz.transport.messages import (
@@ -146,12 +146,19 @@ class Crew:
         return [self._outcomes.popleft() for _ in range(count)]
 
     def render(self) -> dict[int, bytes]:
-        """The last rendered screen of every game; no decision may be pending."""
+        """The last rendered screen of every game, empty if its worker has died; no decision may be pending."""
         screens: dict[int, bytes] = {}
         for worker in self._workers:
             worker.process.channel.send(Render())
         for worker in self._workers:
-            answer = worker.process.channel.wait_for_message()
+            try:
+                answer = worker.process.channel.wait_for_message()
+            except TransportError:
+                if not worker.process.channel.closed:
+                    raise
+                self._replace_dead(worker)
+                screens |= dict.fromkeys(worker.spec.games, b"")
+                continue
             if not isinstance(answer, Screens):
                 raise _raised(worker, answer)
             screens |= dict(zip(worker.spec.games, answer.screens, strict=True))
@@ -204,8 +211,7 @@ class Crew:
                 del worker.pending[outcome.game]
                 self._add(worker, outcome)
         if channel.closed and worker.pending:
-            worker.process.wait(_STOP_TIMEOUT_S)
-            self._replace(worker, worker.process.exit_text() or "closed its channel")
+            self._replace_dead(worker)
 
     def _add(self, worker: _Worker, outcome: Outcome) -> None:
         """One outcome more, with what happened to the game's last worker."""
@@ -220,6 +226,10 @@ class Crew:
             worker.deaths = 0
         self._last_infos[game] = info
         self._outcomes.append(outcome)
+
+    def _replace_dead(self, worker: _Worker) -> None:
+        worker.process.wait(_STOP_TIMEOUT_S)
+        self._replace(worker, worker.process.exit_text() or "closed its channel")
 
     def _replace(self, worker: _Worker, what: str) -> None:
         """Ends what is left of a worker, starts the next, and sees to the games that it had."""

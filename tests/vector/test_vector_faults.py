@@ -131,6 +131,20 @@ def test_games_that_waited_for_an_action_when_their_worker_died_are_cut_too():
     envs.close()
 
 
+def test_a_worker_that_died_unnoticed_has_no_screens_and_its_games_are_cut():
+    envs = gvz.make_vec(TASK, 2, num_workers=1, render_mode="rgb_array")
+    envs.reset(seed=1)
+    process = psutil.Process(envs._crew.pids[0])
+    process.kill()
+    psutil.wait_procs([process], timeout=30)
+    with pytest.raises(ResetNeeded, match=r"render: games \[0, 1\] have rendered nothing since their worker died"):
+        envs.render()
+    *_, truncated, infos = envs.step(TURN[:2])
+    assert truncated.all()
+    assert infos["engine_crash"].all()
+    envs.close()
+
+
 def test_death_upon_death_is_an_error_that_says_what_happened_and_closes_everything(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(crew, "_MAX_DEATHS", 0)
     envs = gvz.make_vec(TASK, 1)
