@@ -1,0 +1,37 @@
+"""The policies that come with GViZDoom: small, playable, and their scores are those that the findings say."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gvz.evaluation.episode_log import read_rows
+from gvz.evaluation.trained import find_checkpoints, read_run_config, trained_player
+from gvz.evaluation.zoo import MAX_BYTES, ZOO_DIRECTORY, run_directory, zoo_names
+from gvz.tasks import named_tasks, scenarios
+
+PAGE = Path(__file__).parent.parent / "docs" / "FINDINGS.md"
+
+
+def test_every_scenario_of_the_thesis_has_a_policy():
+    assert set(scenarios()) <= set(zoo_names())
+
+
+@pytest.mark.parametrize("name", zoo_names())
+def test_a_policy_is_small_readable_and_has_its_score_card(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path))
+    assert (ZOO_DIRECTORY / f"{name}.zip").stat().st_size <= MAX_BYTES
+    directory = run_directory(Path(f"zoo:{name}"))
+    config = read_run_config(directory)
+    (num_updates,) = find_checkpoints(directory, ["newest"])
+    player = trained_player(directory, config, num_updates)
+    rows = [row for row in read_rows(directory / "evaluation.jsonl") if player.identity.items() <= row.items()]
+    means = []
+    for task in named_tasks(config.table.scenarios[0].id, split="test"):
+        scores = [row["normalized_score"] for row in rows if row["task"] == task.id]
+        assert len(scores) == 100, task
+        means.append(np.mean(scores))
+    title = config.table.scenarios[0].title
+    assert f"| {title} | {num_updates:,} | " in PAGE.read_text()
+    (line,) = [line for line in PAGE.read_text().splitlines() if line.startswith(f"| {title} | {num_updates:,} | ")]
+    assert f"{np.mean(means):.1f} [" in line
