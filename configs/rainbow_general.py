@@ -1,7 +1,7 @@
 """Rainbow for tasks that it has not seen, on two CPU cores: settings that gates have chosen so far (docs/FINDINGS.md).
 
-Against `rainbow_quick`: the eight training tasks of a scenario, a replay twice as large, and 500,000 gradient steps, of
-which two cores do some 150,000 an hour; stop it when you like.
+Against `rainbow_quick`: the eight training tasks of a scenario, a replay twice as large, and at most 500,000 gradient
+steps. Stop it when you like, or set `--max-processor-s`.
 """
 
 import dataclasses
