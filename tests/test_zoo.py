@@ -23,6 +23,7 @@ def test_a_policy_is_small_readable_and_has_its_score_card(name, tmp_path, monke
     assert (ZOO_DIRECTORY / f"{name}.zip").stat().st_size <= MAX_BYTES
     directory = run_directory(Path(f"zoo:{name}"))
     config = read_run_config(directory)
+    assert config.run_dir is None, "no path of the machine that trained it"
     (num_updates,) = find_checkpoints(directory, ["newest"])
     player = trained_player(directory, config, num_updates)
     rows = [row for row in read_rows(directory / "evaluation.jsonl") if player.identity.items() <= row.items()]

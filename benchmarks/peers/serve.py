@@ -5,6 +5,7 @@ every peer's process imports it.
 import importlib.metadata
 import json
 import sys
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -20,3 +21,20 @@ def serve(body: Callable[..., dict[str, Any]], *packages: str, **about: Any) -> 
     print(json.dumps({"versions": {name: importlib.metadata.version(name) for name in packages}, **about}), flush=True)
     for line in sys.stdin:
         print(json.dumps(body(**json.loads(line))), flush=True)
+
+
+def serve_random_play(envs: Any, *packages: str, **about: Any) -> None:
+    """Serves random play in a vector environment of Gymnasium, which is closed at the end; arguments as of `serve`."""
+    envs.reset(seed=0)
+
+    def play(seconds: float) -> dict[str, Any]:
+        count, start = 0, time.perf_counter()
+        while time.perf_counter() - start < seconds:
+            envs.step(envs.action_space.sample())
+            count += envs.num_envs
+        return {"count": count, "seconds": time.perf_counter() - start}
+
+    try:
+        serve(play, *packages, **about)
+    finally:
+        envs.close()

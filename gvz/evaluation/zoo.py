@@ -5,6 +5,7 @@ configuration, its newest policy, its records of training, and the evaluation ep
 """
 
 import contextlib
+import dataclasses
 import hashlib
 import json
 import shutil
@@ -87,6 +88,7 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", agent_file: Path 
     """
     from gvz.core import records
     from gvz.evaluation.trained import find_checkpoints, read_params, read_run_config, trained_player
+    from gvz.run.config_files import config_to_dict
     from learner import checkpoint as checkpoints
 
     if not name.replace("_", "").replace("-", "").isalnum():
@@ -97,9 +99,11 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", agent_file: Path 
     with tempfile.TemporaryDirectory() as temporary:
         packed = Path(temporary) / name
         packed.mkdir()
-        for record in RECORDS[:-1]:
+        for record in RECORDS[1:-1]:
             if (run_dir / record).exists():
                 shutil.copy(run_dir / record, packed)
+        saved = config_to_dict(dataclasses.replace(config, run_dir=None))  # no path of this machine
+        (packed / RECORDS[0]).write_text(json.dumps(saved, indent=2) + "\n")
         checkpoints.write(packed / "policies" / str(num_updates), _rounded(params), {"num_updates": num_updates})
         player = trained_player(packed, config, num_updates)
         rows = [row for row in records.read_stored(run_dir / RECORDS[-1])[0] if player.identity.items() <= row.items()]

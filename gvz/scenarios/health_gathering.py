@@ -14,7 +14,7 @@ Attributes: thesis B.2, below. `complete` takes water for its textures. Tasks: t
 import random
 
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
-from gvz.scenarios.layout import Layout, draw_pillar, draw_pillars, draw_places, draw_rooms, vary
+from gvz.scenarios.layout import Layout, draw_rooms, furnished, vary
 from gvz.scenarios.parts import RESIZED, retextured, starts_at, things_at
 from gvz.scenarios.rewards import Pace, Reward, Rose, death, living
 
@@ -186,16 +186,7 @@ def draw_hall(rng: random.Random, strength: float) -> Layout:
         loops=vary(rng, strength, 1.0, 0.2, 1.0),
         corridor=(3, 3),
     )
-    pillars = draw_pillars(rng, rooms, round(12 * strength), (32, 160))
-    starts, places = draw_places(rng, rooms, pillars, 9)
-    return Layout(
-        walls=rooms.walls() + sum((draw_pillar(rng, *one) for one in pillars), ()),
-        starts=starts,
-        height=round(vary(rng, strength, 104, 96, 240)),
-        parameters={"num_places": len(places), "last_spot": 9 + len(starts)},
-        places=places,
-        marked=True,
-    )
+    return furnished(rng, strength, rooms, most_pillars=12, pillar_width=(32, 160), num_starts=9)
 
 
 SCENARIO = Scenario(

@@ -183,6 +183,28 @@ def draw_rooms(
     return Rooms(size=size, rooms=tuple(rooms.values()), corridors=tuple(corridors))
 
 
+def furnished(
+    rng: random.Random,
+    strength: float,
+    rooms: Rooms,
+    *,
+    most_pillars: int,
+    pillar_width: tuple[float, float],
+    num_starts: int,
+) -> Layout:
+    """The layout of rooms with pillars in them, at most so many, and with starts and places marked for the script."""
+    pillars = draw_pillars(rng, rooms, round(most_pillars * strength), pillar_width)
+    starts, places = draw_places(rng, rooms, pillars, num_starts)
+    return Layout(
+        walls=rooms.walls() + sum((draw_pillar(rng, *one) for one in pillars), ()),
+        starts=starts,
+        height=round(vary(rng, strength, 104, 96, 240)),
+        parameters={"num_places": len(places), "last_spot": FIRST_SPOT - 1 + len(starts)},
+        places=places,
+        marked=True,
+    )
+
+
 def _neighbours(cell: tuple[int, int]) -> list[tuple[int, int]]:
     x, y = cell
     return [(x + 1, y), (x, y + 1), (x - 1, y), (x, y - 1)]

@@ -18,7 +18,7 @@ Known: about one enemy in a hundred appears in the walled-off notch at the map's
 import random
 
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Variety, words
-from gvz.scenarios.layout import Layout, draw_pillar, draw_pillars, draw_places, draw_rooms, vary
+from gvz.scenarios.layout import Layout, draw_rooms, furnished, vary
 from gvz.scenarios.parts import COUNTED_MARINE, RESIZED, retextured, starts_at, things_at
 from gvz.scenarios.rewards import HISTORY_STEPS, Fell, Pace, Reward, Rose, death, living, moved
 from gvz.wad.udmf import UdmfMap
@@ -178,16 +178,7 @@ def draw_maze(rng: random.Random, strength: float) -> Layout:
         loops=vary(rng, strength, 0.7, 0.1, 1.0),
         corridor=(2, 3),
     )
-    pillars = draw_pillars(rng, rooms, round(8 * strength), (40, 144))
-    starts, places = draw_places(rng, rooms, pillars, 20)
-    return Layout(
-        walls=rooms.walls() + sum((draw_pillar(rng, *one) for one in pillars), ()),
-        starts=starts,
-        height=round(vary(rng, strength, 104, 96, 240)),
-        parameters={"num_places": len(places), "last_spot": 9 + len(starts)},
-        places=places,
-        marked=True,
-    )
+    return furnished(rng, strength, rooms, most_pillars=8, pillar_width=(40, 144), num_starts=20)
 
 
 SCENARIO = Scenario(

@@ -23,6 +23,7 @@ def test_a_packed_policy_is_the_runs_rounded(run):
     assert packed.num_updates == 20
     assert zoo_names() == ["one"]
     directory = run_directory("zoo:one")
+    assert read_run_config(directory).run_dir is None
     assert read_run_config(directory).agent == read_run_config(run).agent
     (_, before), (_, after) = (read_params(path, CONFIG, 20) for path in (run, directory))
     import jax
