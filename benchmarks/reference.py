@@ -1,9 +1,9 @@
-"""Reference scores: the committed records of simple players, and the tables of docs/BENCHMARK.md that come from them.
+"""Reference scores: the committed records of simple players, and the tables of the docs that come from them.
 
-    python -m benchmarks.reference [--extended] [RECORDS ...]
+    python -m benchmarks.reference [RECORDS ...]
 
-packs the given record files of `gvz evaluate` into results/reference/ and writes the tables of all records there; with
---extended, into results/reference/extended/, and the tables of the scenarios of the extended suite.
+packs the given record files of `gvz evaluate` into results/reference/ and writes the tables of all records there. A
+scenario of the extended suite has a folder of its own, and its table is in docs/EXTENDED.md.
 """
 
 import gzip
@@ -27,9 +27,9 @@ from gvz.scenarios.base import Scenario, Task
 from gvz.tasks import LEVELS, named_tasks, scenarios
 
 RECORDS = ROOT / "results" / "reference"
+COMMAND = "python -m benchmarks.reference"
 PAGE = ROOT / "docs" / "BENCHMARK.md"
-EXTENDED = "scores of later scenarios"
-"""the part of the page that has the tables of the extended suite"""
+EXTENDED_PAGE = ROOT / "docs" / "EXTENDED.md"
 PLAYERS = ("random", "idle", "sweep", "scripted")
 """in the order of the tables' columns"""
 COLUMNS = (
@@ -45,24 +45,29 @@ Scores = dict[tuple[str, str], list[Row]]
 def pack(file: Path, directory: Path = RECORDS) -> list[Path]:
     """Writes the columns COLUMNS of a record file's rows as `<player>.jsonl.gz`; the same rows give the same bytes.
 
+    Rows of the extended suite go into a folder of their scenario.
+
     Raises:
         ConfigError: damaged lines, or a player that is not in PLAYERS.
     """
-    rows = _read(file)
-    if strangers := {row["player"] for row in rows} - set(PLAYERS):
-        raise ConfigError(f"{file}: rows of {', '.join(sorted(strangers))}; want only {', '.join(PLAYERS)}")
-    written = []
-    for player in sorted({row["player"] for row in rows}):
-        mine = sorted((row for row in rows if row["player"] == player), key=lambda r: (r["task"], r["episode"]))
-        lines = [json.dumps({name: row[name] for name in COLUMNS if name in row}) for row in mine]
-        target = directory / f"{player}.jsonl.gz"
+    targets = defaultdict[Path, list[Row]](list)
+    for row in _read(file):
+        if row["player"] not in PLAYERS:
+            raise ConfigError(f"{file}: rows of {row['player']}; want only {', '.join(PLAYERS)}")
+        scenario = row["task"].partition("/")[0]
+        targets[(directory if scenario in scenarios() else directory / scenario) / f"{row['player']}.jsonl.gz"].append(
+            row
+        )
+    for target, rows in sorted(targets.items()):
+        rows.sort(key=lambda row: (row["task"], row["episode"]))
+        lines = [json.dumps({name: row[name] for name in COLUMNS if name in row}) for row in rows]
+        target.parent.mkdir(exist_ok=True)
         target.write_bytes(gzip.compress("".join(f"{line}\n" for line in lines).encode(), mtime=0))
-        written.append(target)
-    return written
+    return sorted(targets)
 
 
 def read_reference(directory: Path = RECORDS) -> Scores:
-    """The committed records of all PLAYERS.
+    """The committed records of all PLAYERS in a folder: the core suite, or one scenario of the extended suite.
 
     Raises:
         ConfigError: a file is missing or of another schema.
@@ -90,16 +95,11 @@ def estimate(scores: Scores, player: str, tasks: Sequence[Task], column: str = "
     return bootstrap(strata, num_resamples=1000)
 
 
-def extended_tables(scores: Scores) -> str:
-    """The tables of the extended suite as Markdown."""
-    return "\n\n".join(_task_table(scores, scenario) for scenario in scenarios("extended").values())
-
-
 def tables(scores: Scores) -> str:
     """The tables of the core suite as Markdown."""
     parts = [_test_table(scores), _level_table(scores)]
     for scenario in scenarios().values():
-        parts.append(_task_table(scores, scenario))
+        parts.append(task_table(scores, scenario))
         if scenario.metric == "kills":
             parts.append(_own_kills_table(scores, scenario))
     return "\n\n".join(parts)
@@ -144,7 +144,7 @@ def _level_table(scores: Scores) -> str:
     return "\n".join([table, "", listed, "", *not_harder])
 
 
-def _task_table(scores: Scores, scenario: Scenario) -> str:
+def task_table(scores: Scores, scenario: Scenario) -> str:
     """The scenario's score by task, for the tasks that all players have played."""
     rows, bound = [], scenario.upper_bound("thesis")
     played = [task for task in named_tasks(scenario.id) if all((player, task.id) in scores for player in PLAYERS)]
@@ -172,28 +172,28 @@ def _own_kills_table(scores: Scores, scenario: Scenario) -> str:
     return _table(title, ("task", "level", *PLAYERS), rows)
 
 
-def write_page(page: str, text: str, section: str = "reference scores") -> str:
-    """The page with the tables `text` in their place.
+def pages() -> dict[Path, str]:
+    """docs/BENCHMARK.md and docs/EXTENDED.md with the tables of all records in their places.
 
     Raises:
-        ConfigError: the markers are missing.
+        ConfigError: records or markers are missing.
     """
-    command = "python -m benchmarks.reference" + (" --extended" if section == EXTENDED else "")
-    return between(page, PAGE, section, text, command)
+    extended = EXTENDED_PAGE.read_text()
+    for scenario in scenarios("extended").values():
+        table = task_table(read_reference(RECORDS / scenario.id), scenario)
+        extended = between(extended, EXTENDED_PAGE, f"scores of {scenario.id}", table, COMMAND)
+    core = between(PAGE.read_text(), PAGE, "reference scores", tables(read_reference()), COMMAND)
+    return {PAGE: core, EXTENDED_PAGE: extended}
 
 
-def main(arguments: Sequence[str]) -> None:
+def main(files: Sequence[str]) -> None:
     """Packs the given record files, then writes the tables."""
-    extended = "--extended" in arguments
-    directory = RECORDS / "extended" if extended else RECORDS
-    for file in arguments:
-        if file != "--extended":
-            for written in pack(Path(file), directory):
-                print(written)
-    scores = read_reference(directory)
-    text = write_page(PAGE.read_text(), extended_tables(scores), EXTENDED) if extended else None
-    PAGE.write_text(text or write_page(PAGE.read_text(), tables(scores)))
-    print(PAGE)
+    for file in files:
+        for written in pack(Path(file)):
+            print(written)
+    for page, text in pages().items():
+        page.write_text(text)
+        print(page)
 
 
 if __name__ == "__main__":
