@@ -1,6 +1,7 @@
 """Tasks by name: ids, levels, the named tasks, training and test sets."""
 
 import itertools
+import re
 from functools import cache
 from typing import Literal, get_args
 
@@ -48,7 +49,8 @@ def parse_task(text: str) -> Task:
 
     Args:
         text: `<scenario>/default`, `<scenario>/complete` or `<scenario>/<attribute>+<attribute>...`, attributes
-            in any order; or a set of drawn maps (gvz.scenarios.map_set), such as `<scenario>/varied-10` or
+            in any order, each perhaps with a severity from 0 to 1, such as `fast_enemies=0.5` (also `complete=0.5`);
+            or a set of drawn maps (gvz.scenarios.map_set), such as `<scenario>/varied-10` or
             `<scenario>/procedural-train-100+layout=0.5`.
 
     Raises:
@@ -61,14 +63,25 @@ def parse_task(text: str) -> Task:
             f"scenarios: {', '.join(all_scenarios())}"
         )
     scenario = scenario_named(scenario_id)
-    whole_sets = {"default": (), "complete": scenario.complete}
-    names = tuple(name.split("+"))
+    whole_sets: dict[str, tuple[str, ...]] = {"default": (), "complete": scenario.complete}
     if names_map_set(name):
         return Task(scenario, maps=parse_map_set(name))
+    graded = [_severity(scenario, word) for word in name.split("+")]
+    names = tuple(one for one, _ in graded)
     for whole in (*whole_sets, *filter(names_map_set, names)):
         if whole in names and len(names) > 1:
             raise TaskError(f"task: got {text!r}, but {whole!r} is a task and no attribute; want {scenario.choices()}")
-    return Task(scenario, whole_sets.get(name, names))
+    if len(graded) == 1 and (whole := whole_sets.get(name.partition("=")[0])) is not None:
+        graded = [(one, graded[0][1]) for one in whole]
+    return Task(scenario, tuple(one for one, _ in graded), severities=tuple(graded))
+
+
+def _severity(scenario: Scenario, word: str) -> tuple[str, float]:
+    """(Attribute, severity) of a word in a task's id: "gore", "gore=0.5"."""
+    name, equals, value = word.partition("=")
+    if equals and not re.fullmatch(r"[0-9]+(\.[0-9]+)?", value):
+        raise TaskError(f"scenario {scenario.id}: got {word!r}, want '<attribute>=<severity>', such as 'gore=0.5'")
+    return name, float(value) if equals else 1.0
 
 
 def named_tasks(
@@ -97,7 +110,7 @@ def named_tasks(
 
 
 def attribute_tasks(scenario: str) -> tuple[Task, ...]:
-    """The default task, then one with each attribute alone, then one with each two of different groups.
+    """The default task, then each attribute alone, at half its severity and whole, then each two of different groups.
 
     Raises:
         TaskError: an unknown scenario.
@@ -107,7 +120,8 @@ def attribute_tasks(scenario: str) -> tuple[Task, ...]:
     pairs = [
         (a.name, b.name) for a, b in itertools.combinations(one.attributes, 2) if not set(a.groups) & set(b.groups)
     ]
-    return tuple(Task(one, attributes) for attributes in ((), *((name,) for name in names), *pairs))
+    alone = [Task(one, (name,), severities=((name, severity),)) for name in names for severity in (0.5, 1.0)]
+    return (Task(one), *alone, *(Task(one, pair) for pair in pairs))
 
 
 def _names(scenario: Scenario, split: TaskSet | None) -> tuple[str, ...]:

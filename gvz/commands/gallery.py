@@ -16,9 +16,9 @@ class Gallery:
     """directory for <kind>_<scenario>.png"""
     scenario: str | None = None
     """only this one"""
-    kind: Literal["gallery", "varied", "procedural", "augmented"] = "gallery"
-    """gallery: the named tasks; varied, procedural: the first maps of such a task; augmented: the default task under
-    each augmentation that a learner can train with"""
+    kind: Literal["gallery", "varied", "procedural", "severity", "augmented"] = "gallery"
+    """gallery: the named tasks; varied, procedural: the first maps of such a task; severity: each attribute alone at
+    four severities; augmented: the default task under each augmentation that a learner can train with"""
     moving: bool = False
     """also agents.webp: agents of the core scenarios at play, level after level; policies of the zoo if there are"""
 

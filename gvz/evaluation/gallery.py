@@ -35,6 +35,8 @@ CAPTION_HEIGHT = 16
 COLUMNS = 4
 NUM_VARIED, NUM_PROCEDURAL = 24, 48
 """maps that the sheets of `varied` and `procedural-train` show"""
+SEVERITIES = (0.25, 0.5, 0.75, 1.0)
+"""that the sheet of attributes shows"""
 PLAN_SIZE = 72
 """pixels of the side of a map's plan"""
 LEVEL_DECISIONS = 10
@@ -148,6 +150,16 @@ def map_plan(room: UdmfMap) -> np.ndarray:
     return np.asarray(plan)
 
 
+def severity_sheet(scenario: Scenario) -> Image.Image:
+    """A frame of each attribute alone, at severities from a quarter to the whole."""
+    tasks = [
+        Task(scenario, (attribute.name,), severities=((attribute.name, severity),))
+        for attribute in scenario.attributes
+        for severity in SEVERITIES
+    ]
+    return tiled([(task_frame(task), task.name, 0) for task in tasks], len(SEVERITIES))
+
+
 def augmented_sheet(scenario: Scenario) -> Image.Image:
     """The default task's frame under each augmentation of `learner.augment`, as it is, at half and at full strength."""
     import jax
@@ -166,6 +178,7 @@ SHEETS = {
     "gallery": contact_sheet,
     "varied": varied_sheet,
     "procedural": procedural_sheet,
+    "severity": severity_sheet,
     "augmented": augmented_sheet,
 }
 

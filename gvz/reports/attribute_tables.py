@@ -16,20 +16,24 @@ def attribute_tables(scenario: Scenario, scores: Mapping[str, Scores], tasks: Se
     """The losses of single attributes, and those of pairs that were played with both of their attributes alone."""
     ids = _by_attributes(tasks)
     default = ids.get(frozenset())
-    names = [attribute.name for attribute in scenario.attributes if frozenset({attribute.name}) in ids]
-    if default is None or not names:
+    names = [attribute.name for attribute in scenario.attributes]
+    singles = sorted(
+        (task for task in tasks if len(task.attributes) == 1),
+        key=lambda task: (names.index(task.attributes[0]), task.severity(task.attributes[0])),
+    )
+    if default is None or not singles:
         return []
-    alone = {name: ids[frozenset({name})] for name in names}
+    alone = {name: ids[frozenset({name})] for name in names if frozenset({name}) in ids}
     pairs = sorted(sorted(pair, key=names.index) for pair in ids if len(pair) == 2 and pair <= alone.keys())
     tables = [
         Table(
             id=f"{scenario.id}_attributes",
             caption=f"{scenario.title}: what an attribute costs, in points of the upper bound: the score on the "
-            "default task less that with this attribute alone.",
+            "default task less that with this attribute alone, whole or at a severity.",
             columns=("attribute", *scores),
             rows=tuple(
-                (words(name), *(_cell(one, [default, alone[name]], attribute_loss) for one in scores.values()))
-                for name in names
+                (words(task.name), *(_cell(one, [default, task.id], attribute_loss) for one in scores.values()))
+                for task in singles
             ),
         )
     ]
@@ -76,7 +80,8 @@ def attribute_figure(
 
 
 def _by_attributes(tasks: Sequence[Task]) -> dict[frozenset[str], str]:
-    return {frozenset(task.attributes): task.id for task in tasks if task.maps is None}
+    """Ids of the tasks with whole attributes."""
+    return {frozenset(task.attributes): task.id for task in tasks if task.maps is None and not task.severities}
 
 
 def _cell(scores: Scores, tasks: Sequence[str], statistic: Statistic) -> Cell:

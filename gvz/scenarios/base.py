@@ -27,9 +27,25 @@ class Uniform:
     high: float
 
 
-Value = int | float | str | Uniform | tuple[str | float, ...]
+@dataclass(frozen=True, slots=True)
+class Toward:
+    """A property that goes a share of the way from what the thing itself has to `value`."""
+
+    value: float | Uniform
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
+class Chance:
+    """A property that this share of the things get; drawn for each."""
+
+    value: str
+    share: float
+
+
+Value = int | float | str | Uniform | Toward | Chance | tuple[str | float, ...]
 """A value in a script. int: ACS integer; float: fixed point; str: unchanged ACS expression; tuple: initializer of an
-array, with quoted strings."""
+array, with quoted strings. Toward and Chance are for properties alone."""
 
 BOOKKEEPING: Mapping[str, str] = MappingProxyType(
     {
@@ -63,6 +79,15 @@ class Textures:
 
 
 @dataclass(frozen=True, slots=True)
+class Blend:
+    """A texture made of two: `over` covers `under` and is opaque by the share `opacity`."""
+
+    under: str
+    over: str
+    opacity: float
+
+
+@dataclass(frozen=True, slots=True)
 class Thing:
     """An object on the map from the start. Position in map units; `type` is an editor number."""
 
@@ -89,10 +114,12 @@ class Content:
     """APROP name -> value, set on the agent when it enters"""
     actors: Mapping[str, str] = field(default_factory=dict)
     """class name -> its DECORATE definition"""
+    blends: Mapping[str, Blend] = field(default_factory=dict)
+    """texture name -> what it is made of; other textures are those of Freedoom"""
 
     def overlaid(self, other: "Content") -> "Content":
         """This content, with every value that `other` sets replaced by that of `other`."""
-        mappings = ("things", "parameters", "entity", "agent", "actors")
+        mappings = ("things", "parameters", "entity", "agent", "actors", "blends")
         return Content(
             base_wad=other.base_wad or self.base_wad,
             textures=other.textures or self.textures,
@@ -259,14 +286,18 @@ class Task:
         scenario: the scenario.
         attributes: canonical names, sorted.
         maps: drawn maps; an episode's seed says which is played. None: one map, that of the attributes.
+        severities: (attribute, severity) pairs of attributes that are graded (gvz.scenarios.severity), sorted. Those
+            left out have severity 1; an attribute given with severity 0 is left out altogether.
 
     Raises:
-        TaskError: an unknown attribute, two of one group, or attributes together with drawn maps.
+        TaskError: an unknown attribute, two of one group, a severity out of range, or attributes together with drawn
+            maps.
     """
 
     scenario: Scenario
     attributes: tuple[str, ...] = ()
     maps: MapSet | None = None
+    severities: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
         if self.maps is not None and self.scenario.variety is None:
@@ -287,16 +318,31 @@ class Task:
                         f"{group}; want {self.scenario.choices()}"
                     )
                 taken[group] = attribute.name
-        object.__setattr__(self, "attributes", tuple(sorted(attribute.name for attribute in found)))
+        severities = {self.scenario.attribute(name).name: float(value) for name, value in self.severities}
+        for name, severity in severities.items():
+            if not 0 <= severity <= 1 or round(severity, 3) != severity:  # the name gives three decimals back
+                raise TaskError(
+                    f"scenario {self.scenario.id}: got {name}={severity:g}, want a severity from 0 (as without it) to "
+                    "1 (whole), with at most three decimals"
+                )
+        kept = sorted(attribute.name for attribute in found if severities.get(attribute.name) != 0)
+        object.__setattr__(self, "attributes", tuple(kept))
+        pairs = ((name, severities.get(name, 1.0)) for name in kept)
+        object.__setattr__(self, "severities", tuple(pair for pair in pairs if pair[1] != 1))
+
+    def severity(self, attribute: str) -> float:
+        """How severe one of its attributes is, from 0 to 1."""
+        return dict(self.severities).get(attribute, 1.0)
 
     @property
     def name(self) -> str:
-        """The id without its scenario: "gore+mossy_bricks", "default", "complete", "procedural-train-100"."""
+        """The id without its scenario: "gore+mossy_bricks", "default", "complete", "gore=0.5", "procedural-train"."""
         if self.maps is not None:
             return self.maps.name
-        if set(self.attributes) == set(self.scenario.complete):
-            return "complete"
-        return "+".join(self.attributes) or "default"
+        severities = {self.severity(name) for name in self.attributes}
+        if set(self.attributes) == set(self.scenario.complete) and len(severities) == 1:
+            return "complete" + graded_name(*severities)
+        return "+".join(name + graded_name(self.severity(name)) for name in self.attributes) or "default"
 
     @property
     def id(self) -> str:
@@ -311,6 +357,11 @@ class Task:
 
     def __str__(self) -> str:
         return self.id
+
+
+def graded_name(severity: float) -> str:
+    """What an attribute's name in a task's id ends with: "=0.5", or nothing if it is whole."""
+    return "" if severity == 1 else f"={severity:g}"
 
 
 def words(text: str) -> tuple[str, ...]:

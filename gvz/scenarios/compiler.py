@@ -1,16 +1,19 @@
 """Task -> WAD file: content of a task, its maps, script and classes, and the cache.
 
 The WAD of a task is built each time (some 20 ms) and stored in the user's cache directory under the hash of its bytes.
-So a file of another version of the code is never used. If the task's maps are drawn, this file holds the classes of all
-its maps, and the first of them; `CompiledTask.map_of` makes the map of an episode when it is played (a few ms), and
-keeps it. Nothing here starts an engine.
+So a file of another version of the code is never used. If a task has several maps, because they are drawn or because an
+attribute is in force in a part of the episodes, this file holds the classes and textures of all of them, and one map;
+`CompiledTask.map_of` makes the map of an episode when it is played (a few ms), and keeps it. Nothing here starts an
+engine.
 """
 
+import dataclasses
 import hashlib
+import itertools
 import os
 import re
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -20,15 +23,16 @@ from gvz.core.cache import cache_directory
 from gvz.core.env_config import Profile
 from gvz.core.errors import ResourceError, TaskError, WadError, nearest
 from gvz.scenarios import looks
-from gvz.scenarios.base import Content, Task, Thing, Uniform, Value
+from gvz.scenarios.base import Attribute, Chance, Content, Task, Thing, Toward, Uniform, Value
 from gvz.scenarios.floor import Floor
 from gvz.scenarios.layout import Layout
 from gvz.scenarios.map_set import MapSet
+from gvz.scenarios.severity import graded, in_force, is_whole
 from gvz.wad.acs import compile_acs
 from gvz.wad.decorate import declared_actors, declared_numbers, used_sprites
 from gvz.wad.lumps import read_maps, read_wad, write_map_wad
 from gvz.wad.stock import scenario_wad, stock_editor_numbers, stock_sprites, stock_textures
-from gvz.wad.textures import check_textures
+from gvz.wad.textures import blended, check_textures
 from gvz.wad.udmf import UdmfMap, is_inside, make_thing, parse_textmap, write_textmap
 
 MAP_NAME = "MAP01"
@@ -50,14 +54,15 @@ class CompiledTask:
     """the value that the MAP_MAGIC variable of this file's map has"""
 
     def map_of(self, episode_seed: int) -> tuple[bytes | None, int]:
-        """(The WAD of an episode's drawn map, None for that of `wad_path`; the value of the map's MAP_MAGIC).
+        """(The WAD of an episode's own map, None for that of `wad_path`; the value of the map's MAP_MAGIC).
 
         Raises:
             TaskError: the drawn map cannot be played.
         """
-        if self.task.maps is None:
-            return None, self.map_magic
-        return _drawn_map(self.task, self.profile, self.task.maps.number_of(episode_seed))
+        if self.task.maps is not None:
+            return _map_alone(self.task, self.profile, self.task.maps.number_of(episode_seed))
+        played = _in_force(self.task, self.profile, episode_seed)
+        return (None, self.map_magic) if played == self.task else _map_alone(played, self.profile)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -67,6 +72,7 @@ class MapSource:
     textmap: str
     script: str
     decorate: str
+    textures: str
     map_magic: int
 
 
@@ -86,11 +92,38 @@ def compile_task(task: Task, profile: Profile = "thesis") -> CompiledTask:
 
 
 @lru_cache(maxsize=1000)
-def _drawn_map(task: Task, profile: Profile, number: int) -> tuple[bytes, int]:
-    """(The WAD of a map alone, its magic number). The classes of all maps are in the task's own file."""
+def _map_alone(task: Task, profile: Profile, number: int | None = None) -> tuple[bytes, int]:
+    """(The WAD of a map alone, its magic number). The classes and textures of all maps are in the task's own file."""
     source = map_source(task, profile, number)
     behavior = _compiled_by_form(source.script, source.decorate)
     return write_map_wad(textmap=source.textmap, behavior=behavior, scripts=source.script), source.map_magic
+
+
+def _in_force(task: Task, profile: Profile, episode_seed: int) -> Task:
+    """The task that an episode plays: a whole attribute of severity below 1 is in force in a part of the episodes."""
+    sometimes = _sometimes(task, profile)
+    idle = [name for name in sometimes if not in_force(task.severity(name), name, episode_seed)]
+    return _one_way(task, profile, idle)
+
+
+def _sometimes(task: Task, profile: Profile) -> list[str]:
+    """Its attributes that have a severity below 1 and nothing in between."""
+    return [name for name, _ in task.severities if is_whole(_change(task.scenario.attribute(name), profile))]
+
+
+def _one_way(task: Task, profile: Profile, idle: Iterable[str]) -> Task:
+    """The task with these attributes left out, and others that are sometimes in force in force."""
+    fixed = dict.fromkeys(_sometimes(task, profile), 1.0) | dict.fromkeys(idle, 0.0)
+    return dataclasses.replace(task, severities=tuple({**dict(task.severities), **fixed}.items())) if fixed else task
+
+
+def _all_ways(task: Task, profile: Profile) -> Content:
+    """The classes and blended textures of all maps that the task's episodes play."""
+    sometimes, found = _sometimes(task, profile), Content()
+    for idle in itertools.product((False, True), repeat=len(sometimes)):
+        content = task_content(_one_way(task, profile, itertools.compress(sometimes, idle)), profile)
+        found = found.overlaid(Content(actors=content.actors, blends=content.blends))
+    return found
 
 
 def _compiled_by_form(script: str, decorate: str) -> bytes:
@@ -129,10 +162,17 @@ def task_content(task: Task, profile: Profile) -> Content:
     content = scenario.content.overlaid(scenario.levdoom) if levdoom else scenario.content
     for attribute in scenario.attributes:
         if attribute.name in task.attributes:
-            change = attribute.content.overlaid(attribute.levdoom) if levdoom else attribute.content
+            change, severity = _change(attribute, profile), task.severity(attribute.name)
+            if severity < 1 and not is_whole(change):
+                change = graded(content, change, severity)
             content = content.joined(change)
     exception = scenario.levdoom_tasks.get(task.name) if levdoom else None
     return content if exception is None else content.overlaid(exception)
+
+
+def _change(attribute: Attribute, profile: Profile) -> Content:
+    """What an attribute changes in a profile."""
+    return attribute.content.overlaid(attribute.levdoom) if profile == "levdoom" else attribute.content
 
 
 def map_source(task: Task, profile: Profile, number: int | None = None) -> MapSource:
@@ -149,11 +189,12 @@ def map_source(task: Task, profile: Profile, number: int | None = None) -> MapSo
         drawn = _draw(task, content)
     else:
         content, drawn = _draw_of_set(task, task.maps, content, task.maps.number_of(0) if number is None else number)
-    decorate = "\n".join(content.actors.values())
+    every = _all_ways(task, profile).overlaid(content)
+    decorate = "\n".join(every.actors.values())
     _check_sprites(task, decorate)
     drawn.things += [make_thing(t.type, t.x, t.y, tid=t.tid) for t in _checked_things(task, content, drawn, decorate)]
     try:
-        check_textures(drawn, stock_textures())
+        check_textures(drawn, {*stock_textures(), *content.blends})
     except WadError as error:
         raise WadError(f"task {task.id}: {error}") from error
     textmap = write_textmap(drawn)
@@ -168,7 +209,10 @@ def map_source(task: Task, profile: Profile, number: int | None = None) -> MapSo
     digest = hashlib.sha256(everything.encode()).digest()
     magic = int.from_bytes(digest[:4], "little") % (2**31 - 1) + 1
     script = template.substitute(names, map_magic=magic)
-    return MapSource(textmap=textmap, script=script, decorate=decorate, map_magic=magic)
+    textures = "".join(
+        blended(name, blend.under, blend.over, blend.opacity, stock_textures()) for name, blend in every.blends.items()
+    )
+    return MapSource(textmap=textmap, script=script, decorate=decorate, textures=textures, map_magic=magic)
 
 
 def build_wad(source: MapSource) -> bytes:
@@ -183,6 +227,7 @@ def build_wad(source: MapSource) -> bytes:
         behavior=behavior,
         scripts=source.script,
         decorate=source.decorate,
+        textures=source.textures,
     )
 
 
@@ -212,7 +257,17 @@ def _script_names(content: Content) -> dict[str, str]:
 
 
 def _set_properties(tid: str, properties: Mapping[str, Value]) -> str:
-    lines = (f"SetActorProperty({tid}, APROP_{name}, {acs_value(v)});" for name, v in properties.items())
+    lines: list[str] = []
+    for name, value in properties.items():
+        now, condition = f"GetActorProperty({tid}, APROP_{name})", ""
+        match value:
+            case Toward(end, share):
+                text = f"{now} + FixedMul({acs_value(share)}, {acs_value(end)} - {now})"
+            case Chance(whole, share):
+                text, condition = whole, f"if (Random(0.0, 1.0) < {acs_value(share)}) "
+            case _:
+                text = acs_value(value)
+        lines.append(f"{condition}SetActorProperty({tid}, APROP_{name}, {text});")
     return " ".join(lines)
 
 

@@ -112,6 +112,7 @@ def write_map_wad(
     behavior: bytes,
     scripts: str,
     decorate: str = "",
+    textures: str = "",
     map_name: str = "MAP01",
 ) -> bytes:
     """Writes a WAD with one map; the same arguments give the same bytes.
@@ -123,13 +124,14 @@ def write_map_wad(
         behavior: compiled scripts.
         scripts: their source, for a reader who opens the map in an editor; the engine does not read it.
         decorate: actor definitions; no lump if empty.
+        textures: definitions of textures; no lump if empty.
         map_name: name of the map.
 
     Raises:
         WadError: a text has a character outside Latin-1, or `map_name` is not a lump name.
     """
     lumps = [
-        *([Lump("DECORATE", _encode("DECORATE", decorate))] if decorate else []),
+        *(Lump(name, _encode(name, text)) for name, text in (("DECORATE", decorate), ("TEXTURES", textures)) if text),
         Lump(map_name, b""),
         Lump("TEXTMAP", _encode("TEXTMAP", textmap)),
         Lump("BEHAVIOR", behavior),

@@ -1,8 +1,9 @@
-"""Names of textures: those in a WAD, and those that a map uses."""
+"""Textures: those in a WAD, those that a map uses, and blends of two."""
 
+import math
 import re
 import struct
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from gvz.core.errors import WadError, nearest
 from gvz.wad.lumps import Lump
@@ -11,52 +12,53 @@ from gvz.wad.udmf import UdmfMap
 WALL_FIELDS = ("texturetop", "texturemiddle", "texturebottom")
 PLANE_FIELDS = ("texturefloor", "textureceiling")
 NO_TEXTURE = "-"
+Size = tuple[int, int]
+"""(width, height) of a texture, pixels"""
 _NAME = re.compile(r"[!-~]{1,8}")
 
 
-def wall_textures(lumps: Sequence[Lump]) -> frozenset[str]:
-    """Names in the TEXTURE1 and TEXTURE2 lumps.
+def wall_textures(lumps: Sequence[Lump]) -> dict[str, Size]:
+    """Name -> size of the textures in the TEXTURE1 and TEXTURE2 lumps.
 
     The first name of TEXTURE1 is left out: to the engine it means "no texture".
 
     Raises:
         WadError: a texture lump is damaged.
     """
-    names: set[str] = set()
+    sizes: dict[str, Size] = {}
     for lump in lumps:
         if lump.name in ("TEXTURE1", "TEXTURE2"):
-            found = _texture_names(lump)
-            names.update(found[1:] if lump.name == "TEXTURE1" else found)
-    return frozenset(names)
+            sizes.update(_textures(lump)[lump.name == "TEXTURE1" :])
+    return sizes
 
 
-def _texture_names(lump: Lump) -> list[str]:
+def _textures(lump: Lump) -> list[tuple[str, Size]]:
     data = lump.data
     count = struct.unpack_from("<i", data)[0] if len(data) >= 4 else -1
     if count < 0 or 4 + 4 * count > len(data):
         raise WadError(f"{lump.name}: got {count} textures in {len(data)} bytes, want their offsets to fit")
-    names = []
+    found = []
     for offset in struct.unpack_from(f"<{count}i", data, 4):
-        if not 0 <= offset <= len(data) - 8:
+        if not 0 <= offset <= len(data) - 16:
             raise WadError(f"{lump.name}: got a texture at {offset}, want it inside the {len(data)} bytes")
         raw_name = data[offset : offset + 8]
         name = raw_name.split(b"\0")[0].decode("latin-1")
         if not _NAME.fullmatch(name):
             raise WadError(f"{lump.name}: got the name {raw_name!r} at {offset}, want 1 to 8 ASCII characters")
-        names.append(name.upper())
-    return names
+        found.append((name.upper(), struct.unpack_from("<hh", data, offset + 12)))
+    return found
 
 
-def flats(lumps: Sequence[Lump]) -> frozenset[str]:
-    """Names of the floor and ceiling textures: the lumps between F_START and F_END."""
-    names: set[str] = set()
+def flats(lumps: Sequence[Lump]) -> dict[str, Size]:
+    """Name -> size of the floor and ceiling textures: the lumps between F_START and F_END, which are square."""
+    sizes: dict[str, Size] = {}
     inside = False
     for lump in lumps:
         if lump.name in ("F_START", "FF_START", "F_END", "FF_END"):
             inside = lump.name.endswith("START")
         elif inside and lump.data:  # an empty lump is a marker of a sub-section
-            names.add(lump.name)
-    return frozenset(names)
+            sizes[lump.name] = math.isqrt(len(lump.data)), math.isqrt(len(lump.data))
+    return sizes
 
 
 def used_textures(udmf_map: UdmfMap) -> dict[str, str]:
@@ -90,3 +92,25 @@ def check_textures(udmf_map: UdmfMap, textures: Collection[str]) -> None:
         if texture not in textures:
             hint = nearest(texture, textures)
             raise WadError(f"{place}: got the unknown texture {texture!r}{hint}, want a wall texture or flat")
+
+
+def blended(name: str, under: str, over: str, opacity: float, sizes: Mapping[str, Size]) -> str:
+    """The entry of a TEXTURES lump that makes a texture of two.
+
+    It is as large as a whole number of each, so that both lie where they would lie alone.
+
+    Args:
+        name: of the new texture.
+        under: a texture that is covered.
+        over: the texture that covers it.
+        opacity: of `over`, 0 to 1.
+        sizes: of all textures.
+    """
+    width, height = (math.lcm(*pair) for pair in zip(sizes[under], sizes[over], strict=True))
+    patches = [
+        f'Patch "{texture}", {x}, {y} {style}'
+        for texture, style in ((under, ""), (over, f"{{ Style Translucent Alpha {opacity:g} }}"))
+        for x in range(0, width, sizes[texture][0])
+        for y in range(0, height, sizes[texture][1])
+    ]
+    return "\n".join((f'Texture "{name}", {width}, {height}', "{", *patches, "}", ""))

@@ -147,6 +147,13 @@ def test_the_augmented_sheets_in_the_docs_show_every_augmentation(scenario):
         assert sheet.height // len(AUGMENTATIONS) > FRAME_HEIGHT
 
 
+def test_the_sheet_of_severities_in_the_docs_shows_every_attribute():
+    attributes = all_scenarios()["defend_the_center"].attributes
+    with Image.open(IMAGES / "severity_defend_the_center.png") as sheet:
+        assert sheet.height % len(attributes) == 0
+        assert sheet.height // len(attributes) > FRAME_HEIGHT
+
+
 @pytest.mark.slow
 @pytest.mark.engine
 @pytest.mark.parametrize("scenario", all_scenarios().values(), ids=lambda s: s.id)

@@ -1,4 +1,4 @@
-"""What attributes cost, by hand: default 80, mossy_bricks 60, gore 70, both 45."""
+"""What attributes cost, by hand: default 80, mossy_bricks 60, gore 70, half of it 77, both 45."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from gvz.tasks import attribute_tasks, parse_task, scenario_named
 from tests.reports.conftest import evaluation_row, write_rows
 
 SCENARIO = scenario_named("defend_the_center")
-PERCENT = {"default": 80.0, "mossy_bricks": 60.0, "gore": 70.0, "gore+mossy_bricks": 45.0}
+PERCENT = {"default": 80.0, "mossy_bricks": 60.0, "gore=0.5": 77.0, "gore": 70.0, "gore+mossy_bricks": 45.0}
 
 
 def scores_of(tmp_path, percent):
@@ -23,6 +23,7 @@ def test_the_loss_of_an_attribute_and_what_two_cost_beyond_their_sum(tmp_path):
     scores = scores_of(tmp_path, {task.id: PERCENT[task.name] for task in tasks})
     single, pairs = attribute_tables(SCENARIO, scores, tasks)
     assert {row[0].text: row[1].text for row in single.rows} == {
+        "gore=0.5": "3.0 [3.0, 3.0]",
         "gore": "10.0 [10.0, 10.0]",
         "mossy_bricks": "20.0 [20.0, 20.0]",
     }
@@ -33,10 +34,11 @@ def test_the_loss_of_an_attribute_and_what_two_cost_beyond_their_sum(tmp_path):
 def test_all_pairs_are_a_picture(tmp_path):
     tasks = attribute_tasks("defend_the_center")
     names = [attribute.name for attribute in SCENARIO.attributes]
-    assert [task.attributes for task in tasks[: 1 + len(names)]] == [(), *((name,) for name in names)]
+    singles = [name for one in names for name in (f"{one}=0.5", one)]
+    assert [task.name for task in tasks[: 1 + 2 * len(names)]] == ["default", *singles]
     assert len({task.id for task in tasks}) == len(tasks)
     assert parse_task("defend_the_center/gore+mossy_bricks") in tasks
-    assert all(len(task.attributes) == 2 for task in tasks[1 + len(names) :])
+    assert all(len(task.attributes) == 2 for task in tasks[1 + 2 * len(names) :])
     scores = scores_of(tmp_path, {task.id: 90.0 - 20 * len(task.attributes) for task in tasks})
     (tmp_path / "figures").mkdir()
     figure = attribute_figure(SCENARIO, "random", scores["random"], tasks, tmp_path, "pairs")

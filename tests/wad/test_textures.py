@@ -13,8 +13,9 @@ from gvz.wad.udmf import UdmfMap, parse_textmap
 
 def texture_lump(name: str, *textures: bytes) -> Lump:
     first = 4 + 4 * len(textures)
-    offsets = struct.pack(f"<{len(textures)}i", *(first + 8 * i for i in range(len(textures))))
-    return Lump(name, struct.pack("<i", len(textures)) + offsets + b"".join(t.ljust(8, b"\0") for t in textures))
+    offsets = struct.pack(f"<{len(textures)}i", *(first + 16 * i for i in range(len(textures))))
+    entries = b"".join(struct.pack("<8s4xhh", texture, 64, 128) for texture in textures)
+    return Lump(name, struct.pack("<i", len(textures)) + offsets + entries)
 
 
 def walls_and_floor(wall: str, floor: str) -> UdmfMap:
@@ -26,13 +27,13 @@ def walls_and_floor(wall: str, floor: str) -> UdmfMap:
 
 def test_wall_textures_are_listed_without_the_one_that_means_none():
     lumps = [texture_lump("TEXTURE1", b"NOTHING", b"Brick", b"EIGHTLET"), texture_lump("TEXTURE2", b"STONE")]
-    assert wall_textures(lumps) == {"BRICK", "EIGHTLET", "STONE"}
+    assert wall_textures(lumps) == dict.fromkeys(("BRICK", "EIGHTLET", "STONE"), (64, 128))
 
 
 def test_flats_are_the_lumps_between_their_markers():
     names = ("PATCH", "F_START", "F1_START", "FLOOR", "F1_END", "F_END", "SOUND", "FF_START", "LAVA", "FF_END")
-    lumps = [Lump(name, b"" if name.endswith(("START", "END")) else b"pixels") for name in names]
-    assert flats(lumps) == {"FLOOR", "LAVA"}
+    lumps = [Lump(name, b"" if name.endswith(("START", "END")) else bytes(64 * 64)) for name in names]
+    assert flats(lumps) == {"FLOOR": (64, 64), "LAVA": (64, 64)}
 
 
 @pytest.mark.parametrize(
@@ -44,10 +45,10 @@ def test_flats_are_the_lumps_between_their_markers():
         (struct.pack("<ii", 1, 4), "TEXTURE1: got a texture at 4, want it inside the 8 bytes"),
         (struct.pack("<iii", 1, -4, 0), "TEXTURE1: got a texture at -4, want it inside the 12 bytes"),
         (
-            struct.pack("<ii8s", 1, 8, b"A\xff"),
+            struct.pack("<ii8s8x", 1, 8, b"A\xff"),
             r"TEXTURE1: got the name b'A\\xff.*' at 8, want 1 to 8 ASCII characters",
         ),
-        (struct.pack("<ii8s", 1, 8, b""), "TEXTURE1: got the name b'.*' at 8, want 1 to 8 ASCII characters"),
+        (struct.pack("<ii8s8x", 1, 8, b""), "TEXTURE1: got the name b'.*' at 8, want 1 to 8 ASCII characters"),
     ],
 )
 def test_a_damaged_texture_lump_is_refused(data: bytes, message: str):
@@ -59,7 +60,7 @@ def test_freedoom_has_every_texture_of_the_benchmark_as_wall_or_flat():
     wanted = """A-MOSBRI A-CAMO3 AQCONC14 AQSECT09 ICKWALL3 FIREBLU2 FIREWALL SKY2 TANROCK2 BRICK12 GSTONE1 STONE2
         CRACKLE4 DORED CAVERN1 ROCKRED1 FLOOR4_6 CEIL5_1 FLOOR1_6 CEIL3_3 SLIME04 GRASS2 LAVA1 CEIL1_1 FWATER1 AQF052
         AQF051 FLAT19 FLAT14 CEIL4_3 CEIL4_1 RROCK02 NUKAGE1 CRATOP1 FLOOR0_5 FLAT5_7 SWATER1"""
-    assert set(wanted.split()) <= stock_textures()
+    assert set(wanted.split()) <= stock_textures().keys()
     assert len(stock_textures()) > 1000
 
 

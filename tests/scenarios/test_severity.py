@@ -1,0 +1,160 @@
+"""Graded attributes: ids, what an engine shows at a severity, and how often whole attributes are in force."""
+
+import numpy as np
+import pytest
+
+import gvz
+from gvz.core.errors import TaskError
+from gvz.evaluation.gallery import task_frame
+from gvz.evaluation.play import episode_seed
+from gvz.scenarios.compiler import compile_task, map_source, task_content
+from gvz.scenarios.severity import in_force
+from gvz.tasks import all_scenarios, parse_task
+from gvz.wad.textures import blended
+from tests.scenarios.test_games import BAD_LOG_LINES
+
+HALF = tuple((f"{name}/complete=0.5", "thesis") for name in ("defend_the_center", "dodge_projectiles"))
+HALF += (("defend_the_center/fast=0.5+fuzzy=0.5+resized=0.5+gore=0.4", "thesis"),)
+HALF += (("defend_the_center/fast=0.5", "levdoom"), ("health_gathering/short_agent=0.5+poison=0.5+slime=0.5", "thesis"))
+HALF += (("health_gathering/supreme+shaded_kits=0.7", "thesis"),)
+SHADED = 66
+"""the engine's number of STYLE_Shaded"""
+RESIZED_AT_HALF = (0.65, 2.0)
+"""halfway from 1 to 0.3, and from 1 to 3"""
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "level"),
+    [
+        ("defend_the_center/fast=0.5", "fast_enemies=0.5", 1),
+        ("defend_the_center/gore=1+fast=0.250", "fast_enemies=0.25+gore", 2),
+        ("defend_the_center/gore=0+fast=0.25", "fast_enemies=0.25", 1),
+        ("defend_the_center/gore=0", "default", 0),
+        ("seek_and_kill/complete=0.5", "complete=0.5", 4),
+        ("seek_and_kill/complete=1", "complete", 4),
+        ("seek_and_kill/complete=0", "default", 0),
+        ("dodge_projectiles/mancubus=0.5", "mancubus=0.5", 1),
+    ],
+)
+def test_an_id_with_severities_has_one_canonical_form(text, name, level):
+    task = parse_task(text)
+    assert (task.name, task.level) == (name, level)
+    assert parse_task(task.id) == task
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("defend_the_center/gore=1.5", r"gore=1.5, want a severity from 0 \(as without it\) to 1"),
+        ("defend_the_center/gore=0.1234", "at most three decimals"),
+        ("defend_the_center/gore=half", "got 'gore=half', want '<attribute>=<severity>'"),
+        ("defend_the_center/gore=", "got 'gore=', want"),
+        ("defend_the_center/gore=-1", "got 'gore=-1', want"),
+        ("defend_the_center/gor=0.5", "unknown attribute 'gor' .*did you mean 'gore'"),
+        ("defend_the_center/stone_wall=0.5+mossy_bricks=0.5", "are both of group textures"),
+        ("defend_the_center/complete=0.5+gore", "'complete' is a task and no attribute"),
+    ],
+)
+def test_a_wrong_severity_is_an_error_that_says_what_is_possible(text, message):
+    with pytest.raises(TaskError, match=message):
+        parse_task(text)
+
+
+@pytest.mark.parametrize("scenario", all_scenarios().values(), ids=lambda scenario: scenario.id)
+def test_no_two_maps_of_a_task_need_different_classes_of_one_name(scenario):
+    """The task's file holds the classes of all maps of its episodes."""
+    for profile in ("thesis", "levdoom"):
+        for attribute in scenario.attributes:
+            task = parse_task(f"{scenario.id}/{attribute.name}")
+            with_it, without = (
+                task_content(one, profile).actors for one in (task, parse_task(f"{scenario.id}/default"))
+            )
+            assert all(with_it[name] == text for name, text in without.items())
+
+
+def test_a_blend_lies_where_both_textures_lie():
+    """A wall of 64x128 and a flat of 64x64: one patch of the wall, two of the flat."""
+    entry = blended("XWALL", "WALL", "FLAT", 0.25, {"WALL": (64, 128), "FLAT": (64, 64)})
+    assert entry.splitlines() == [
+        'Texture "XWALL", 64, 128',
+        "{",
+        'Patch "WALL", 0, 0 ',
+        'Patch "FLAT", 0, 0 { Style Translucent Alpha 0.25 }',
+        'Patch "FLAT", 0, 64 { Style Translucent Alpha 0.25 }',
+        "}",
+    ]
+
+
+def test_things_are_spread_and_numbers_go_part_of_the_way():
+    def content(text):
+        return task_content(parse_task(f"health_gathering/{text}"), "thesis")
+
+    starts = content("default").things["health_gathering.wad"]
+    columns = content("obstacles").things["health_gathering.wad"][len(starts) :]
+    assert content("obstacles=0.5").things["health_gathering.wad"] == (*starts, *columns[1::2])
+    assert len(content("obstacles=0.1").things["health_gathering.wad"]) == len(starts) + len(columns) // 10
+    default, whole = content("default").parameters, content("poison").parameters
+    half = content("poison=0.5").parameters
+    assert (default["num_poisons"], half["num_poisons"], whole["num_poisons"]) == (0, 1, 2)
+
+
+def test_a_whole_attribute_is_in_force_in_its_share_of_the_episodes():
+    """Of 4,000 evaluation seeds; the standard error is 0.7 points. What is in force at 0.3 is so at 0.6."""
+    seeds = [episode_seed("seek_and_kill/default", n) for n in range(4000)]
+    low, high = ({s for s in seeds if in_force(severity, "mixed_enemies", s)} for severity in (0.3, 0.6))
+    assert low < high
+    assert len(low) / 4000 == pytest.approx(0.3, abs=0.03)
+    assert len(high) / 4000 == pytest.approx(0.6, abs=0.03)
+    compiled = compile_task(parse_task("seek_and_kill/mixed=0.3"))
+    magic = {name: map_source(parse_task(f"seek_and_kill/{name}"), "thesis").map_magic for name in ("default", "mixed")}
+    for seed in seeds[:20]:
+        played = compiled.map_of(seed)[1]
+        # the file has a class more than that of default, which is a part of what the number is made of
+        assert (played == magic["mixed"]) == (seed in low)
+        assert played in magic.values()
+
+
+@pytest.mark.engine
+@pytest.mark.xdist_group("games")
+@pytest.mark.parametrize("job", HALF, ids="-".join)
+def test_games_at_half_severity_are_what_they_say(measured, job):
+    found = measured(HALF, job)
+    assert found["magic_right"]
+    assert [line for line in BAD_LOG_LINES.findall(found["log"]) if "bots read" not in line] == []
+    if "fast" in job[0]:  # 8 and 10 of the classes, 20 (levdoom: 15) of the attribute
+        speeds = (11.5, 12.5) if job[1] == "levdoom" else (14.0, 15.0)
+        assert {entity["speed"] for entity in found["entities"]} <= set(speeds)
+        assert found["agent"]["damage_factor"] == pytest.approx(0.65, abs=1e-4)  # halfway from 1 to 0.3
+    if "resized" in job[0]:
+        low, high = RESIZED_AT_HALF
+        scales = [entity[name] for entity in found["entities"] for name in ("scale_x", "scale_y")]
+        assert all(low - 1e-4 <= scale <= high + 1e-4 for scale in scales)
+        assert len(set(scales)) == len(scales)
+    if "shaded_kits" in job[0]:  # of 30 kits, the standard error is 8 points
+        shaded = [entity["render_style"] for entity in found["entities"]].count(SHADED)
+        assert 0.4 <= shaded / len(found["entities"]) <= 0.95
+    if "short_agent" in job[0]:  # 41 of the class, 0 to 100 of the attribute
+        assert 20.5 <= found["agent"]["view_height"] <= 70.5
+
+
+@pytest.mark.engine
+@pytest.mark.xdist_group("games")
+def test_textures_at_a_severity_are_between_those_of_both_tasks():
+    names = ("default", "stone_wall=0.25", "stone_wall=0.5", "stone_wall=0.75", "stone_wall")
+    frames = [task_frame(parse_task(f"defend_the_center/{name}"))[:90].astype(float) for name in names]
+    from_default, to_whole = (
+        [float(np.abs(frame.mean(axis=(0, 1)) - frames[end].mean(axis=(0, 1))).sum()) for frame in frames]
+        for end in (0, -1)
+    )
+    assert from_default == sorted(from_default)
+    assert to_whole == sorted(to_whole, reverse=True)
+
+
+@pytest.mark.engine
+def test_an_environment_plays_both_maps_of_a_graded_attribute():
+    with gvz.make("health_gathering/supreme=0.5+slime=0.5") as env:
+        for seed in range(6):  # the environment compares the map's number with the one that it should play
+            env.reset(options={"episode_seed": seed})
+            env.step(0)
+        assert env.unwrapped.task.name == "slime=0.5+supreme=0.5"
+    assert 0 < sum(in_force(0.5, "supreme", seed) for seed in range(6)) < 6
