@@ -3,6 +3,7 @@
 Source: thesis 5.1.1 (seeds, checkpoints, episodes) and 5.2 (the four experiments).
 """
 
+import itertools
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -78,7 +79,7 @@ class TrainingRun:
     @property
     def run_config(self) -> RunConfig:
         """Its config file with the settings of its variant, at full size."""
-        return with_settings(load_config(self.config), self.settings)
+        return with_settings(load_config(self.config), {"scenario": self.scenario, **self.settings})
 
     @property
     def checkpoint_period_updates(self) -> int:
@@ -314,9 +315,9 @@ def experiments() -> dict[str, Experiment]:
     assert all(name == experiment.name for name, experiment in found.items()), "an experiment's name is its file's"
     for experiment in found.values():
         for config in map(load_config, experiment.configs):
-            for variant, settings in experiment.variants.items():
+            for (variant, settings), scenario in itertools.product(experiment.variants.items(), experiment.scenarios):
                 try:
-                    with_settings(config, settings)
+                    with_settings(config, {"scenario": scenario, **settings})
                 except ConfigError as error:
                     where = f"experiment {experiment.name}: variant {variant} of {config.name}"
                     raise ConfigError(f"{where}: {error}") from error

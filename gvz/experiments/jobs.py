@@ -152,7 +152,7 @@ def _flag(name: str, value: Any) -> tuple[str, ...]:
 
 
 def _words(value: Any) -> tuple[str, ...]:
-    return tuple(word for item in value for word in _words(item)) if isinstance(value, tuple) else (str(value),)
+    return tuple(word for item in value for word in _words(item)) if isinstance(value, tuple | list) else (str(value),)
 
 
 def _episodes(evaluation: Evaluation) -> tuple[str, ...]:

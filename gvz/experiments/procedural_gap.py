@@ -11,6 +11,7 @@ EXPERIMENT = Experiment(
     trainings=("procedural-train-10", "procedural-train-100", "procedural-train-1000", "procedural-train"),
     seeds=(1111, 2222, 3333),
     total_updates=60_000,
+    max_processor_s=1_800.0,
     num_checkpoints=1,
     table_checkpoints=1,
     evaluate_on="procedural",
