@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from actors.placement import PlacementKind
 from gvz.core.errors import ConfigError
 
 MAX_LANES = 2**16
@@ -17,6 +18,9 @@ class ActorsConfig:
     games_per_actor: int | None = None
     """games each actor plays and acts on in one batch; default the smallest number >= 4 that gives every actor
     every task"""
+    placement: PlacementKind = "auto"
+    """pinned: an actor and its engines share one core, and the learner keeps off these cores if there are others; free:
+    any core; auto: pinned if at the start as many cores are idle as there are actors, and one more"""
     ring_capacity: int = 64
     """step records a ring holds; a full ring makes its actor wait"""
     start_timeout_s: float = 120.0

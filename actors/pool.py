@@ -25,6 +25,8 @@ class PoolConfig(Play, frozen=True, kw_only=True):
     num_actors: int
     games_per_actor: int
     actors: ActorsConfig
+    cores: tuple[int | None, ...] = ()
+    """the core of each actor and its engines (actors.placement), None: any; empty: any for all"""
     work_dir: Path
     """private directory for logs and the engines' files"""
 
@@ -68,6 +70,7 @@ class PoolConfig(Play, frozen=True, kw_only=True):
                     lane_tasks=lanes.tasks[own],
                     first_episodes=lanes.next_episodes[own],
                     ring_capacity=self.ring_capacity,
+                    core=self.cores[actor] if self.cores else None,
                     work_dir=str(self.work_dir.absolute()),
                 )
             )

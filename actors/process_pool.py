@@ -1,10 +1,12 @@
 """The pool of actor processes: starts them, watches them, takes their records."""
 
+import os
 import time
 from typing import Any
 
 import numpy as np
 
+from actors.placement import cores_left, keep_to
 from actors.pool import STOP_TIMEOUT_S, Pool, PoolConfig, PoolStatistics, lanes_to_begin_with, num_decisions
 from actors.supervisor import SupervisedActor
 from gvz.core import janitor
@@ -39,11 +41,13 @@ class ProcessPool(Pool):
         self._params: BroadcastWriter | None = None
         self._clock = AwakeClock(config.actors.heartbeat_timeout_s / 4)
         self._env_steps, self._waited_s = 0, 0.0
+        self._own_cores = os.sched_getaffinity(0)
         try:
             if config.policy:
                 self._params = BroadcastWriter.create("gvz-params", config.num_params, config.layout_hash)
             for spec in specs:
                 self._actors.append(SupervisedActor(spec, config.actors, self._params))
+            keep_to(cores_left(spec.core for spec in specs))
             for actor in self._actors:
                 actor.start()
         except BaseException:
@@ -127,4 +131,5 @@ class ProcessPool(Pool):
                 actor.ring.close()
             if self._params is not None:
                 self._params.close()
+            keep_to(self._own_cores)
             janitor.clean_dead_instances()

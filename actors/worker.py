@@ -12,6 +12,7 @@ import time
 import traceback
 
 from actors.loop import ActorLoop
+from actors.placement import keep_to
 from gvz.core.errors import EngineError, WaitTimeoutError
 from gvz.transport import child
 from gvz.transport.broadcast import BroadcastReader
@@ -97,6 +98,8 @@ def main() -> int:
     spec = channel.wait_for_message()
     if not isinstance(spec, ActorSpec):
         raise TypeError(f"first message: got {type(spec).__name__}, want ActorSpec")
+    if spec.core is not None:
+        keep_to([spec.core])
     try:
         worker = Worker(spec, channel, ring, params[0] if params else None)
         for inherited in (ring, *params):  # their memory is mapped; the engines must not inherit them

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from actors.inline import InlinePool
+from actors.placement import actor_cores, in_words
 from actors.pool import Pool, PoolConfig
 from actors.process_pool import ProcessPool
 from gvz.core.errors import ConfigError
@@ -81,6 +82,7 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
     spec, params = agent.spec, jax.eval_shape(agent.init, jax.random.key(0))
     num_params = sum(leaf.size for leaf in jax.tree.leaves(params))
     _, extras = jax.eval_shape(agent.act, params, jax.random.key(0), spec.zeros(), jnp.float32(0))
+    cores = () if config.mode == "sync" else tuple(actor_cores(config.actors.placement, config.num_actors))
     pool_config = PoolConfig(
         tasks=table.ids,
         num_actors=config.num_actors,
@@ -99,6 +101,7 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
         num_params=num_params,
         layout_hash=layout_hash(params),
         actors=config.actors,
+        cores=cores,
         work_dir=work_dir,
     )
     learner = (_on_policy if config.agent.on_policy else _off_policy)(config, agent, pool_config)
@@ -113,6 +116,7 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
             num_actors=0 if config.mode == "sync" else config.num_actors,
             num_games=config.num_lanes,
             transport_bytes=0 if config.mode == "sync" else pool_config.shared_memory_bytes(),
+            placement=in_words(cores),
         ),
     )
 

@@ -30,6 +30,8 @@ class Footprint:
     num_games: int
     transport_bytes: int
     """rings and parameter queue"""
+    placement: str
+    """which cores the actors use, in words"""
 
     @property
     def shm_bytes(self) -> int:
@@ -61,7 +63,7 @@ class Footprint:
             f"replay {format_bytes(self.replay_bytes)} ({where}), checkpoint copy {format_bytes(self.snapshot_bytes)}",
             f"/dev/shm {format_bytes(self.shm_bytes)}, rings and parameter queue {format_bytes(self.transport_bytes)}, "
             f"host memory in all {format_bytes(self.memory_bytes)}",
-            f"processes: 1 learner, {self.num_actors} actors, {self.num_games} engines",
+            f"processes: 1 learner, {self.num_actors} actors, {self.num_games} engines; {self.placement}",
         ]
 
 

@@ -10,6 +10,7 @@ _MAY_CHANGE = (
     "name",
     "max_processor_s",
     "learner.total_updates",
+    "actors.placement",
     "actors.ring_capacity",
     "actors.start_timeout_s",
     "actors.heartbeat_timeout_s",

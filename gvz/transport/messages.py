@@ -186,6 +186,8 @@ class ActorSpec(Play, frozen=True, kw_only=True, tag="actor_spec"):
     first_episodes: list[Count]
     """number of each game's first episode (larger than 0 after a restart or resume)"""
     ring_capacity: Count
+    core: Count | None
+    """the only one that it and its engines may use; None: any"""
     work_dir: str
     """private directory for the engines' files and the worker's logs"""
 

@@ -78,6 +78,7 @@ MESSAGES = [
         num_actions=3,
         policy=b"\0\1",
         ring_capacity=8,
+        core=None,
         num_params=3,
         layout_hash=2**64 - 1,
         work_dir="/x",

@@ -14,6 +14,7 @@ FOOTPRINT = Footprint(
     num_actors=2,
     num_games=8,
     transport_bytes=100_000_000,
+    placement="actors and engines on any core",
 )
 
 
