@@ -28,6 +28,7 @@ GOALS = {
     8: ("startup", "Start-up"),
     9: ("encoders", "Encoders"),
     10: ("vector", "Vector environment"),
+    11: ("placement", "Placement"),
 }
 """number -> (benchmark, title); a benchmark may have figures and no goal"""
 RATES = ("decisions", "frames", "updates", "samples")
