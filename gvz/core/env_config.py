@@ -58,7 +58,8 @@ class EnvConfig:
     buffers: tuple[Buffer, ...] = ()
     """more than the screen: observations become a dict of `screen` and these"""
     reward_weights: tuple[tuple[str, float], ...] = ()
-    """reward components and their weights, in place of the profile's: kill 2 death 0"""
+    """reward components and their weights, in place of the profile's: kill 2 death 0; seek_and_kill.moved 0 is of one
+    scenario alone"""
 
     def __post_init__(self) -> None:
         if isinstance(self.reward_weights, Mapping):

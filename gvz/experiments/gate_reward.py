@@ -10,7 +10,7 @@ EXPERIMENT = Experiment(
     configs=("rainbow_quick",),
     variants={
         "thesis": {},
-        "tenth": {"env.reward_weights": [["moved", 0.0005]]},
+        "tenth": {"env.reward_weights": [["seek_and_kill.moved", 0.0005]]},
     },
     scenarios=("seek_and_kill",),
     trainings=("train8",),

@@ -231,14 +231,31 @@ class Scenario:
         """The weight of every reward component.
 
         Args:
-            weights: component -> weight, instead of the profile's; other components keep the profile's weight.
+            weights: component -> weight, instead of the profile's; other components keep the profile's weight. A name
+                such as "seek_and_kill.moved" is of that scenario alone.
             profile: the profile of the other weights.
 
         Raises:
             ConfigError: an unknown component, or a weight that is not a finite number.
+            TaskError: an unknown scenario in a name.
         """
         defaults = {n: r.levdoom if profile == "levdoom" else r.weight for n, r in self.rewards.items()}
-        return defaults if weights is None else {**defaults, **check_weights(weights, defaults)}
+        return defaults if weights is None else {**defaults, **check_weights(self._own(weights), defaults)}
+
+    def _own(self, weights: Mapping[str, float]) -> Mapping[str, float]:
+        """Without the weights of other scenarios, which are checked."""
+        if not isinstance(weights, Mapping) or not any("." in str(name) for name in weights):
+            return weights
+        from gvz.tasks import scenario_named  # which imports this module
+
+        own: dict[str, float] = {}
+        for name, weight in weights.items():
+            scenario, dot, component = str(name).rpartition(".")
+            if dot and scenario != self.id:
+                scenario_named(scenario).reward_weights({component: weight})
+            else:
+                own[component] = weight
+        return own
 
     def make_rewarder(self, weights: Mapping[str, float] | None = None, profile: Profile = "thesis") -> Rewarder:
         """A rewarder for one game, with `reward_weights(weights, profile)`; raises the same errors."""

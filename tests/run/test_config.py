@@ -10,11 +10,12 @@ import pytest
 
 from gvz.actions import UNIFIED_V1
 from gvz.core.env_config import EnvConfig
-from gvz.core.errors import ConfigError
+from gvz.core.errors import ConfigError, TaskError
 from gvz.launch import main, parse
 from gvz.run.config import RunConfig
 from gvz.run.config_files import config_from_dict, config_to_dict, configs_directory, find_config_file, load_config
 from gvz.run.resume import differences
+from gvz.tasks import scenario_named
 from learner.agents.configs.ppo import PPOConfig
 from learner.config import LearnerConfig, OnPolicyConfig, ReplayConfig
 
@@ -118,6 +119,19 @@ def test_reward_weights_are_one_field_in_every_form():
     saved = config_to_dict(run)
     assert saved["config"]["env"]["reward_weights"] == [["death", -1.5], ["kill", 2.0]]
     assert config_from_dict(json.loads(json.dumps(saved))).env == run.env
+
+
+def test_a_weight_may_be_of_one_scenario():
+    weights = (("kill", 2.0), ("seek_and_kill.moved", 0.0), ("health_gathering.living", 3.0))
+    by_scenario = [
+        scenario.reward_weights(dict(weights))
+        for scenario in map(scenario_named, ("seek_and_kill", "defend_the_center"))
+    ]
+    assert [(found["kill"], found.get("moved")) for found in by_scenario] == [(2.0, 0.0), (2.0, None)]
+    with pytest.raises(TaskError, match="unknown scenario 'seek_an_kill'"):
+        scenario_named("defend_the_center").reward_weights({"seek_an_kill.moved": 0.0})
+    with pytest.raises(ConfigError, match="unknown component 'move'"):
+        scenario_named("defend_the_center").reward_weights({"seek_and_kill.move": 0.0})
 
 
 def test_the_fewest_warmup_decisions_are_n_steps_a_game():
