@@ -29,7 +29,8 @@ _SLACK = 0.1
 def measure(budget: Budget) -> list[Row]:
     """The five curves and their goals."""
     few = dataclasses.replace(budget, rounds=min(budget.rounds, 3), body_s=budget.body_s / 2)
-    return [*_replay(few), *_batch(few), *_parameters(few), *_actors(few), *_tasks(few)]
+    capacities = (1_000, 4_000) if budget.quick else (10_000, 100_000, 1_000_000)
+    return [*replay_rows(few, capacities), *_batch(few), *_parameters(few), *_actors(few), *_tasks(few)]
 
 
 def _curve(
@@ -51,7 +52,7 @@ def _alternate(budget: Budget, bodies: Mapping[float, Callable[[], float]]) -> d
     return {x: found[str(x)] for x in bodies}
 
 
-def _replay(budget: Budget) -> list[Row]:
+def replay_rows(budget: Budget, capacities: Sequence[int]) -> list[Row]:
     """Insertion of a block of 64 records and draw of a batch of 32, over the replay's size."""
     import jax
 
@@ -61,7 +62,7 @@ def _replay(budget: Budget) -> list[Row]:
     from learner.store import StepArrays
 
     rng, inserts, draws = np.random.default_rng(0), {}, {}
-    for capacity in (1_000, 4_000) if budget.quick else (10_000, 100_000, 1_000_000):
+    for capacity in capacities:
         spec = ReplaySpec(
             num_lanes=8,
             capacity=capacity,
@@ -110,7 +111,9 @@ def _replay(budget: Budget) -> list[Row]:
     return rows
 
 
-def _updates(budget: Budget, sizes: Sequence[int], change: Callable[[Any, int], Any]) -> dict[float, list[float]]:
+def updates_by_size(
+    budget: Budget, sizes: Sequence[int], change: Callable[[Any, int], Any]
+) -> dict[float, list[float]]:
     """Seconds of a gradient step by size, with a replay of two thousand records of full frames."""
     from gvz.run.assemble import assemble
     from learner.config import ReplayConfig
@@ -134,7 +137,7 @@ def _batch(budget: Budget) -> list[Row]:
     def change(config: Any, size: int) -> Any:
         return dataclasses.replace(config, learner=dataclasses.replace(config.learner, batch_size=size))
 
-    values = _updates(budget, (8, 16) if budget.quick else (32, 128, 1024), change)
+    values = updates_by_size(budget, (8, 16) if budget.quick else (32, 128, 1024), change)
     return [
         *_curve("gradient step over the batch", "ms", "transitions in a batch", values, 1e3),
         goal(7, "exponent of a gradient step in its batch", exponent(values), at_most=1 + _SLACK),
@@ -158,7 +161,7 @@ def _parameters(budget: Budget) -> list[Row]:
     for size in hidden:
         params = jax.eval_shape(run_agent(change(workload.run_config(budget), size)).init, jax.random.key(0))
         counts[size] = sum(leaf.size for leaf in jax.tree.leaves(params))
-    steps = {counts[size]: found for size, found in _updates(budget, hidden, change).items()}
+    steps = {counts[size]: found for size, found in updates_by_size(budget, hidden, change).items()}
     writers = {n: BroadcastWriter.create("gvz-bench", n, 0) for n in counts.values()}
     try:
         bodies = {}

@@ -29,6 +29,7 @@ GOALS = {
     9: ("encoders", "Encoders"),
     10: ("vector", "Vector environment"),
     11: ("placement", "Placement"),
+    12: ("gpu", "GPU"),
 }
 """number -> (benchmark, title); a benchmark may have figures and no goal"""
 RATES = ("decisions", "frames", "updates", "samples")

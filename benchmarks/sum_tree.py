@@ -30,7 +30,7 @@ def measure(budget: Budget) -> list[Row]:
             peer = start_peer("flashbax_tree", budget.peers, *sizes, environment={"JAX_PLATFORMS": "cpu"})
         bodies: dict[str, Callable[[], float]] = {}
         for batch in batches:
-            bodies[f"sum tree, batch {batch}"] = partial(seconds_per_call, _steps(num_leaves, batch), budget.body_s)
+            bodies[f"sum tree, batch {batch}"] = partial(seconds_per_call, steps_of(num_leaves, batch), budget.body_s)
             if not isinstance(peer, str):
                 body = {"seconds": budget.body_s, "batch": batch}
                 bodies[f"flashbax, batch {batch}"] = lambda body=body: peer(**body)["seconds_per_call"]
@@ -50,7 +50,7 @@ def measure(budget: Budget) -> list[Row]:
     return rows
 
 
-def _steps(num_leaves: int, batch_size: int) -> Callable[[], None]:
+def steps_of(num_leaves: int, batch_size: int) -> Callable[[], None]:
     """A compiled and warm function that does STEPS_PER_CALL steps and waits for them."""
     import jax
     import jax.numpy as jnp

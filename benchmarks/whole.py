@@ -51,9 +51,9 @@ def measure(budget: Budget) -> list[Row]:
         firsts, runs, learner_alone, actors_alone = [], [], [], []
         costs: defaultdict[str, list[float]] = defaultdict(list)
         for number in range(num_runs):
-            firsts.append(_run(Path(directory) / f"first_{number}", budget, 1, 1, memory_period_s, tree_bytes))
+            firsts.append(run_command(Path(directory) / f"first_{number}", budget, 1, 1, memory_period_s, tree_bytes))
             runs.append(
-                _run(Path(directory) / f"run_{number}", budget, updates, period, processor_period_s, _processor)
+                run_command(Path(directory) / f"run_{number}", budget, updates, period, processor_period_s, _processor)
             )
             learner = workload.Learner(config, parts)
             learn = partial(learner.updates_per_s, learner.sizes.num_updates_per_call)
@@ -68,7 +68,7 @@ def measure(budget: Budget) -> list[Row]:
                 decisions_per_s, cost = workload.processor_costs(play)
             actors_alone.append(decisions_per_s)
             costs["decision, actors alone"].append(cost["Python"] + cost["engines"])
-    together = [_rates(run["rows"]) for run in runs]
+    together = [run_rates(run["rows"]) for run in runs]
     updates_per_s, decisions_per_s = [u for u, _ in together], [d for _, d in together]
     shares = [
         u / alone_u + d / alone_d
@@ -109,7 +109,7 @@ def measure(budget: Budget) -> list[Row]:
     ]
 
 
-def _run(
+def run_command(
     directory: Path, budget: Budget, updates: int, log_period: int, look_period_s: float, look: Callable[[int], Any]
 ) -> dict[str, Any]:
     """One run of the real command: its rows of metrics, seconds from the command to the first, and `look`'s samples.
@@ -165,7 +165,7 @@ def end_run(process: "subprocess.Popen[bytes]") -> None:
         process.wait()
 
 
-def _rates(rows: list[dict[str, Any]]) -> tuple[float, float]:
+def run_rates(rows: list[dict[str, Any]]) -> tuple[float, float]:
     """Gradient steps and decisions a second, from the first row to the last."""
     first, last = rows[0], rows[-1]
     seconds = last["time_s"] - first["time_s"]
