@@ -9,7 +9,7 @@ import numpy as np
 from gvz.evaluation.statistics import Estimate, bootstrap
 from gvz.reports.experiment_section import comparison_table, result_table
 from gvz.reports.results import read_results
-from gvz.tasks import named_tasks
+from gvz.tasks import named_tasks, scenarios
 
 ROOT = Path(__file__).parent.parent
 
@@ -48,6 +48,24 @@ def test_the_quick_comparison_says_what_its_records_give():
             tasks = {task.id for task in named_tasks("defend_the_center", level=level)}
             assert value == round(np.mean([row["normalized_score"] for row in final if row["task"] in tasks]), 1)
         assert said[-1] == round(np.mean([row["normalized_score"] for row in final if row["task"] in test_tasks]), 1)
+
+
+def test_the_joint_run_says_what_its_records_give():
+    folder = ROOT / "results" / "rainbow_all"
+    lines = gzip.decompress((folder / "evaluation.jsonl.gz").read_bytes()).splitlines()
+    rows, readme = [json.loads(line) for line in lines], (folder / "README.md").read_text()
+    for split, episodes, title in (("train4", 20, "4 training tasks"), ("test", 50, "7 test tasks")):
+        means = []
+        for scenario in scenarios():
+            tasks = [task.id for task in named_tasks(scenario, split=split)]
+            scores = [[row["normalized_score"] for row in rows if row["task"] == task] for task in tasks]
+            assert [len(found) for found in scores] == [episodes] * len(tasks)
+            means.append(np.mean(scores))
+        cells = " | ".join(f"{value:.1f}" for value in (*means, np.mean(means)))
+        assert f"| {title} each, {episodes} episodes a task | {cells} |" in readme
+    report = (folder / "report" / "report.md").read_text()
+    assert "P_norm, 43.6 [42.8, 44.4]" in readme
+    assert "| rainbow_all | 47.7 [46.8, 48.8] | 41.4 [40.2, 42.7] |" in report
 
 
 def test_the_findings_say_what_the_gates_records_give():
