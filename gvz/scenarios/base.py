@@ -54,6 +54,7 @@ BOOKKEEPING: Mapping[str, str] = MappingProxyType(
         "KITS_TAKEN": "USER3",  # kits, or keys
         "POISONS_TAKEN": "USER4",  # vials of poison, or other things that hurt
         "GOALS": "USER5",  # how often the agent did what the metric `goals` counts
+        "STEPS_NEARER": "USER6",  # steps of 64 units by which the agent came nearer to a goal
         "MAP_MAGIC": "USER60",  # `CompiledTask.map_magic`: checks that the right map runs
     }
 )

@@ -42,6 +42,10 @@ SHOWN = {
     "cacodemons": (("Cacodemon", 200), ("CacodemonBall", 20)),
     "revenants": (("Revenant", 100), ("RevenantTracer", 40)),
     "arachnotron": (("Arachnotron", 50), ("ArachnotronPlasma", 40)),
+    "sergeants": (("ShotgunGuy", 200), ("Goal", 300)),
+    "flying_guards": (("Cacodemon", 400), ("Goal", 100)),
+    "knights": (("HellKnight", 400), ("Goal", 200)),
+    "traps": (("Trap", 200),),
     "decoys": (("RedCard YellowCard RedSkull YellowSkull", 20),),
     "skulls": (("BlueSkull", 100), ("Portal", 1000)),
     "revenants_and_arachnotron": (("Revenant", 80), ("Arachnotron", 50), ("RevenantTracer", 40)),
@@ -53,6 +57,7 @@ ENEMIES = {
     "seek_and_kill": ("Demon", 300),
     "dodge_projectiles": ("DoomImp", 200),
     "find_the_key": ("BlueCard", 100),
+    "guarded_goal": ("DoomImp", 300),
 }
 """what a task shows whose attributes change no kind of thing"""
 

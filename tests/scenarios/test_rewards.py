@@ -203,6 +203,7 @@ def test_an_atom_is_half_a_main_event_at_most_but_in_seek_and_kill_it_is_wider_t
         ("health_gathering", "health_gained"),
         ("dodge_projectiles", "health_lost"),
         ("find_the_key", "left"),
+        ("guarded_goal", "goal"),
     ):
         assert atoms[scenario] <= abs(scenario_named(scenario).rewards[event].weight) / 2
 
@@ -213,6 +214,7 @@ TASKS = {
     "seek_and_kill": {"scripted": "invulnerable", "sweep": "mixed_enemies", "idle": "mixed_enemies"},
     "dodge_projectiles": {"scripted": "mancubus", "sweep": "default", "idle": "arachnotron"},
     "find_the_key": {"scripted": "default", "sweep": "decoys", "idle": "default"},
+    "guarded_goal": {"scripted": "default", "sweep": "traps", "idle": "default"},
 }
 """scenario -> player -> the task in which most of what is rewarded happens to it"""
 PLAYED_STEPS = 300
@@ -224,6 +226,7 @@ FILLED_SHARES = {
     "seek_and_kill": (0.08, 0.3),
     "dodge_projectiles": (0.45, 0.1),
     "find_the_key": (0.2, 0.15),
+    "guarded_goal": (0.2, 0.15),
 }
 """How much of v_min and of v_max the three players reach, at least, in profile thesis at frame skip 4.
 

@@ -217,6 +217,7 @@ def test_the_first_maps_are_those_that_runs_were_trained_on():
         "defend_the_center": "392c38852665036e",
         "dodge_projectiles": "5f512baa8ce0c63f",
         "find_the_key": "ee603d794e179bc5",
+        "guarded_goal": "4bcf7d6b1c8732d9",
         "health_gathering": "7e30c5f9275bdd64",
         "seek_and_kill": "3aab033a1a5bc1a3",
     }

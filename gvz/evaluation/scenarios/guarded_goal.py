@@ -1,0 +1,66 @@
+"""Guarded Goal: its sweep, script and pictures."""
+
+import math
+from collections.abc import Iterator
+
+from gvz.evaluation.scenarios.base import FULL_TURN, HALF_TURN, Moment, Pose, Sight
+
+SWEEP = (("MOVE_FORWARD", 8), ("ATTACK", 1), ("MOVE_FORWARD", 8), ("TURN_RIGHT", 6))
+MOMENTS = {"health_gathering.wad": Moment(seed=1, tics=20, pose=Pose(916, 300, 135))}
+STUCK_UNITS = 4.0
+"""map units; an agent that a step forward brings less far walks against something"""
+IN_RANGE = 7.0
+"""nearness, pixels, of a guard worth a bullet"""
+AIM = 14.0
+"""half of what a decision turns the picture by, pixels: a finer aim would be skipped; walking corrects the rest"""
+
+
+def script(sight: Sight) -> Iterator[str]:
+    """Walks towards the goal, shoots all guards as soon as they are near enough, then walks on.
+
+    It turns round to look for the goal, then walks on. After a turn too far it takes a step: a turn that begins again
+    is a small one.
+    """
+    last = ""
+    while True:
+        button = _button(sight)
+        if button is None:
+            yield from _search(sight)
+            continue
+        if {button, last} == {"TURN_LEFT", "TURN_RIGHT"}:
+            button = "MOVE_FORWARD"
+        place = _place(sight)
+        yield (last := button)
+        if button == "MOVE_FORWARD" and math.dist(place, _place(sight)) < STUCK_UNITS:
+            yield from _walk_on(sight)
+
+
+def _button(sight: Sight) -> str | None:
+    """What to do about the guards and the goal in sight; None: there is nothing."""
+    guards = [guard for guard in sight.nearest("Monster") if sight.nearness(guard) > IN_RANGE]
+    goals = [thing for thing in sight.labels if thing.object_name == "Goal"]
+    if any(sight.ahead(guard, guard.width / 3) for guard in guards):
+        return "ATTACK"
+    if guards and not any(sight.ahead(guard, HALF_TURN) for guard in guards):
+        return sight.turn_to(guards[0])
+    if not goals:
+        return None
+    return "MOVE_FORWARD" if guards or sight.ahead(goals[0], AIM) else sight.turn_to(goals[0])
+
+
+def _search(sight: Sight) -> Iterator[str]:
+    turn = sight.turn_anywhere()
+    for _ in range(FULL_TURN):
+        yield turn
+        if any(thing.object_name == "Goal" for thing in sight.labels):
+            return
+    yield from _walk_on(sight)
+
+
+def _walk_on(sight: Sight) -> Iterator[str]:
+    yield from [sight.turn_anywhere()] * int(sight.rng.integers(3, 12))
+    yield from ["MOVE_FORWARD"] * 5
+
+
+def _place(sight: Sight) -> tuple[float, float]:
+    return sight.variables["POSITION_X"], sight.variables["POSITION_Y"]
