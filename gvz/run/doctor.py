@@ -21,6 +21,8 @@ import psutil
 
 from gvz.core import janitor
 from gvz.core.cache import cache_directory
+from gvz.engine.tuned import TUNED, describe_engine
+from gvz.engine.tuned.build_vizdoom import TUNED_VERSION
 from gvz.run.footprint import ACTOR_MEMORY_BYTES, ENGINE_SHM_BYTES, LEARNER_MEMORY_BYTES, format_bytes
 from gvz.run.machine import instruction_set, versions
 
@@ -159,9 +161,20 @@ def check_cache() -> Finding:
 
 
 def check_engine() -> Finding:
-    """ViZDoom starts and plays one of our maps."""
+    """ViZDoom, as released or tuned (docs/ENGINE.md), starts and plays one of our maps."""
     remedy = "the line above is the engine's own; it often lacks a system library: see ViZDoom's installation page"
-    return _try("vizdoom", _ENGINE, remedy)
+    try:
+        installed = version("vizdoom")
+    except PackageNotFoundError:
+        return Finding("vizdoom", "bad", "not installed", "run `make install`")
+    if TUNED in installed:
+        remedy += "; or go back to the released engine (docs/ENGINE.md)"
+    finding = _try("vizdoom", _ENGINE, remedy)
+    finding = dataclasses.replace(finding, found=f"{describe_engine(installed)}: {finding.found}")
+    if finding.state == "ok" and TUNED in installed and installed != TUNED_VERSION:
+        remedy = f"the patches here make {TUNED_VERSION}: run `make engine` again"
+        return dataclasses.replace(finding, state="note", remedy=remedy)
+    return finding
 
 
 def check_devices() -> Finding:
