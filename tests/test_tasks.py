@@ -30,6 +30,7 @@ LEVELS = {  # tasks of level 0, 1, 2, 3, 4
 LATER = {  # those of the suite `extended`, and how many of level 2 are in the gate set
     "find_the_key": ((1, 10, 7, 3, 1), 4),
     "guarded_goal": ((1, 10, 5, 3, 1), 2),
+    "rockets": ((1, 9, 5, 3, 1), 2),
 }
 TEST_SETS = {
     "defend_the_center": "gore+mossy_bricks, resized+fuzzy, stone_wall+flying, resized+flying+mossy_bricks, "
@@ -44,6 +45,8 @@ TEST_SETS = {
     "decoys+resized+glowing, complete",
     "guarded_goal": "moss+obstacles, knights+shadows, traps+city, flying+moss+traps, sergeants+obstacles+resized, "
     "knights+city+short_agent, complete",
+    "rockets": "blue+barrels, fast+flying, resized+hell_knights, stone_wall+fast+obstacles, obstacles+flying+resized, "
+    "slime+hell_knights+glowing, complete",
 }
 
 

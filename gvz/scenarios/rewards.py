@@ -90,6 +90,16 @@ class Fell:
         return float(history[-1][self.name] < history[-2][self.name])
 
 
+@dataclass(frozen=True, slots=True)
+class Gained:
+    """How much variable `name` is higher than one decision ago; 0 if it is not."""
+
+    name: str
+
+    def __call__(self, history: Sequence[Variables], _terminated: bool) -> float:
+        return max(0.0, history[-1][self.name] - history[-2][self.name])
+
+
 def moved(history: Sequence[Variables], _terminated: bool) -> float:
     """Map units between here and where the agent stood HISTORY_STEPS decisions ago, or at the episode's start."""
     old, new = history[0], history[-1]

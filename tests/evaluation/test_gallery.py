@@ -30,7 +30,7 @@ KITS, COLUMNS_AND_TORCHES = "Medikit CustomMedikit", "HeartColumn TallGreenColum
 STRONG = "Arachnotron Fatso PainElemental Archvile Revenant"
 SHOWN = {
     "gore": (("HeadCandles HeadsOnAStick LiveStick", 100),),
-    "flying_enemies": (("LostSoul", 60),),
+    "flying_enemies": (("LostSoul PeacefulSoul", 60),),
     "obstacles": ((COLUMNS_AND_TORCHES, 100),),
     "stimpacks": (("Stimpack", 80), (KITS, 80)),
     "poison": (("Poison", 40),),
@@ -46,6 +46,8 @@ SHOWN = {
     "flying_guards": (("Cacodemon", 400), ("Goal", 100)),
     "knights": (("HellKnight", 400), ("Goal", 200)),
     "traps": (("Trap", 200),),
+    "barrels": (("ExplosiveBarrel", 100),),
+    "hell_knights": (("HellKnight", 100),),
     "decoys": (("RedCard YellowCard RedSkull YellowSkull", 20),),
     "skulls": (("BlueSkull", 100), ("Portal", 1000)),
     "revenants_and_arachnotron": (("Revenant", 80), ("Arachnotron", 50), ("RevenantTracer", 40)),
@@ -58,6 +60,7 @@ ENEMIES = {
     "dodge_projectiles": ("DoomImp", 200),
     "find_the_key": ("BlueCard", 100),
     "guarded_goal": ("DoomImp", 300),
+    "rockets": ("Demon", 100),
 }
 """what a task shows whose attributes change no kind of thing"""
 

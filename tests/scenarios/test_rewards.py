@@ -204,6 +204,7 @@ def test_an_atom_is_half_a_main_event_at_most_but_in_seek_and_kill_it_is_wider_t
         ("dodge_projectiles", "health_lost"),
         ("find_the_key", "left"),
         ("guarded_goal", "goal"),
+        ("rockets", "kill"),
     ):
         assert atoms[scenario] <= abs(scenario_named(scenario).rewards[event].weight) / 2
 
@@ -215,6 +216,7 @@ TASKS = {
     "dodge_projectiles": {"scripted": "mancubus", "sweep": "default", "idle": "arachnotron"},
     "find_the_key": {"scripted": "default", "sweep": "decoys", "idle": "default"},
     "guarded_goal": {"scripted": "default", "sweep": "traps", "idle": "default"},
+    "rockets": {"scripted": "default", "sweep": "default", "idle": "hell_knights"},
 }
 """scenario -> player -> the task in which most of what is rewarded happens to it"""
 PLAYED_STEPS = 300
@@ -227,6 +229,7 @@ FILLED_SHARES = {
     "dodge_projectiles": (0.45, 0.1),
     "find_the_key": (0.2, 0.15),
     "guarded_goal": (0.2, 0.15),
+    "rockets": (0.3, 0.5),
 }
 """How much of v_min and of v_max the three players reach, at least, in profile thesis at frame skip 4.
 

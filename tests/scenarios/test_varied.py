@@ -219,6 +219,7 @@ def test_the_first_maps_are_those_that_runs_were_trained_on():
         "find_the_key": "ee603d794e179bc5",
         "guarded_goal": "4bcf7d6b1c8732d9",
         "health_gathering": "7e30c5f9275bdd64",
+        "rockets": "a8f3214b6a5b29fa",
         "seek_and_kill": "3aab033a1a5bc1a3",
     }
 

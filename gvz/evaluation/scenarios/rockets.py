@@ -1,0 +1,35 @@
+"""Rockets: its sweep, script and pictures."""
+
+import math
+from collections.abc import Iterator
+
+from gvz.evaluation.scenarios.base import HALF_TURN, Moment, Pose, Sight
+
+SWEEP = (("MOVE_BACKWARD", 30), ("ATTACK", 200))
+MOMENTS = {"health_gathering.wad": Moment(seed=10, tics=90, pose=Pose(608, 180, 90))}
+TOO_NEAR = 25.0
+"""nearness, pixels (some 150 map units), of an enemy at which a rocket would hurt the agent, too"""
+STUCK_UNITS = 4.0
+"""map units; an agent that a step brings less far walks against something"""
+
+
+def script(sight: Sight) -> Iterator[str]:
+    """Turns to the nearest enemy and fires; steps back from one that is too near, and where it cannot, runs."""
+    turn = "TURN_LEFT"
+    while True:
+        enemies = sight.nearest("Monster")
+        if enemies and sight.nearness(enemies[0]) > TOO_NEAR:
+            place = _place(sight)
+            yield "MOVE_BACKWARD"
+            if math.dist(place, _place(sight)) < STUCK_UNITS:
+                yield from [sight.turn_anywhere()] * 5
+                yield from ["MOVE_FORWARD"] * 6
+        elif any(sight.ahead(enemy, max(HALF_TURN, enemy.width / 2)) for enemy in enemies):
+            yield "ATTACK"
+        else:
+            turn = sight.turn_to(enemies[0]) if enemies else turn
+            yield turn
+
+
+def _place(sight: Sight) -> tuple[float, float]:
+    return sight.variables["POSITION_X"], sight.variables["POSITION_Y"]
