@@ -9,7 +9,7 @@ import random
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 from gvz.core.env_config import EnvConfig, Profile
 from gvz.core.errors import TaskError, nearest
@@ -243,7 +243,7 @@ class Scenario:
         defaults = {n: r.levdoom if profile == "levdoom" else r.weight for n, r in self.rewards.items()}
         return defaults if weights is None else {**defaults, **check_weights(self._own(weights), defaults)}
 
-    def _own(self, weights: Mapping[str, float]) -> Mapping[str, float]:
+    def _own(self, weights: Any) -> Any:
         """Without the weights of other scenarios, which are checked."""
         if not isinstance(weights, Mapping) or not any("." in str(name) for name in weights):
             return weights
