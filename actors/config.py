@@ -1,6 +1,7 @@
 """Configuration of the actor pool."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 from actors.placement import PlacementKind
 from gvz.core.errors import ConfigError
@@ -21,6 +22,9 @@ class ActorsConfig:
     placement: PlacementKind = "auto"
     """pinned: an actor and its engines share one core, and the learner keeps off these cores if there are others; free:
     any core; auto: pinned if at the start as many cores are idle as there are actors, and one more"""
+    inference: Literal["actors", "device"] = "actors"
+    """who chooses actions: actors, each for its own games on its core; device, the learner's device (a GPU) for the
+    games of all actors in one batch. An actor waits for its actions then: more actors than cores may be faster"""
     ring_capacity: int = 64
     """step records a ring holds; a full ring makes its actor wait"""
     start_timeout_s: float = 120.0

@@ -8,6 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from actors.loop import ActorLoop
 from actors.pool import Pool, PoolConfig, PoolStatistics, lanes_to_begin_with, num_decisions
@@ -23,11 +24,15 @@ class InlinePool(Pool):
         """Starts every game; `state` is what `state()` returned in the run that is resumed.
 
         Raises:
-            ValueError: more than one actor.
+            ValueError: more than one actor, or one that would ask for its actions.
             ResumeError: a game does not come to where `state` left it.
         """
         if config.num_actors != 1:
             raise ValueError(f"num_actors: got {config.num_actors}, want 1: inline, all games are one actor's")
+        if config.actors.inference != "actors":
+            raise ValueError(
+                f"actors.inference: got {config.actors.inference!r}, want 'actors': here is no other process"
+            )
         (spec,) = config.actor_specs(lanes_to_begin_with(config, None))
         self._messages: list[Message] = []
         self._ring = RingReader.create("gvz-ring-inline", spec.ring_capacity, config.frame_shape, config.record_dtype)
@@ -48,9 +53,9 @@ class InlinePool(Pool):
             self.close()
             raise
 
-    def publish(self, params: np.ndarray, header: ParamsHeader) -> None:
+    def publish(self, params: ArrayLike, header: ParamsHeader) -> None:
         if self._needs_params:
-            self._published = (params.copy(), header)
+            self._published = (np.array(params), header)
             self._loop.set_params(*self._published)
 
     def assign(self, lane: int, task: int) -> None:

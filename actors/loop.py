@@ -12,9 +12,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from actors.policy import make_policy
+from actors.policy import AskedPolicy, Policy, make_policy
 from actors.preprocess import ObservationBatch
 from gvz.core.errors import ConfigError, ResumeError
+from gvz.transport.inference import RequestWriter
 from gvz.transport.messages import ActorSpec, EpisodeStats, Fault, Message, ParamsHeader
 from gvz.transport.ring import RingWriter, WriterState
 
@@ -55,30 +56,25 @@ class ActorLoop:
         spec: what to play, and how.
         ring: where records go; `step` writes one for each game.
         emit: takes an `EpisodeStats` for each episode that ends, and a `Fault` for each engine that crashed.
+        requests: where the observations are kept and the actions come from, if the learner's process chooses them.
     """
 
-    def __init__(self, spec: ActorSpec, ring: RingWriter, emit: Callable[[Message], None]):
+    def __init__(
+        self,
+        spec: ActorSpec,
+        ring: RingWriter,
+        emit: Callable[[Message], None],
+        requests: RequestWriter | None = None,
+    ):
         self._spec = spec
         self._ring = ring
         self._emit = emit
-        self._obs = ObservationBatch(
-            len(spec.lanes),
-            spec.frame_shape,
-            spec.stack_size,
-            past_actions=spec.past_actions,
-            variables=spec.variables,
-            action_masks=spec.action_masks,
-        )
-        self._params_version = 0
+        self._obs = ObservationBatch.of(spec, len(spec.lanes))
         self.games: list[Game] = []
         ring.beat(WriterState.STARTING)
-        self._policy = make_policy(
-            spec.policy,
-            num_actions=spec.num_actions,
-            num_params=spec.num_params,
-            obs=self._obs.arrays,
-            seed=derive_seed(spec.seed, spec.actor, *spec.first_episodes),
-        )
+        self._policy = self._local_policy() if requests is None else AskedPolicy(requests)
+        if requests is not None:
+            self._obs.keep_in(requests.observation)
 
     def begin(self, state: dict[str, Any] | None = None) -> None:
         """Starts every game: at its first episode, or where `state` says.
@@ -103,7 +99,6 @@ class ActorLoop:
     def set_params(self, params: np.ndarray, header: ParamsHeader) -> None:
         """Acts by `params` float32[P] from now on, which nobody may change any more."""
         self._policy.set_params(params, header)
-        self._params_version = header.version
 
     def assign(self, lane: int, task: int) -> None:
         """The next episodes of a lane are of the task with this index; the present one ends first."""
@@ -119,7 +114,7 @@ class ActorLoop:
                 self._finish(game)
             else:
                 self._ring.beat(WriterState.ACTING)
-                game.params_version = self._params_version
+                game.params_version = self._policy.params_version
                 self._play(game, action)
 
     def state(self) -> dict[str, Any]:
@@ -142,6 +137,16 @@ class ActorLoop:
         while self.games:
             self.games.pop().env.close()
 
+    def _local_policy(self) -> Policy:
+        spec = self._spec
+        return make_policy(
+            spec.policy,
+            num_actions=spec.num_actions,
+            num_params=spec.num_params,
+            obs=self._obs.arrays,
+            seed=derive_seed(spec.seed, spec.actor, *spec.first_episodes),
+        )
+
     def _make_env(self, task: int) -> gymnasium.Env[np.ndarray, int]:
         module, _, name = self._spec.env_entry_point.partition(":")
         return getattr(importlib.import_module(module), name)(self._spec.tasks[task], self._spec.env_config)
@@ -151,7 +156,7 @@ class ActorLoop:
         games = self.games
         steps, frames = self._ring.reserve(len(games))
         steps["episode"] = [game.episode for game in games]
-        steps["params_version"] = self._params_version
+        steps["params_version"] = self._policy.params_version
         steps["reward"] = [game.reward for game in games]
         steps["lane"] = self._spec.lanes
         steps["task"] = self._obs.arrays["task"]

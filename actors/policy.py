@@ -1,14 +1,33 @@
-"""What chooses actions in an actor: the learner's exported acting function, or chance."""
+"""What chooses actions: the learner's exported acting function, chance, or the learner's process that is asked."""
 
 import itertools
 import math
 from collections.abc import Mapping
+from typing import Any, Protocol
 
 import numpy as np
 
+from gvz.transport.inference import RequestWriter
 from gvz.transport.messages import ParamsHeader
 
 _CALLS_PER_BLOCK = 256
+
+
+class Policy(Protocol):
+    """Chooses the actions of a batch of games."""
+
+    num_calls: int
+    """acting steps so far"""
+    params_version: int
+    """of the parameters that chose the last actions"""
+
+    def set_params(self, params: Any, header: ParamsHeader) -> None:
+        """Acts by `params` float32[P] from now on, which nobody may change any more."""
+        ...
+
+    def act(self, obs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """The arrays of an `ObservationBatch` -> (action int32[B], extras float32[B, E])."""
+        ...
 
 
 class RandomPolicy:
@@ -19,7 +38,7 @@ class RandomPolicy:
     """
 
     def __init__(self, num_actions: int, batch_size: int, seed: int):
-        self.num_calls = 0
+        self.num_calls, self.params_version = 0, 0
         self._num_actions = num_actions
         self._seed = seed
         self._block = -1
@@ -84,6 +103,7 @@ class ExportedPolicy:
 
     def set_params(self, params: np.ndarray, header: ParamsHeader) -> None:
         """Acts by `params` float32[P] from now on, which nobody may change any more."""
+        self.params_version = header.version
         leaves = np.split(params, self._ends[:-1])
         leaves = [leaf.reshape(shape) for leaf, shape in zip(leaves, self._shapes, strict=True)]
         self._params = self._jax.device_put(leaves, self._cpu)
@@ -97,9 +117,31 @@ class ExportedPolicy:
         return np.asarray(action), np.asarray(extras)
 
 
+class AskedPolicy:
+    """What the learner's process has chosen. `RequestWriter.wait` comes before each call of `act`.
+
+    Attributes:
+        num_calls, params_version: as of every policy.
+    """
+
+    def __init__(self, requests: RequestWriter):
+        self.num_calls, self.params_version = 0, 0
+        self._requests = requests
+
+    def set_params(self, params: np.ndarray, header: ParamsHeader) -> None:
+        """Ignored: the parameters are where the actions are chosen."""
+
+    def act(self, obs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """The answer to the last request, whose observations lie in these arrays, as in every policy's `act`."""
+        assert obs is self._requests.observation
+        self.num_calls += 1
+        action, extras, self.params_version = self._requests.answer()
+        return action, extras
+
+
 def make_policy(
     serialized: bytes, *, num_actions: int, num_params: int, obs: Mapping[str, np.ndarray], seed: int
-) -> RandomPolicy | ExportedPolicy:
+) -> Policy:
     """The policy of an actor: the exported function, or chance if `serialized` is empty. `seed` has 31 bits."""
     if not serialized:
         return RandomPolicy(num_actions, len(obs["task"]), seed)

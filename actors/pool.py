@@ -5,10 +5,13 @@ from pathlib import Path
 from typing import Any, Protocol, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from actors.config import MAX_LANES, ActorsConfig
+from actors.preprocess import ObservationBatch
 from gvz.core.errors import ConfigError, ResumeError
 from gvz.transport.broadcast import broadcast_bytes
+from gvz.transport.inference import request_bytes
 from gvz.transport.messages import ActorSpec, Message, ParamsHeader, Play, StepBlock
 from gvz.transport.ring import ring_bytes
 
@@ -50,8 +53,11 @@ class PoolConfig(Play, frozen=True, kw_only=True):
         return num_steps * self.games_per_actor
 
     def shared_memory_bytes(self) -> int:
-        """Shared memory of a `ProcessPool`: rings and parameter queue."""
+        """Shared memory of a `ProcessPool`: rings, and the parameter queue or the actors' requests."""
         rings = self.num_actors * ring_bytes(self.ring_capacity, self.frame_shape, self.record_dtype)
+        if self.actors.inference == "device":
+            observation = ObservationBatch.of(self, self.games_per_actor).arrays
+            return rings + self.num_actors * request_bytes(observation, self.num_extras)
         return rings + (broadcast_bytes(self.num_params) if self.policy else 0)
 
     def actor_specs(self, lanes: "LaneState") -> list[ActorSpec]:
@@ -71,6 +77,7 @@ class PoolConfig(Play, frozen=True, kw_only=True):
                     first_episodes=lanes.next_episodes[own],
                     ring_capacity=self.ring_capacity,
                     core=self.cores[actor] if self.cores else None,
+                    inference=self.actors.inference,
                     work_dir=str(self.work_dir.absolute()),
                 )
             )
@@ -95,9 +102,9 @@ class PoolStatistics:
 class Pool(Protocol):
     """Games that are played: step records and messages come out, parameters and tasks of lanes go in.
 
-    `actors.process_pool.ProcessPool` plays in processes of its own, `actors.inline.InlinePool` in this one. Neither
-    starts a thread: all watching happens in `poll`, which the learner calls in every round. Use one as a context
-    manager, or `close` it.
+    `actors.process_pool.ProcessPool` plays in processes of its own, `actors.inline.InlinePool` in this one. All
+    watching happens in `poll`, which the learner calls in every round; a thread there is only to answer actors that ask
+    for their actions. Use one as a context manager, or `close` it.
     """
 
     def __enter__(self) -> Self:
@@ -106,8 +113,11 @@ class Pool(Protocol):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def publish(self, params: np.ndarray, header: ParamsHeader) -> None:
-        """Gives the actors `params` float32[P] to act by, before their next step. Never waits."""
+    def publish(self, params: ArrayLike, header: ParamsHeader) -> None:
+        """Has the actions of each actor's next steps chosen by `params` float32[P], which nobody may change any more.
+
+        Never waits for an actor. Waits for the device if `params` are on it and the actors need them on the host.
+        """
         ...
 
     def assign(self, lane: int, task: int) -> None:
@@ -130,7 +140,7 @@ class Pool(Protocol):
         """Watches the actors and returns what they said since the last call. Never waits long.
 
         Raises:
-            WorkerError: an actor failed more often than its budget allows.
+            WorkerError: an actor failed more often than its budget allows. What went wrong in choosing actions here.
         """
         ...
 

@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from gvz.transport.messages import Play
+
 
 def start_stack(stack: np.ndarray, frame: np.ndarray) -> None:
     """Begins an episode in place: the stack uint8[H, W, stack_size * C] is the first frame uint8[H, W, C] repeated."""
@@ -62,6 +64,24 @@ class ObservationBatch:
         }
         if self._masks is not None:
             self.arrays["mask"] = np.ones((num_games, self._masks.shape[1]), bool)
+
+    @classmethod
+    def of(cls, play: Play, num_games: int) -> "ObservationBatch":
+        """Empty observations of `num_games` games."""
+        return cls(
+            num_games,
+            play.frame_shape,
+            play.stack_size,
+            past_actions=play.past_actions,
+            variables=play.variables,
+            action_masks=play.action_masks,
+        )
+
+    def keep_in(self, arrays: dict[str, np.ndarray]) -> None:
+        """Keeps the observations in these arrays from now on: the same names, shapes and dtypes."""
+        for name, array in self.arrays.items():
+            arrays[name][:] = array
+        self.arrays = arrays
 
     def begin(self, game: int, task: int, frame: np.ndarray, variables: Mapping[str, float]) -> None:
         """A game begins an episode of the task with this index with a frame uint8[H, W, C]."""

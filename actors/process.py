@@ -5,12 +5,14 @@ from pathlib import Path
 from gvz.core.cache import xla_cache_directory
 from gvz.transport.broadcast import BroadcastWriter
 from gvz.transport.child import ChildProcess
+from gvz.transport.inference import RequestReader
 from gvz.transport.messages import ActorSpec
 from gvz.transport.ring import RingReader
 
 
-def start_actor(spec: ActorSpec, ring: RingReader, params: BroadcastWriter | None) -> ChildProcess:
-    """Starts a worker, which inherits its ring and the parameter queue. Its output is appended to a log file.
+def start_actor(spec: ActorSpec, ring: RingReader, shared: BroadcastWriter | RequestReader | None) -> ChildProcess:
+    """Starts a worker, which inherits its ring and the parameter queue or its requests. Its output is appended to a log
+    file.
 
     Actors share a cache of compiled acting functions (6 s less at a start).
     """
@@ -21,7 +23,7 @@ def start_actor(spec: ActorSpec, ring: RingReader, params: BroadcastWriter | Non
             "actors.worker",
             f"actor {spec.actor}",
             spec,
-            inherited=[ring.descriptor] + ([] if params is None else [params.descriptor]),
+            inherited=[ring.descriptor] + ([] if shared is None else [shared.descriptor]),
             log=log,
             directory=work_dir,
             environment={"JAX_COMPILATION_CACHE_DIR": str(xla_cache_directory())},

@@ -2,12 +2,18 @@
 
 import os
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from actors.inference import InferenceServer
+from actors.loop import derive_seed
 from actors.placement import cores_left, keep_to
+from actors.policy import Policy
 from actors.pool import STOP_TIMEOUT_S, Pool, PoolConfig, PoolStatistics, lanes_to_begin_with, num_decisions
+from actors.preprocess import ObservationBatch
 from actors.supervisor import SupervisedActor
 from gvz.core import janitor
 from gvz.core.watchdog import AwakeClock
@@ -24,21 +30,33 @@ many (play at random on 2 cores: 12% more decisions/s than taking every record a
 class ProcessPool(Pool):
     """The `Pool` whose actors are processes."""
 
-    def __init__(self, config: PoolConfig, state: dict[str, Any] | None = None):
+    def __init__(
+        self,
+        config: PoolConfig,
+        state: dict[str, Any] | None = None,
+        make_policy: Callable[[int], Policy] | None = None,
+    ):
         """Makes the segments and starts the processes; does not wait for them.
 
-        `state` is what `state()` returned in the run that is resumed.
+        Args:
+            config: what is played.
+            state: what `state()` returned in the run that is resumed.
+            make_policy: seed of 31 bits -> what chooses the actions in this process, if `actors.inference` is "device".
 
         Raises:
+            ValueError: a policy is missing, or one too many.
             ResourceError: there is not enough memory.
             ResumeError: `state` is of a pool of another size.
         """
+        if (config.actors.inference == "device") != (make_policy is not None):
+            raise ValueError(f"make_policy: got {make_policy} for actors.inference {config.actors.inference!r}")
         self._lanes = lanes_to_begin_with(config, state)
         specs = config.actor_specs(self._lanes)
         self._config = config
         self._min_drain_records = max(1, int(_MIN_DRAIN_SHARE * config.num_actors * config.ring_capacity))
         self._actors: list[SupervisedActor] = []
         self._params: BroadcastWriter | None = None
+        self._inference: InferenceServer | None = None
         self._clock = AwakeClock(config.actors.heartbeat_timeout_s / 4)
         self._env_steps, self._waited_s = 0, 0.0
         self._own_cores = os.sched_getaffinity(0)
@@ -48,15 +66,22 @@ class ProcessPool(Pool):
             for spec in specs:
                 self._actors.append(SupervisedActor(spec, config.actors, self._params))
             keep_to(cores_left(spec.core for spec in specs))
+            if make_policy is not None:
+                policy = make_policy(derive_seed(config.seed, *self._lanes.next_episodes))
+                requests = [actor.requests for actor in self._actors if actor.requests is not None]
+                batch = ObservationBatch.of(config, config.num_lanes).arrays
+                self._inference = InferenceServer(policy, requests, batch)
             for actor in self._actors:
                 actor.start()
         except BaseException:
             self.close()
             raise
 
-    def publish(self, params: np.ndarray, header: ParamsHeader) -> None:
+    def publish(self, params: ArrayLike, header: ParamsHeader) -> None:
         if self._params is not None:
-            self._params.publish(params, header)
+            self._params.publish(np.asarray(params), header)
+        elif self._inference is not None:
+            self._inference.publish(params, header)
 
     def assign(self, lane: int, task: int) -> None:
         """As `Pool.assign`; a restarted actor begins the lane's next episode with this task."""
@@ -88,6 +113,8 @@ class ProcessPool(Pool):
         """As `Pool.poll`. Dead and stuck actors are replaced; what they published stays in the ring, and their games go
         on with new episodes. What an actor that failed for good said last came with the poll before the error.
         """
+        if self._inference is not None:
+            self._inference.check()
         for actor in self._actors:
             if actor.failure is not None:
                 raise actor.failure
@@ -126,10 +153,13 @@ class ProcessPool(Pool):
             deadline = time.monotonic() + grace_s
             for process in processes:
                 process.end(grace_s=max(0.0, deadline - time.monotonic()))
-            for actor in self._actors:
-                actor.process = None
-                actor.ring.close()
-            if self._params is not None:
-                self._params.close()
-            keep_to(self._own_cores)
-            janitor.clean_dead_instances()
+            try:
+                if self._inference is not None:
+                    self._inference.close(abandon=grace_s == 0.0)
+            finally:
+                for actor in self._actors:
+                    actor.free()
+                if self._params is not None:
+                    self._params.close()
+                keep_to(self._own_cores)
+                janitor.clean_dead_instances()

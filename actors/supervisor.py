@@ -6,11 +6,13 @@ import msgspec
 import numpy as np
 
 from actors.config import ActorsConfig
+from actors.preprocess import ObservationBatch
 from actors.process import log_path, start_actor
 from gvz.core import janitor, records
 from gvz.core.errors import TransportError, WorkerError
 from gvz.transport.broadcast import BroadcastWriter
 from gvz.transport.child import ChildProcess
+from gvz.transport.inference import RequestReader
 from gvz.transport.messages import ActorSpec, Assign, EpisodeStats, Fault, Message, Ready
 from gvz.transport.ring import RingReader, WriterState
 
@@ -27,6 +29,7 @@ class SupervisedActor:
 
     Attributes:
         ring: the reading end of its ring.
+        requests: the end that answers its requests for actions; None if it acts by itself.
         process: its present process; None while it waits to be started.
         next_episodes: per game, one more than the largest episode number seen.
         ready: its present process has started all its games.
@@ -35,16 +38,20 @@ class SupervisedActor:
     """
 
     def __init__(self, spec: ActorSpec, limits: ActorsConfig, params: BroadcastWriter | None):
-        """`params` is the queue that the actor takes its parameters from; None for random play."""
+        """`params` is the queue that the actor takes its parameters from; None if it needs none."""
         name = f"gvz-ring-{spec.actor}"
         self.ring = RingReader.create(name, spec.ring_capacity, spec.frame_shape, spec.record_dtype)
+        self.requests: RequestReader | None = None
+        if spec.inference == "device":
+            observation = ObservationBatch.of(spec, len(spec.lanes)).arrays
+            self.requests = RequestReader.create(f"gvz-requests-{spec.actor}", observation, spec.num_extras)
         self.process: ChildProcess | None = None
         self.next_episodes = list(spec.first_episodes)
         self.restarts = 0
         self.failure: WorkerError | None = None
         self._spec = spec
         self._limits = limits
-        self._params = params
+        self._shared = params if self.requests is None else self.requests
         self._start_at = 0.0
         self._ready_at: float | None = None
         self._silent_s = 0.0  # without a sign of life (or, before Ready, since the start) while we watched
@@ -59,9 +66,16 @@ class SupervisedActor:
 
     def start(self) -> None:
         """Starts a process; does not wait for it."""
-        self.process = start_actor(self._spec, self.ring, self._params)
+        self.process = start_actor(self._spec, self.ring, self._shared)
         self._ready_at, self._kill_at, self._silent_s = None, None, 0.0
         self._heartbeat_ns = self.ring.writer_status().heartbeat_ns
+
+    def free(self) -> None:
+        """Releases the shared memory; the process has ended. Can be repeated."""
+        self.process = None
+        self.ring.close()
+        if self.requests is not None:
+            self.requests.close()
 
     def assign(self, lane: int, task: int) -> None:
         """The next episodes of a lane are of the task with this index; processes that follow begin with it."""

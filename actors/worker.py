@@ -1,8 +1,9 @@
-"""An actor process: `python -m actors.worker PARENT_PID SOCKET RING [PARAMS]`, started by `actors/process.py`.
+"""An actor process: `python -m actors.worker PARENT_PID SOCKET RING [SHARED]`, started by `actors/process.py`.
 
-SOCKET, RING and PARAMS are inherited file descriptors: its end of a socket, its ring, the parameter queue (absent for
-random play). The first message on the socket is an `ActorSpec`; then the process acts until it receives `Stop`.
-Everything that goes wrong becomes a `Fault` message and a non-zero exit.
+SOCKET, RING and SHARED are inherited file descriptors: its end of a socket, its ring, and the parameter queue or, if
+the learner's process chooses its actions, its requests (absent for random play). The first message on the socket is an
+`ActorSpec`; then the process acts until it receives `Stop`. Everything that goes wrong becomes a `Fault` message and a
+non-zero exit.
 """
 
 import contextlib
@@ -10,13 +11,16 @@ import os
 import sys
 import time
 import traceback
+from functools import partial
 
 from actors.loop import ActorLoop
 from actors.placement import keep_to
+from actors.preprocess import ObservationBatch
 from gvz.core.errors import EngineError, WaitTimeoutError
 from gvz.transport import child
 from gvz.transport.broadcast import BroadcastReader
 from gvz.transport.channel import Channel
+from gvz.transport.inference import RequestWriter
 from gvz.transport.messages import ActorSpec, Assign, Fault, Ready, Stop
 from gvz.transport.ring import RingWriter, WriterState
 
@@ -24,6 +28,8 @@ SPACE_TIMEOUT_S = 3600.0
 """an actor ends when its learner reads nothing for this time (compiling, saving and pauses take far less)"""
 PARAMS_TIMEOUT_S = 600.0
 """likewise for the first version of the parameters"""
+ACTIONS_TIMEOUT_S = 3600.0
+"""likewise for the actions, if the learner chooses them (its first parameters and its compilation take far less)"""
 MAX_PARAMS_SHARE = 0.05
 """share of an actor's time that may go into taking parameters (27 MB: 20 ms), however often they are published"""
 
@@ -31,14 +37,20 @@ MAX_PARAMS_SHARE = 0.05
 class Worker:
     """The life of an actor process after its spec has come."""
 
-    def __init__(self, spec: ActorSpec, channel: Channel, ring: int, params: int | None):
-        """`ring` and `params` are file descriptors; they stay the caller's."""
+    def __init__(self, spec: ActorSpec, channel: Channel, ring: int, shared: int | None):
+        """`ring` and `shared`, the parameter queue or the requests, are file descriptors; they stay the caller's."""
         self._spec = spec
         self._channel = channel
         self._ring = RingWriter.attach(ring, spec.ring_capacity, spec.frame_shape, spec.record_dtype)
-        self._params = None if params is None else BroadcastReader.attach(params, spec.num_params, spec.layout_hash)
+        self._params: BroadcastReader | None = None
+        self._requests: RequestWriter | None = None
+        if shared is not None and spec.inference == "device":
+            observation = ObservationBatch.of(spec, len(spec.lanes)).arrays
+            self._requests = RequestWriter.attach(shared, observation, spec.num_extras)
+        elif shared is not None:
+            self._params = BroadcastReader.attach(shared, spec.num_params, spec.layout_hash)
         self._take_params_at = 0.0
-        self._loop = ActorLoop(spec, self._ring, channel.send)
+        self._loop = ActorLoop(spec, self._ring, channel.send, self._requests)
 
     def run(self) -> None:
         """Plays until told to stop or until the learner's end of the socket is closed."""
@@ -52,6 +64,8 @@ class Worker:
                 if self._must_stop():
                     break
                 self._take_params()
+                if not self._wait_for_actions():
+                    break
                 self._loop.step()
         self._ring.beat(WriterState.STOPPED)
 
@@ -75,6 +89,14 @@ class Worker:
         self._take_params_at = now + (now - start) / MAX_PARAMS_SHARE
         return True
 
+    def _wait_for_actions(self) -> bool:
+        """Has the learner choose the actions, if that is its matter; False if told to stop first."""
+        if self._requests is None:
+            return True
+        self._requests.ask()
+        waiting = partial(self._ring.beat, WriterState.WAITING_FOR_ACTIONS)
+        return self._requests.wait(ACTIONS_TIMEOUT_S, beat=waiting, cancelled=self._must_stop)
+
     def _wait_for_params(self) -> bool:
         """Waits for the first version; False if told to stop first."""
         start = time.monotonic()
@@ -93,7 +115,7 @@ class Worker:
 
 def main() -> int:
     """Entry point of the process; returns its exit code."""
-    parent_pid, descriptor, ring, *params = map(int, sys.argv[1:])
+    parent_pid, descriptor, ring, *shared = map(int, sys.argv[1:])
     channel = child.begin(parent_pid, descriptor, parent="the learner")
     spec = channel.wait_for_message()
     if not isinstance(spec, ActorSpec):
@@ -101,8 +123,8 @@ def main() -> int:
     if spec.core is not None:
         keep_to([spec.core])
     try:
-        worker = Worker(spec, channel, ring, params[0] if params else None)
-        for inherited in (ring, *params):  # their memory is mapped; the engines must not inherit them
+        worker = Worker(spec, channel, ring, shared[0] if shared else None)
+        for inherited in (ring, *shared):  # their memory is mapped; the engines must not inherit them
             os.close(inherited)
         worker.run()
     except Exception as error:  # the process boundary: whatever it is, the learner is to hear of it

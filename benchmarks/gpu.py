@@ -2,8 +2,9 @@
 
 Gradient steps at batch 32, 256 and 1024 in float32 and bfloat16, and by the number in one call; the sum tree at batch
 256; insertion and drawing with up to 4 million records; decisions of the network on the device; the whole run of
-`rainbow_4task`; the device's memory against the bill. Sizes are those of `rainbow_4task`; records of the large replays
-have small frames. Without a GPU nothing is measured, but `--quick` runs each part once.
+`rainbow_4task` with both kinds of `actors.inference`; the device's memory against the bill. Sizes are those of
+`rainbow_4task`; records of the large replays have small frames. Without a GPU nothing is measured, but `--quick` runs
+each part once.
 """
 
 import dataclasses
@@ -103,13 +104,20 @@ def _tree(budget: Budget) -> list[Row]:
 
 
 def _whole(budget: Budget) -> list[Row]:
-    """The run with its actors, as a user starts it."""
+    """The run with its actors, as a user starts it, and with actors that leave acting to the device."""
     updates, period = (400, 100) if budget.quick else (RUN_UPDATES, 100)
-    with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
-        run = whole.run_command(Path(directory) / "run", budget, updates, period, 2.0, whole.tree_bytes)
-    updates_per_s, decisions_per_s = whole.run_rates(run["rows"])
-    return [
-        rates("the run", decisions_per_s=[decisions_per_s], updates_per_s=[updates_per_s]),
-        measured("from the command to the first gradient step", "s", [run["first_row_s"]]),
-        measured("peak of the host's memory", "GB", [max(run["seen"], default=0) / 1e9]),
-    ]
+    rows = []
+    for inference in ("device",) if budget.quick else ("actors", "device"):
+        with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
+            run = whole.run_command(
+                *(Path(directory) / "run", budget, updates, period, 2.0, whole.tree_bytes),
+                *("--actors.inference", inference),
+            )
+        updates_per_s, decisions_per_s = whole.run_rates(run["rows"])
+        name = f"actors.inference {inference}"
+        rows += [
+            rates(f"the run, {name}", decisions_per_s=[decisions_per_s], updates_per_s=[updates_per_s]),
+            measured(f"from the command to the first gradient step, {name}", "s", [run["first_row_s"]]),
+            measured(f"peak of the host's memory, {name}", "GB", [max(run["seen"], default=0) / 1e9]),
+        ]
+    return rows

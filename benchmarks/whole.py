@@ -110,14 +110,21 @@ def measure(budget: Budget) -> list[Row]:
 
 
 def run_command(
-    directory: Path, budget: Budget, updates: int, log_period: int, look_period_s: float, look: Callable[[int], Any]
+    directory: Path,
+    budget: Budget,
+    updates: int,
+    log_period: int,
+    look_period_s: float,
+    look: Callable[[int], Any],
+    *further: str,
 ) -> dict[str, Any]:
     """One run of the real command: its rows of metrics, seconds from the command to the first, and `look`'s samples.
 
-    `look` is called with the process's id, only from the first row on, because sampling slows the process down.
+    `further` are flags. `look` is called with the process's id, only from the first row on, because sampling slows the
+    process down.
     """
     flags = ["--learner.total-updates", str(updates), "--log.period-updates", str(log_period)]
-    flags += workload.quick_flags(budget)
+    flags += [*workload.quick_flags(budget), *further]
     command = [sys.executable, "-m", "gvz.launch", "--config", "rainbow_4task.py", "--run-dir", str(directory), *flags]
     records, seen, start = directory / "metrics.jsonl", [], time.time()
     with tempfile.TemporaryFile() as output:

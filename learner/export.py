@@ -5,6 +5,7 @@ CPU wherever the learner runs. An actor calls them without importing this packag
 """
 
 import hashlib
+import itertools
 from dataclasses import fields
 
 import jax
@@ -19,6 +20,14 @@ from learner.observation import Observation
 def flatten_params(params: Params) -> Float[Array, "P"]:
     """All leaves in tree order, which is the order that `export_policy` takes them in, as one float32 vector."""
     return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(params)])
+
+
+def unflatten_params(template: Params, vector: Float[Array, "P"]) -> Params:
+    """The inverse of `flatten_params`: parameters of the template's shapes (arrays or their ShapeDtypeStructs)."""
+    leaves, treedef = jax.tree.flatten(template)
+    ends = list(itertools.accumulate(leaf.size for leaf in leaves))
+    parts = jnp.split(vector, ends[:-1])
+    return jax.tree.unflatten(treedef, [part.reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)])
 
 
 def layout_hash(params: Params) -> int:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import jax
-import numpy as np
 
 from gvz.transport.messages import StepBlock
 from learner.agents.base import Agent
@@ -53,8 +52,8 @@ class Learner(Protocol):
         """Probability of a uniformly random action after this number of decisions of the run."""
         ...
 
-    def acting_params(self) -> np.ndarray:
-        """What the actors act by, as one vector float32[P]. Waits for the device."""
+    def acting_params(self) -> jax.Array:
+        """What is acted by, as one vector float32[P] on the device: a copy, which no gradient step changes."""
         ...
 
     def take_metrics(self) -> dict[str, float]:

@@ -1,6 +1,6 @@
 """The learner of transitions from a replay: records -> replay -> gradient steps -> priorities.
 
-Nothing here waits for the device but `acting_params`, `take_metrics` and `check_finite`.
+Nothing here waits for the device but `take_metrics` and `check_finite`.
 """
 
 from collections.abc import Sequence
@@ -145,8 +145,8 @@ class OffPolicyLearner:
         since_warmup = env_steps - self._parts.config.warmup_steps
         return 1.0 if since_warmup < 0 else self._parts.agent.epsilon(since_warmup)
 
-    def acting_params(self) -> np.ndarray:
-        return np.asarray(self._flatten(self._state.params))
+    def acting_params(self) -> jax.Array:
+        return self._flatten(self._state.params)
 
     def take_metrics(self) -> dict[str, float]:
         """Means of the train step as `learner/...`, shares of the tasks in the replay as `replay/share/...`."""

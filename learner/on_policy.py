@@ -126,8 +126,8 @@ class OnPolicyLearner:
         """The agent's, from the first decision on."""
         return self._parts.agent.epsilon(env_steps)
 
-    def acting_params(self) -> np.ndarray:
-        return np.asarray(self._flatten(self._state.params))
+    def acting_params(self) -> jax.Array:
+        return self._flatten(self._state.params)
 
     def take_metrics(self) -> dict[str, float]:
         """Means of the updates as `learner/...`, and how old the actions learnt from were as `rollout/...`."""

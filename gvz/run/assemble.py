@@ -2,6 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from gvz.run.config import RunConfig, off_policy
 from gvz.run.footprint import Footprint
 from gvz.scenarios.compiler import compile_task
 from gvz.task_table import TaskTable
+from learner.acting import DevicePolicy
 from learner.agents.base import Agent, AgentSpec, OffPolicyAgent, OnPolicyAgent, make_agent
 from learner.config import OnPolicyConfig, ValueConfig
 from learner.export import export_policy, layout_hash
@@ -42,7 +44,10 @@ class RunParts:
 
     def make_pool(self, config: RunConfig, state: dict[str, Any] | None) -> Pool:
         """Starts the games: new ones, or from what `Pool.state()` gave."""
-        return (InlinePool if config.mode == "sync" else ProcessPool)(self.pool_config, state)
+        if config.mode == "sync":
+            return InlinePool(self.pool_config, state)
+        on_device = config.actors.inference == "device"
+        return ProcessPool(self.pool_config, state, partial(DevicePolicy, self.learner.agent) if on_device else None)
 
 
 def run_agent(config: RunConfig) -> Agent:
@@ -97,7 +102,7 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
         num_extras=extras.shape[1],
         action_masks=table.action_masks,
         num_actions=spec.num_actions,
-        policy=export_policy(agent, params, config.games_per_actor),
+        policy=export_policy(agent, params, config.games_per_actor) if config.actors.inference == "actors" else b"",
         num_params=num_params,
         layout_hash=layout_hash(params),
         actors=config.actors,
@@ -114,6 +119,7 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
             replay_on_host=jax.default_backend() == "cpu",
             params_bytes=4 * num_params,
             num_actors=0 if config.mode == "sync" else config.num_actors,
+            actors_ask=config.actors.inference == "device",
             num_games=config.num_lanes,
             transport_bytes=0 if config.mode == "sync" else pool_config.shared_memory_bytes(),
             placement=in_words(cores),

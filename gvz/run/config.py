@@ -105,6 +105,11 @@ class RunConfig:
             raise ConfigError(
                 "env.action_set: got multi_discrete_v1, want unified_v1: the trainer's actions are discrete"
             )
+        if self.mode == "sync" and self.actors.inference == "device":
+            raise ConfigError(
+                'actors.inference: got "device" with mode "sync", where one process plays and learns in turn; '
+                'want "actors", or mode "async"'
+            )
         check_curriculum(self.curriculum, self.table)
         if self.num_lanes > MAX_LANES:
             raise ConfigError(

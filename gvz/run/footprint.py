@@ -15,6 +15,8 @@ ENGINE_MEMORY_BYTES = 20_000_000
 """proportional set size of one engine and its client side, without shared files (measured 2026-11, x86-64)"""
 ACTOR_MEMORY_BYTES = 270_000_000
 """proportional set size of an actor process with jax loaded (measured 2026-11, x86-64)"""
+ASKING_ACTOR_MEMORY_BYTES = 50_000_000
+"""likewise of an actor that asks for its actions, which loads no jax (measured 35 MB, 2026-11, x86-64)"""
 LEARNER_MEMORY_BYTES = 700_000_000
 """proportional set size of the learner with its compiled programs, without replay (measured 2026-11, x86-64)"""
 
@@ -27,15 +29,17 @@ class Footprint:
     replay_on_host: bool
     params_bytes: int
     num_actors: int
+    actors_ask: bool = False
+    """the learner's process chooses the actions: actors have neither jax nor parameters"""
     num_games: int
     transport_bytes: int
-    """rings and parameter queue"""
+    """rings, and the parameter queue or the actors' requests"""
     placement: str
     """which cores the actors use, in words"""
 
     @property
     def shm_bytes(self) -> int:
-        """What the engines take of /dev/shm. (Rings and parameter queue are anonymous memory, not files in it.)"""
+        """What the engines take of /dev/shm. (What actors and learner share is anonymous memory, not files in it.)"""
         return self.num_games * ENGINE_SHM_BYTES
 
     @property
@@ -50,7 +54,8 @@ class Footprint:
             LEARNER_MEMORY_BYTES
             + (self.replay_bytes if self.replay_on_host else 0)
             + self.snapshot_bytes
-            + self.num_actors * (ACTOR_MEMORY_BYTES + 2 * self.params_bytes)
+            + self.num_actors
+            * (ASKING_ACTOR_MEMORY_BYTES if self.actors_ask else ACTOR_MEMORY_BYTES + 2 * self.params_bytes)
             + self.num_games * ENGINE_MEMORY_BYTES
             + self.transport_bytes
             + self.shm_bytes
@@ -59,9 +64,10 @@ class Footprint:
     def lines(self) -> list[str]:
         """The footprint as a person reads it."""
         where = "host" if self.replay_on_host else "device"
+        shared = f"rings and {'requests' if self.actors_ask else 'parameter queue'}"
         return [
             f"replay {format_bytes(self.replay_bytes)} ({where}), checkpoint copy {format_bytes(self.snapshot_bytes)}",
-            f"/dev/shm {format_bytes(self.shm_bytes)}, rings and parameter queue {format_bytes(self.transport_bytes)}, "
+            f"/dev/shm {format_bytes(self.shm_bytes)}, {shared} {format_bytes(self.transport_bytes)}, "
             f"host memory in all {format_bytes(self.memory_bytes)}",
             f"processes: 1 learner, {self.num_actors} actors, {self.num_games} engines; {self.placement}",
         ]

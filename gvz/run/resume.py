@@ -11,6 +11,7 @@ _MAY_CHANGE = (
     "max_processor_s",
     "learner.total_updates",
     "actors.placement",
+    "actors.inference",
     "actors.ring_capacity",
     "actors.start_timeout_s",
     "actors.heartbeat_timeout_s",

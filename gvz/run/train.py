@@ -2,7 +2,7 @@
 
 What is laid round it (supervision, records, checkpoints, resume) calls into the modules that do the work. How records
 become gradient steps is the learner's matter (`learner.learner`), where games are played is the pool's. Nothing here
-waits for the device between log periods but a publication, which copies the parameters to the host, and a checkpoint.
+waits for the device between log periods but a checkpoint, and a publication to actors that act by themselves.
 """
 
 import contextlib

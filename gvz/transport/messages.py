@@ -12,14 +12,14 @@ is never executed.
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 
 from gvz.core.errors import TransportError
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 """Increased by one when the meaning or layout of anything in this file changes."""
 
 
@@ -163,7 +163,8 @@ class Play(_Message, frozen=True, kw_only=True):
     """[task][action]: the actions that each task allows; None for all"""
     num_actions: Count
     policy: bytes
-    """serialized jax.export of the acting function; empty for a uniformly random policy"""
+    """serialized jax.export of the acting function; empty for a uniformly random policy, and for actors
+    that ask for their actions"""
     num_params: Count
     """length of the flat float32 parameter vector; 0 for a random policy, which has no queue"""
     layout_hash: Count
@@ -188,6 +189,8 @@ class ActorSpec(Play, frozen=True, kw_only=True, tag="actor_spec"):
     ring_capacity: Count
     core: Count | None
     """the only one that it and its engines may use; None: any"""
+    inference: Literal["actors", "device"] = "actors"
+    """who chooses its actions: itself, or the learner's process"""
     work_dir: str
     """private directory for the engines' files and the worker's logs"""
 

@@ -38,6 +38,7 @@ class WriterState(IntEnum):
     RESETTING = 3
     WAITING_FOR_SPACE = 4
     STOPPED = 5
+    WAITING_FOR_ACTIONS = 6
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

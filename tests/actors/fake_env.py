@@ -12,9 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import jax
-import jax.export
-import jax.numpy as jnp
 import numpy as np
 
 from actors.config import ActorsConfig
@@ -106,6 +103,9 @@ class CountingEnv(gymnasium.Env[np.ndarray, int]):
 
 def export_act(act: Any, param_shapes: Sequence[tuple[int, ...]], obs: ObservationBatch, num_extras: int = 0) -> bytes:
     """An acting function, act(leaves, obs, key, epsilon) -> actions (and extras, if there are any), as bytes."""
+    import jax  # not by an actor that imports this file: it takes longer than all else there
+    import jax.export
+    import jax.numpy as jnp
 
     def policy(leaves, arrays, key, epsilon):
         found = act(leaves, arrays, key, epsilon)

@@ -10,7 +10,7 @@ from pathlib import Path
 import msgpack
 import numpy as np
 import pytest
-from command import alive, arrays_of, descendants, finish, launch, num_updates, rows, wait_until
+from command import alive, arrays_of, descendants, faults, finish, launch, num_updates, rows, wait_until
 from scipy import stats
 
 from learner.checkpoint import checkpoint_steps, verify
@@ -156,6 +156,39 @@ def test_a_killed_run_goes_on_from_its_checkpoint_without_a_burst(tmp_path):
     assert (run / "discarded" / "metrics.jsonl").exists()
     for row in metrics:  # 300 warm-up decisions, then 4 an update: no second warm-up, no burst
         assert abs(row["actors/env_steps"] - 300 - 4 * row["num_updates"]) <= 256 + 64
+
+
+def test_a_run_that_acts_on_the_learners_device_goes_on_after_a_kill_and_after_a_stop(tmp_path):
+    run = tmp_path / "run"
+    process = launch(run, "--actors.inference", "device", "--learner.total-updates", "1000000")
+    wait_until(lambda: num_updates(run) >= 20, "20 updates")
+    children = descendants(process)
+    actors = [child for child in children if "actors.worker" in child.cmdline()]
+    assert len(actors) == 2
+    assert not [
+        line for actor in actors for line in Path(f"/proc/{actor.pid}/maps").read_text().split() if "jax" in line
+    ]
+    actors[0].kill()
+    wait_until(lambda: any(fault["kind"] == "died" for fault in faults(run)), "the fault to be recorded")
+    after = num_updates(run)
+    wait_until(lambda: num_updates(run) >= after + 60, "60 updates more")
+    children = descendants(process)
+    process.send_signal(signal.SIGINT)
+    code, err = finish(process)
+    assert code == 130, err
+    assert not alive(children)
+    assert "rings and requests" in err
+    (saved,) = checkpoint_steps(run / "checkpoints")[-1:]
+    for row in rows(run, "metrics.jsonl"):  # 300 warm-up decisions, then 4 an update
+        assert abs(row["actors/env_steps"] - 300 - 4 * row["num_updates"]) <= 256 + 64
+        assert row["actors/staleness_mean_versions"] < 20
+    process = launch(run, "--learner.total-updates", "1000000")  # now actors act by themselves
+    wait_until(lambda: num_updates(run) >= saved + 20, "20 updates more")
+    process.send_signal(signal.SIGINT)
+    code, err = finish(process)
+    assert code == 130, err
+    assert f"goes on from update {saved}" in err
+    assert "rings and parameter queue" in err
 
 
 def test_a_synchronous_run_cut_twice_equals_one_that_was_not(tmp_path):

@@ -146,6 +146,7 @@ def test_tasks_may_be_named():
 
 
 BAD = {
+    "--mode sync --actors.inference device": 'actors.inference: got "device" with mode "sync"',
     "--seed -1": "seed: got -1",
     "--learner.batch-size 0": "learner.batch_size: got 0",
     "--learner.warmup-steps 200000": "learner.warmup_steps: got 200000, more than replay.capacity",

@@ -29,6 +29,13 @@ def test_a_replay_on_a_gpu_is_not_charged_to_the_host_but_its_checkpoint_copy_is
     assert on_device.snapshot_bytes == FOOTPRINT.snapshot_bytes > FOOTPRINT.replay_bytes
 
 
+def test_actors_that_ask_for_their_actions_have_neither_jax_nor_parameters():
+    asking = dataclasses.replace(FOOTPRINT, actors_ask=True)
+    assert FOOTPRINT.memory_bytes - asking.memory_bytes == 2 * (270_000_000 - 50_000_000 + 2 * 20_000_000)
+    assert "rings and parameter queue 100 MB" in FOOTPRINT.lines()[1]
+    assert "rings and requests 100 MB" in asking.lines()[1]
+
+
 def test_the_lines_say_bytes_and_processes():
     text = "\n".join(FOOTPRINT.lines())
     assert "replay 2.00 GB (host)" in text

@@ -122,3 +122,17 @@ def test_an_on_policy_run_goes_on_bit_for_bit_between_two_rollouts(tmp_path, age
         assert row["rollout/age_max_versions"] == 1
         assert row["rollout/age_mean_versions"] < 0.2, "only a window's first action is of the parameters before"
         assert row["learner/loss"] == row["learner/loss"]
+
+
+def test_an_on_policy_run_learns_from_what_was_chosen_on_the_learners_device(tmp_path):
+    """Log-probabilities come with the actions: the first rollout's are those of the parameters that learn from it."""
+    actors = ActorsConfig(num_actors=2, games_per_actor=1, inference="device")
+    agent, learner = PPOConfig(**NETWORK), replace(ON_POLICY, num_epochs=1, num_minibatches=1)
+    config = replace(DQN, name="on_policy", mode="async", agent=agent, replay=None, learner=learner, actors=actors)
+    go_on(tmp_path, replace(config, log=replace(config.log, period_updates=1)), 12)
+    rows, _ = records.read(tmp_path / "metrics.jsonl")
+    assert len(rows) == 12
+    for row in rows:
+        assert np.isfinite(row["learner/loss"])
+        assert row["rollout/age_max_versions"] <= 12
+    assert abs(rows[0]["learner/kl"]) < 1e-6
