@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import growth, sum_tree, whole, workload
-from benchmarks.rounds import Budget, Row, absent, alternate, goal, measured, rates, seconds_per_call
+from benchmarks.rounds import Budget, Row, absent, alternate, measured, rates, seconds_per_call
 
 BATCHES, SCANS, ACTED = (32, 256, 1024), (1, 4, 16, 64), (64, 256, 1024)
 CAPACITIES = (100_000, 1_000_000, 4_000_000)
@@ -31,7 +31,9 @@ def measure(budget: Budget) -> list[Row]:
     if jax.default_backend() == "cpu" and not budget.quick:
         return [absent("everything on this list", "JAX finds no GPU here")]
     few = dataclasses.replace(budget, rounds=min(budget.rounds, 3), body_s=budget.body_s / 2)
-    return [*_batches(few), *_calls(few), *_tree(few), *growth.replay_rows(few, _few(CAPACITIES, few)), *_whole(few)]
+    replay = growth.replay_rows(few, _few(CAPACITIES, few))
+    rows = [*_batches(few), *_calls(few), *_tree(few), *replay, *_whole(few)]
+    return [row for row in rows if row["kind"] != "goal"]  # those of growth are of other sizes
 
 
 def _few(sizes: tuple[int, ...], budget: Budget) -> tuple[int, ...]:
@@ -100,7 +102,7 @@ def _tree(budget: Budget) -> list[Row]:
     call = sum_tree.steps_of(leaves, 256)
     seconds = [seconds_per_call(call, budget.body_s) for _ in range(budget.rounds)]
     found = [1e6 * s / sum_tree.STEPS_PER_CALL for s in seconds]
-    return [goal(4, "sum tree on a GPU, batch 256", found, at_most=50.0, unit="us a step")]
+    return [measured(f"sum tree, batch 256, {leaves:,} leaves", "us a step", found)]
 
 
 def _whole(budget: Budget) -> list[Row]:
