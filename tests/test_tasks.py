@@ -28,6 +28,7 @@ LEVELS = {  # tasks of level 0, 1, 2, 3, 4
     "dodge_projectiles": (1, 7, 6, 3, 1),
 }
 LATER = {  # those of the suite `extended`, and how many of level 2 are in the gate set
+    "find_ammunition": ((1, 10, 5, 3, 1), 2),
     "find_the_key": ((1, 10, 7, 3, 1), 4),
     "guarded_goal": ((1, 10, 5, 3, 1), 2),
     "rockets": ((1, 9, 5, 3, 1), 2),
@@ -41,6 +42,8 @@ TEST_SETS = {
     "resized+shadows+invulnerable, complete",
     "dodge_projectiles": "revenants, city+resized_agent, barons+flaming_skulls, flames+flaming_skulls+mancubus, "
     "resized_agent+revenants, city+arachnotron, complete",
+    "find_ammunition": "metal+obstacles, boxes+glowing, maze+wrong, stone_wall+maze+boxes, obstacles+metal+imps, "
+    "wrong+resized+fast, complete",
     "find_the_key": "moss+obstacles, glowing+skulls, maze+decoys, bricks+maze+short_agent, obstacles+moss+skulls, "
     "decoys+resized+glowing, complete",
     "guarded_goal": "moss+obstacles, knights+shadows, traps+city, flying+moss+traps, sergeants+obstacles+resized, "

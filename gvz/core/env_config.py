@@ -20,8 +20,8 @@ LABEL_CLASSES = (
 )
 """What a pixel of the buffer `labels` shows, by number: 0 walls and the HUD; 1 floors and ceilings; 2 the agent's
 own weapon; 3 living enemies; 4 missiles and fire; 5 what heals; 6 vials of poison; 7 decorations, lights and
-corpses; 8 puffs, smoke and blood; 9 anything else: portals, barrels; 10 keys. A number never changes its meaning.
-Frames of classes have no room for more numbers (observation.py, CLASS_STEP)."""
+corpses; 8 puffs, smoke and blood; 9 anything else: portals, ammunition, barrels; 10 keys. A number never changes its
+meaning. Frames of classes have no room for more numbers (observation.py, CLASS_STEP)."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

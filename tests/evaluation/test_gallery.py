@@ -21,6 +21,7 @@ from gvz.evaluation.gallery import (
 from gvz.evaluation.scenarios.base import stated
 from gvz.scenarios.base import Task
 from gvz.scenarios.compiler import task_content
+from gvz.scenarios.find_ammunition import DECOYS
 from gvz.tasks import LEVELS, all_scenarios, named_tasks, parse_task, scenarios
 from learner.augment import AUGMENTATIONS
 
@@ -48,6 +49,9 @@ SHOWN = {
     "traps": (("Trap", 200),),
     "barrels": (("ExplosiveBarrel", 100),),
     "hell_knights": (("HellKnight", 100),),
+    "imps": (("DoomImp", 200),),
+    "boxes": (("BulletBox", 100),),
+    "wrong_ammunition": ((" ".join(DECOYS), 80),),
     "decoys": (("RedCard YellowCard RedSkull YellowSkull", 20),),
     "skulls": (("BlueSkull", 100), ("Portal", 1000)),
     "revenants_and_arachnotron": (("Revenant", 80), ("Arachnotron", 50), ("RevenantTracer", 40)),
@@ -58,6 +62,7 @@ ENEMIES = {
     "health_gathering": (KITS, 150),
     "seek_and_kill": ("Demon", 300),
     "dodge_projectiles": ("DoomImp", 200),
+    "find_ammunition": ("Demon", 200),
     "find_the_key": ("BlueCard", 100),
     "guarded_goal": ("DoomImp", 300),
     "rockets": ("Demon", 100),

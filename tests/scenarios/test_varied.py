@@ -216,6 +216,7 @@ def test_the_first_maps_are_those_that_runs_were_trained_on():
     assert {one.id: digest(one, range(3)) for one in SCENARIOS} == {
         "defend_the_center": "392c38852665036e",
         "dodge_projectiles": "5f512baa8ce0c63f",
+        "find_ammunition": "77753f030219f5db",
         "find_the_key": "ee603d794e179bc5",
         "guarded_goal": "4bcf7d6b1c8732d9",
         "health_gathering": "7e30c5f9275bdd64",

@@ -1,0 +1,78 @@
+"""Find Ammunition: its sweep, script and pictures."""
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from gvz.evaluation.scenarios.base import FULL_TURN, NEAR, Moment, Pose, Sight
+
+if TYPE_CHECKING:
+    from gvz.engine.engine import Label
+
+SWEEP = (("MOVE_FORWARD", 18), ("TURN_RIGHT", 11), ("ATTACK", 2))
+MOMENTS = {
+    "health_gathering.wad": Moment(seed=29, tics=20, pose=Pose(1168, 768, 195)),
+    "health_gathering_supreme.wad": Moment(seed=39, tics=20, pose=Pose(976, 1712, 210)),
+}
+STUCK_UNITS = 4.0
+"""map units; an agent that a step forward brings less far walks against something"""
+AIM = 14.0
+"""half of what a decision turns the picture by, pixels: a finer aim would be skipped; walking corrects the rest"""
+
+
+def script(sight: Sight) -> Iterator[str]:
+    """Without bullets it walks to clips that no enemy stands before, with bullets it shoots enemies that are near.
+
+    It turns round to look for what it wants, then walks on. It takes no notice of wrong ammunition.
+    """
+    while True:
+        wanted = _wanted(sight)
+        if _armed(sight) and any(
+            sight.ahead(enemy, enemy.width / 2) and sight.nearness(enemy) > NEAR for enemy in wanted
+        ):
+            yield "ATTACK"
+        elif any(sight.ahead(one, max(AIM, one.width / 2)) for one in wanted):
+            yield from _step(sight)
+        else:
+            turn = sight.turn_to(wanted[0]) if wanted else sight.turn_anywhere()
+            for _ in range(FULL_TURN):
+                yield turn
+                if any(sight.ahead(one, max(AIM, one.width / 2)) for one in _wanted(sight)):
+                    break
+            else:
+                yield from _walk_on(sight)
+
+
+def _armed(sight: Sight) -> bool:
+    return sight.variables["AMMO2"] > 0
+
+
+def _wanted(sight: Sight) -> "list[Label]":
+    """Clips in sight, or with bullets the enemies, nearest first."""
+    enemies = sight.nearest("Monster")
+    if _armed(sight):
+        return enemies
+    clips = [one for one in sight.nearest("Ammo") if one.object_name.startswith("Bullet")]
+    return [clip for clip in clips if not any(_hides(sight, enemy, clip) for enemy in enemies)]
+
+
+def _hides(sight: Sight, enemy: "Label", clip: "Label") -> bool:
+    """Whether an enemy stands on the way to a clip."""
+    apart = abs(enemy.x + enemy.width / 2 - clip.x - clip.width / 2)
+    return sight.nearness(enemy) > sight.nearness(clip) and apart < enemy.width
+
+
+def _step(sight: Sight) -> Iterator[str]:
+    place = _place(sight)
+    yield "MOVE_FORWARD"
+    if math.dist(place, _place(sight)) < STUCK_UNITS:
+        yield from _walk_on(sight)
+
+
+def _walk_on(sight: Sight) -> Iterator[str]:
+    yield from [sight.turn_anywhere()] * int(sight.rng.integers(3, 12))
+    yield from ["MOVE_FORWARD"] * 8
+
+
+def _place(sight: Sight) -> tuple[float, float]:
+    return sight.variables["POSITION_X"], sight.variables["POSITION_Y"]
