@@ -42,6 +42,7 @@ ALLOWED = {
     ("gvz/run/config_files.py", "exec"): "a config file, which the user names",
     ("gvz/run/config_files.py", "compile"): "likewise",
     ("gvz/core/registry.py", "exec_module"): "the file of an agent or an encoder, which the user names",
+    ("gvz/engine/tuned/build_vizdoom.py", "import_module"): "setuptools, which pip brings where the engine is built",
     ("gvz/core/registry.py", "import_module"): "modules of our own packages, found on the disk",
     ("actors/loop.py", "import_module"): "the environment's class, which the learner names to the actor it started",
 }
