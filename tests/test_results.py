@@ -50,6 +50,27 @@ def test_the_quick_comparison_says_what_its_records_give():
         assert said[-1] == round(np.mean([row["normalized_score"] for row in final if row["task"] in test_tasks]), 1)
 
 
+def test_the_gap_of_procedural_maps_is_what_its_records_give():
+    folder, kept = ROOT / "results" / "procedural_gap", ([], [])
+    readme, page = (folder / "README.md").read_text(), (ROOT / "docs" / "BENCHMARK.md").read_text()
+    for title, maps in (("10 maps", "-10"), ("100 maps", "-100"), ("1,000 maps", "-1000"), ("unlimited", "")):
+        training = f"procedural-train{maps}"
+        file = folder / "runs" / "rainbow_quick" / "health_gathering" / training / "seed_1111" / "evaluation.jsonl.gz"
+        rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+        scores = [
+            np.array([row["normalized_score"] for row in rows if row["task"] == f"health_gathering/{task}"])
+            for task in (training, "procedural-test")
+        ]
+        assert [len(found) for found in scores] == [100, 100]
+        on_them, on_test = (bootstrap([found]) for found in scores)
+        gap = on_them.value - on_test.value
+        assert f"| {title} | {on_them} | {on_test} | {gap:.1f} |" in readme
+        for values, found in zip(kept, (on_them, on_test), strict=True):
+            values.append(f"{found.value:.1f}")
+    for title, values in zip(("score on them", "score on test maps"), kept, strict=True):
+        assert f"| {title} | {' | '.join(values)} |" in page
+
+
 def test_the_joint_run_says_what_its_records_give():
     folder = ROOT / "results" / "rainbow_all"
     lines = gzip.decompress((folder / "evaluation.jsonl.gz").read_bytes()).splitlines()
