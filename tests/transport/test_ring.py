@@ -264,7 +264,7 @@ def test_a_damaged_count_of_waiting_does_not_end_the_writer(writer: RingWriter, 
 
 def test_an_unknown_writer_state_is_found(reader: RingReader):
     words_of(reader)[2] = 77
-    with pytest.raises(TransportError, match=r"got writer state 77, want 0\.\.5"):
+    with pytest.raises(TransportError, match=r"got writer state 77, want 0\.\.6"):
         reader.writer_status()
 
 
