@@ -39,6 +39,8 @@ class PoolConfig(Play, frozen=True, kw_only=True):
                 f"actors: got {self.num_actors} actors with {self.games_per_actor} games for {len(self.tasks)} tasks, "
                 "want at least one game a task"
             )
+        if self.cores and len(self.cores) != self.num_actors:
+            raise ConfigError(f"actors: got cores {self.cores}, want one for each of {self.num_actors} actors, or none")
         if self.num_lanes > MAX_LANES:
             raise ConfigError(f"actors: got {self.num_lanes} games, want at most {MAX_LANES} (a lane is a u16)")
 

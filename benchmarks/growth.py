@@ -194,7 +194,7 @@ def _actors(budget: Budget) -> list[Row]:
     with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
         config = workload.run_config(budget)
         base = workload.random_players(assemble(config, Path(directory)).pool_config)
-        pools = {n: msgspec.structs.replace(base, num_actors=n) for n in counts}
+        pools = {n: msgspec.structs.replace(base, num_actors=n, cores=()) for n in counts}
         values: dict[float, list[float]] = {n: _play(budget, pool) for n, pool in pools.items()}
     return [
         *_curve("actor pool over actors", "decisions/s", "actors", values),

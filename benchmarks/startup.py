@@ -88,7 +88,8 @@ def _actor_start_s(directory: Path, budget: Budget) -> float:
     parts = assemble(workload.run_config(budget), directory)
     before = workload.processor_s()
     with workload.playing(
-        msgspec.structs.replace(parts.pool_config, num_actors=1), np.zeros(parts.pool_config.num_params, np.float32)
+        msgspec.structs.replace(parts.pool_config, num_actors=1, cores=()),
+        np.zeros(parts.pool_config.num_params, np.float32),
     ):
         after = workload.processor_s()
     return sum(after[where] - before[where] for where in ("Python", "engines"))

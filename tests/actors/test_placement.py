@@ -10,6 +10,7 @@ from test_doom import config
 from actors import placement
 from actors.placement import actor_cores, cores_left, in_words
 from actors.process_pool import ProcessPool
+from gvz.core.errors import ConfigError
 
 
 @pytest.fixture
@@ -34,6 +35,11 @@ def test_actors_get_cores_of_their_own_where_there_is_room():
 def test_the_log_says_where_actors_are():
     assert in_words([3, 2]) == "each actor with its engines on one core (2, 3)"
     assert in_words([None]) == in_words([]) == "actors and engines on any core"
+
+
+def test_every_actor_wants_a_core_or_none(tmp_path):
+    with pytest.raises(ConfigError, match=r"got cores \(3,\), want one for each of 2 actors, or none"):
+        msgspec.structs.replace(config(tmp_path, num_actors=2), cores=(3,))
 
 
 @pytest.mark.engine
