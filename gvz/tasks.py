@@ -71,6 +71,8 @@ def parse_task(text: str) -> Task:
     for whole in (*whole_sets, *filter(names_map_set, names)):
         if whole in names and len(names) > 1:
             raise TaskError(f"task: got {text!r}, but {whole!r} is a task and no attribute; want {scenario.choices()}")
+    if name.startswith("default="):
+        raise TaskError(f"task: got {text!r}, but 'default' has no attribute to grade; want {scenario.choices()}")
     if len(graded) == 1 and (whole := whole_sets.get(name.partition("=")[0])) is not None:
         graded = [(one, graded[0][1]) for one in whole]
     return Task(scenario, tuple(one for one, _ in graded), severities=tuple(graded))

@@ -2,8 +2,8 @@
 
     python engine_player.py
 
-It plays what each line of arguments says and answers with one digest for every decision. Which package of vizdoom plays
-is up to PYTHONPATH. The answers of two packages are the same exactly if all that a player can read is: see `_seen`.
+Each line on its standard input is a sequence to play. The answer has one digest for each decision. PYTHONPATH says
+which package of vizdoom plays. Two packages give the same answers only if a player can read the same from both (`_seen`).
 """
 
 import dataclasses

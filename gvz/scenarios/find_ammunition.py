@@ -21,7 +21,7 @@ Source: thesis 6.2.1, its second idea for a scenario. Differs: wrong ammunition 
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Variety, words
 from gvz.scenarios.find_the_key import ROOM_SPOTS, draw_rooms_of_spots
 from gvz.scenarios.health_gathering import OBSTACLES
-from gvz.scenarios.parts import RESIZED, retextured, starts_at, things_at
+from gvz.scenarios.parts import ACS_APART, ACS_NEAR, RESIZED, retextured, starts_at, things_at
 from gvz.scenarios.rewards import Pace, Reward, Rose, death, living
 from gvz.scenarios.seek_and_kill import SPOTS as MAZE_SPOTS
 from gvz.scenarios.seek_and_kill import drain_acid
@@ -29,7 +29,8 @@ from gvz.scenarios.seek_and_kill import drain_acid
 WAD = "health_gathering.wad"
 MAZE_WAD = "health_gathering_supreme.wad"
 
-SCRIPT = """\
+SCRIPT = (
+    """\
 #include "zcommon.acs"
 
 global int 1:player_kills;
@@ -43,18 +44,11 @@ str decoys[$num_decoys] = $decoys;
 int taken[40];
 int next_tid = 1000;
 
-function int Apart(int a, int b)
-{
-    if (a > b)
-        return a - b;
-    return b - a;
-}
-
-// A coordinate near that of one of the map's places.
-function int Near(int coordinate)
-{
-    return coordinate + Random(0.0 - $scatter, $scatter);
-}
+"""
+    + ACS_APART
+    + "\n"
+    + ACS_NEAR
+    + """\
 
 // Tries to put something at a random place at least `gap` from the agent, a thing to take at one that has none yet.
 // Returns its tid, or 0 if every try was blocked.
@@ -162,6 +156,7 @@ script 5 (void)
     TakeInventory("Clip", 200);
 }
 """
+)
 
 PISTOL = {
     "HiddenPistol": """\

@@ -27,7 +27,7 @@ import random
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
 from gvz.scenarios.health_gathering import OBSTACLES, draw_hall
 from gvz.scenarios.layout import Layout
-from gvz.scenarios.parts import retextured, starts_at, things_at
+from gvz.scenarios.parts import ACS_APART, ACS_NEAR, retextured, starts_at, things_at
 from gvz.scenarios.rewards import Pace, Reward, Rose, death, living
 from gvz.scenarios.seek_and_kill import SPOTS as MAZE_SPOTS
 from gvz.scenarios.seek_and_kill import drain_acid
@@ -35,7 +35,8 @@ from gvz.scenarios.seek_and_kill import drain_acid
 WAD = "health_gathering.wad"
 MAZE_WAD = "health_gathering_supreme.wad"
 
-SCRIPT = """\
+SCRIPT = (
+    """\
 #include "zcommon.acs"
 
 global int 2:num_spawned;
@@ -48,18 +49,11 @@ str decoys[$num_decoys] = $decoys;
 int taken[40];
 int has_key = 0;
 
-function int Apart(int a, int b)
-{
-    if (a > b)
-        return a - b;
-    return b - a;
-}
-
-// A coordinate near that of one of the map's places.
-function int Near(int coordinate)
-{
-    return coordinate + Random(0.0 - $scatter, $scatter);
-}
+"""
+    + ACS_APART
+    + "\n"
+    + ACS_NEAR
+    + """\
 
 // Tries to put something at a random place that is not near the agent. Returns 0 if every try was blocked.
 function int Put(str kind, int tid)
@@ -160,6 +154,7 @@ script 4 (void)
     Thing_Damage(0, 35, MOD_SUICIDE);
 }
 """
+)
 
 PORTAL = {
     "Portal": """\

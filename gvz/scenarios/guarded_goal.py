@@ -22,13 +22,14 @@ Source: thesis 6.2.1, its last idea for a scenario, with its small rewards for k
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
 from gvz.scenarios.find_the_key import ROOM_SPOTS, draw_rooms_of_spots
 from gvz.scenarios.health_gathering import OBSTACLES
-from gvz.scenarios.parts import retextured, starts_at, things_at
+from gvz.scenarios.parts import ACS_NEAR, retextured, starts_at, things_at
 from gvz.scenarios.rewards import Fell, Pace, Reward, Rose, death
 from gvz.scenarios.seek_and_kill import drain_acid
 
 WAD = "health_gathering.wad"
 
-SCRIPT = """\
+SCRIPT = (
+    """\
 #include "zcommon.acs"
 
 global int 1:player_kills;
@@ -47,11 +48,9 @@ function int Distance(int tid, int other)
     return VectorLength(GetActorX(tid) - GetActorX(other), GetActorY(tid) - GetActorY(other));
 }
 
-// A coordinate near that of one of the map's places.
-function int Near(int coordinate)
-{
-    return coordinate + Random(0.0 - $scatter, $scatter);
-}
+"""
+    + ACS_NEAR
+    + """\
 
 // Tries to put something at a random place this far from the agent, at least and at most, and as far from the goal.
 // Returns 0 if every try was blocked.
@@ -164,6 +163,7 @@ script 3 (int tid)
     Thing_Remove(tid);
 }
 """
+)
 
 
 def _portal(name: str, sprites: str) -> dict[str, str]:

@@ -24,3 +24,22 @@ def things_at(places: Mapping[int, Iterable[tuple[float, float]]]) -> tuple[Thin
 def starts_at(places: Iterable[tuple[float, float]], first_tid: int) -> tuple[Thing, ...]:
     """Places for the agent to start at, map units; their tids are consecutive."""
     return tuple(Thing(MAP_SPOT, x, y, tid) for tid, (x, y) in enumerate(places, first_tid))
+
+
+ACS_APART = """\
+function int Apart(int a, int b)
+{
+    if (a > b)
+        return a - b;
+    return b - a;
+}
+"""
+"""ACS: how far apart two coordinates are"""
+ACS_NEAR = """\
+// A coordinate near that of one of the map's places.
+function int Near(int coordinate)
+{
+    return coordinate + Random(0.0 - $scatter, $scatter);
+}
+"""
+"""ACS: a random place near a spot; `scatter` is a parameter of the script"""

@@ -23,7 +23,7 @@ Known: enemies that die together with the agent, or by each other, count for KIL
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
 from gvz.scenarios.find_the_key import ROOM_SPOTS, draw_rooms_of_spots
 from gvz.scenarios.health_gathering import OBSTACLES
-from gvz.scenarios.parts import RESIZED, retextured, starts_at, things_at
+from gvz.scenarios.parts import ACS_APART, ACS_NEAR, RESIZED, retextured, starts_at, things_at
 from gvz.scenarios.rewards import Fell, Gained, Pace, Reward, death
 from gvz.scenarios.seek_and_kill import drain_acid
 
@@ -36,25 +36,19 @@ KILLS = (Pace(tics=70, times=1, amount=7), Pace(tics=70, times=13, amount=SQUAD_
 BARRELS = {2035: tuple(place for places in OBSTACLES[WAD].values() for place in places)}
 """editor number of an exploding barrel -> places, where `obstacles` has columns"""
 
-SCRIPT = """\
+SCRIPT = (
+    """\
 #include "zcommon.acs"
 
 global int 1:player_kills;
 global int 2:num_spawned;
 global int 60:map_magic;
 
-function int Apart(int a, int b)
-{
-    if (a > b)
-        return a - b;
-    return b - a;
-}
-
-// A coordinate near that of one of the map's places.
-function int Near(int coordinate)
-{
-    return coordinate + Random(0.0 - $scatter, $scatter);
-}
+"""
+    + ACS_APART
+    + "\n"
+    + ACS_NEAR
+    + """\
 
 // An enemy that knows where the agent is. Returns 0 if something stands in the way.
 function int SpawnEnemy(int x, int y)
@@ -120,6 +114,7 @@ script 3 (int tid)
     Thing_Remove(tid);
 }
 """
+)
 
 PEACEFUL_SOUL = {"PeacefulSoul": 'ACTOR PeacefulSoul : LostSoul\n{\n  DamageFactor "Melee", 0\n}\n'}
 """class name -> definition: a lost soul that others cannot hurt; they would kill each other when they charge"""

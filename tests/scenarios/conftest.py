@@ -2,14 +2,17 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+BAD_LOG_LINES = re.compile(r".*(?:unknown|tried to register|script error|error|unable|not found|missing).*", re.I)
 
 Job = tuple[str, str]
 """task id, profile"""
@@ -49,3 +52,30 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Callable[[tuple[Job, .
         return found
 
     return measurements
+
+
+@pytest.fixture
+def start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> Generator[Callable[[str], Any]]:
+    """f(task's name) -> a running game of the test module's SCENARIO, a tic at a time; its log has to be clean."""
+    from tests.scenarios.measure import Player
+
+    monkeypatch.chdir(tmp_path)
+    games: list[Player] = []
+
+    def started(name: str) -> Player:
+        games.append(Player(f"{request.module.SCENARIO}/{name}", "thesis"))
+        return games[-1]
+
+    yield started
+    for player in games:
+        player.game.close()
+        assert bad_lines(player.log.read_text(errors="replace")) == []
+
+
+def bad_lines(log: str) -> list[str]:
+    """What the engine complains of in its log, by our words and by those of the probe."""
+    from gvz.engine.probe import _faults
+
+    return [line for line in (*BAD_LOG_LINES.findall(log), *_faults(log)) if "bots read" not in line]

@@ -10,7 +10,6 @@ import pytest
 
 from benchmarks.reference import RECORDS, read_reference
 from gvz.core.env_config import EnvConfig
-from gvz.engine.probe import _faults
 from gvz.env import DoomEnv
 from gvz.evaluation.play import play_episode
 from gvz.evaluation.players import CLASSES
@@ -29,21 +28,8 @@ FIRST_ENEMY = 1000
 """tid"""
 
 
-@pytest.fixture
-def start(tmp_path, monkeypatch):
-    """f(task's name) -> a running game of it, a tic at a time."""
-    monkeypatch.chdir(tmp_path)
-    games = []
-
-    def started(name: str) -> Player:
-        games.append(Player(f"find_ammunition/{name}", "thesis"))
-        return games[-1]
-
-    yield started
-    for player in games:
-        player.game.close()
-        lines = _faults(player.log.read_text(errors="replace"))
-        assert [line for line in lines if "bots read" not in line] == []
+SCENARIO = "find_ammunition"
+"""which the fixture `start` plays"""
 
 
 def things(player: Player, *names: str) -> list[tuple[str, float, float]]:

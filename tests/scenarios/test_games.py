@@ -5,7 +5,6 @@ The tables here are written from the thesis and from LevDoom's maps, not from th
 
 import cmath
 import random
-import re
 from collections import Counter
 
 import pytest
@@ -14,10 +13,10 @@ from gvz.engine.engine import Engine, EngineConfig
 from gvz.scenarios.base import BOOKKEEPING
 from gvz.scenarios.compiler import compile_task
 from gvz.tasks import named_tasks, parse_task, scenarios
+from tests.scenarios.conftest import bad_lines
 
 pytestmark = [pytest.mark.engine, pytest.mark.xdist_group("games")]
 
-BAD_LOG_LINES = re.compile(r".*(?:unknown|tried to register|script error|error|unable|not found|missing).*", re.I)
 
 THESIS = tuple((task.id, "thesis") for task in named_tasks())
 LEVDOOM = tuple((task.id, "levdoom") for task in named_tasks())
@@ -74,7 +73,7 @@ def attributes(job: tuple[str, str]) -> set[str]:
 def check_common(found: dict, decorations: dict[str, int]):
     """Right map, silent log, the decorations and nothing else that only stands about."""
     assert found["magic_right"]
-    assert [line for line in BAD_LOG_LINES.findall(found["log"]) if "bots read" not in line] == []
+    assert bad_lines(found["log"]) == []
     objects = Counter(name for name, _, _ in found["start_objects"])
     known = ("LiveStick", "HeadsOnAStick", "HeadCandles", "FloatingSkull", "TallGreenColumn", "TallRedColumn")
     known = (*known, "HeartColumn", "BlueTorch", "GreenTorch", "RedTorch")

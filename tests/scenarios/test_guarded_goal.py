@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from gvz.core.env_config import EnvConfig
-from gvz.engine.probe import _faults
 from gvz.env import DoomEnv
 from gvz.evaluation.play import play_episode
 from gvz.evaluation.players import ScriptedPlayer, SweepPlayer
@@ -31,21 +30,8 @@ TURN, SLOW_TURN, SLOW_TICS = 360 * 640 / 65536, 360 * 320 / 65536, 6
 """degrees a tic; the first six tics of a turn are slow"""
 
 
-@pytest.fixture
-def start(tmp_path, monkeypatch):
-    """f(task's name) -> a running game of it, a tic at a time."""
-    monkeypatch.chdir(tmp_path)
-    games = []
-
-    def started(name: str) -> Player:
-        games.append(Player(f"guarded_goal/{name}", "thesis"))
-        return games[-1]
-
-    yield started
-    for player in games:
-        player.game.close()
-        lines = _faults(player.log.read_text(errors="replace"))
-        assert [line for line in lines if "bots read" not in line] == []
+SCENARIO = "guarded_goal"
+"""which the fixture `start` plays"""
 
 
 def places(player: Player, *names: str) -> list[tuple[float, float]]:

@@ -11,7 +11,6 @@ import pytest
 
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import TaskError
-from gvz.engine.probe import _faults
 from gvz.env import DoomEnv
 from gvz.evaluation.play import episode_seed, play_episode
 from gvz.evaluation.players import ScriptedPlayer
@@ -28,6 +27,7 @@ from gvz.wad.acs import compile_acs
 from gvz.wad.decorate import declared_actors
 from gvz.wad.lumps import read_maps, read_wad
 from gvz.wad.udmf import NO_REFERENCE, UdmfMap, is_inside, parse_textmap
+from tests.scenarios.conftest import bad_lines
 from tests.scenarios.pictures import thumbnail
 
 SCENARIOS = [one for one in scenarios().values() if one.variety is not None]
@@ -339,7 +339,7 @@ def test_every_map_plays_and_is_the_right_one(scenario: Scenario):
         assert frames[-1] == frames[2]
         assert env._engine is not None
         log = env._engine.log.read_text(errors="replace")
-        assert [line for line in _faults(log) if "bots read" not in line] == []
+        assert bad_lines(log) == []
 
 
 @pytest.mark.engine

@@ -1,7 +1,6 @@
 """Rockets: what a running engine shows, against what the scenario's file says."""
 
 import itertools
-import re
 from contextlib import closing
 from math import cos, radians, sin
 
@@ -15,29 +14,14 @@ from gvz.evaluation.simple import player_env
 from gvz.observation import label_class
 from gvz.scenarios.compiler import map_source
 from gvz.tasks import parse_task, scenario_named
-from tests.scenarios.measure import Player
 
-BAD_LOG_LINES = re.compile(r".*(?:unknown|tried to register|script error|error|unable|not found|missing).*", re.I)
 MIDDLE = 608
 """of the square room, map units"""
 WEAPON_UP_TICS = 20
 
 
-@pytest.fixture
-def start(tmp_path, monkeypatch):
-    """f(task's name) -> a running game of it, a tic at a time."""
-    monkeypatch.chdir(tmp_path)
-    games = []
-
-    def started(name: str) -> Player:
-        games.append(Player(f"rockets/{name}", "thesis"))
-        return games[-1]
-
-    yield started
-    for player in games:
-        player.game.close()
-        lines = BAD_LOG_LINES.findall(player.log.read_text(errors="replace"))
-        assert [line for line in lines if "bots read" not in line] == []
+SCENARIO = "rockets"
+"""which the fixture `start` plays"""
 
 
 @pytest.mark.engine

@@ -11,7 +11,7 @@ from gvz.scenarios.compiler import compile_task, map_source, task_content
 from gvz.scenarios.severity import in_force
 from gvz.tasks import all_scenarios, parse_task
 from gvz.wad.textures import blended
-from tests.scenarios.test_games import BAD_LOG_LINES
+from tests.scenarios.conftest import bad_lines
 
 HALF = tuple((f"{name}/complete=0.5", "thesis") for name in ("defend_the_center", "dodge_projectiles"))
 HALF += (("defend_the_center/fast=0.5+fuzzy=0.5+resized=0.5+gore=0.4", "thesis"),)
@@ -52,6 +52,7 @@ def test_an_id_with_severities_has_one_canonical_form(text, name, level):
         ("defend_the_center/gore=-1", "got 'gore=-1', want"),
         ("defend_the_center/gor=0.5", "unknown attribute 'gor' .*did you mean 'gore'"),
         ("defend_the_center/stone_wall=0.5+mossy_bricks=0.5", "are both of group textures"),
+        ("defend_the_center/default=0.5", "'default' has no attribute to grade"),
         ("defend_the_center/complete=0.5+gore", "'complete' is a task and no attribute"),
     ],
 )
@@ -120,7 +121,7 @@ def test_a_whole_attribute_is_in_force_in_its_share_of_the_episodes():
 def test_games_at_half_severity_are_what_they_say(measured, job):
     found = measured(HALF, job)
     assert found["magic_right"]
-    assert [line for line in BAD_LOG_LINES.findall(found["log"]) if "bots read" not in line] == []
+    assert bad_lines(found["log"]) == []
     if "fast" in job[0]:  # 8 and 10 of the classes, 20 (levdoom: 15) of the attribute
         speeds = (11.5, 12.5) if job[1] == "levdoom" else (14.0, 15.0)
         assert {entity["speed"] for entity in found["entities"]} <= set(speeds)

@@ -15,7 +15,6 @@ import pytest
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import EngineError
 from gvz.engine.engine import Engine
-from gvz.engine.probe import _faults
 from gvz.env import DoomEnv
 from gvz.evaluation import gallery
 from gvz.evaluation.play import play_episode
@@ -32,6 +31,7 @@ from gvz.wad.lumps import read_maps, read_wad
 from gvz.wad.stock import stock_editor_numbers, stock_textures
 from gvz.wad.udmf import UdmfMap, is_inside, parse_textmap
 from tests.episodes import fingerprint
+from tests.scenarios.conftest import bad_lines
 from tests.scenarios.pictures import colours, moving, picture, thumbnail
 
 SCENARIOS = list(all_scenarios().values())
@@ -275,7 +275,7 @@ def test_every_map_plays_and_is_the_right_one(scenario: Scenario):
         assert frames[-1] == frames[5]
         assert env._engine is not None
         log = env._engine.log.read_text(errors="replace")
-        assert [line for line in _faults(log) if "bots read" not in line] == []
+        assert bad_lines(log) == []
 
 
 @pytest.mark.engine

@@ -22,6 +22,10 @@ HALF_TURN = 6.0
 """half of the smallest turn, pixels: nothing can be centred better than this"""
 FULL_TURN = 30
 """decisions in which the agent has turned round once, at least"""
+AIM = 14.0
+"""half of what a decision turns the picture by, pixels: a finer aim would be skipped; walking corrects the rest"""
+STUCK_UNITS = 4.0
+"""map units; an agent that a step brings less far walks against something"""
 NEAR = 14.0
 """nearness, pixels (some 270 map units), of an enemy worth a bullet, and of a vial worth a detour"""
 
@@ -72,6 +76,16 @@ class Sight:
     def turn_anywhere(self) -> str:
         """A button that turns, by chance."""
         return ("TURN_LEFT", "TURN_RIGHT")[self.rng.integers(2)]
+
+    @property
+    def place(self) -> tuple[float, float]:
+        """Where the agent is, map units, in scenarios whose variables say it."""
+        return self.variables["POSITION_X"], self.variables["POSITION_Y"]
+
+    def walk_on(self, steps: int = 8) -> Iterator[str]:
+        """Turns somewhere and walks there."""
+        yield from [self.turn_anywhere()] * int(self.rng.integers(3, 12))
+        yield from ["MOVE_FORWARD"] * steps
 
     def _offset(self, label: "Label") -> float:
         return label.x + label.width / 2 - self._middle

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from gvz.evaluation.scenarios.base import FULL_TURN, NEAR, Moment, Pose, Sight
+from gvz.evaluation.scenarios.base import AIM, FULL_TURN, NEAR, STUCK_UNITS, Moment, Pose, Sight
 
 if TYPE_CHECKING:
     from gvz.engine.engine import Label
@@ -14,10 +14,6 @@ MOMENTS = {
     "health_gathering.wad": Moment(seed=29, tics=20, pose=Pose(1168, 768, 195)),
     "health_gathering_supreme.wad": Moment(seed=39, tics=20, pose=Pose(976, 1712, 210)),
 }
-STUCK_UNITS = 4.0
-"""map units; an agent that a step forward brings less far walks against something"""
-AIM = 14.0
-"""half of what a decision turns the picture by, pixels: a finer aim would be skipped; walking corrects the rest"""
 
 
 def script(sight: Sight) -> Iterator[str]:
@@ -40,7 +36,7 @@ def script(sight: Sight) -> Iterator[str]:
                 if any(sight.ahead(one, max(AIM, one.width / 2)) for one in _wanted(sight)):
                     break
             else:
-                yield from _walk_on(sight)
+                yield from sight.walk_on()
 
 
 def _armed(sight: Sight) -> bool:
@@ -63,16 +59,7 @@ def _hides(sight: Sight, enemy: "Label", clip: "Label") -> bool:
 
 
 def _step(sight: Sight) -> Iterator[str]:
-    place = _place(sight)
+    place = sight.place
     yield "MOVE_FORWARD"
-    if math.dist(place, _place(sight)) < STUCK_UNITS:
-        yield from _walk_on(sight)
-
-
-def _walk_on(sight: Sight) -> Iterator[str]:
-    yield from [sight.turn_anywhere()] * int(sight.rng.integers(3, 12))
-    yield from ["MOVE_FORWARD"] * 8
-
-
-def _place(sight: Sight) -> tuple[float, float]:
-    return sight.variables["POSITION_X"], sight.variables["POSITION_Y"]
+    if math.dist(place, sight.place) < STUCK_UNITS:
+        yield from sight.walk_on()

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from gvz.evaluation.scenarios.base import FULL_TURN, HALF_TURN, NEAR, Moment, Pose, Sight
+from gvz.evaluation.scenarios.base import AIM, FULL_TURN, HALF_TURN, NEAR, STUCK_UNITS, Moment, Pose, Sight
 
 if TYPE_CHECKING:
     from gvz.engine.engine import Label
@@ -14,10 +14,6 @@ MOMENTS = {
     "health_gathering.wad": Moment(seed=27, tics=20, pose=Pose(896, 480, 120)),
     "health_gathering_supreme.wad": Moment(seed=32, tics=20, pose=Pose(1184, 1728, 225)),
 }
-STUCK_UNITS = 4.0
-"""map units; an agent that a step forward brings less far walks against something"""
-AIM = 14.0
-"""half of what a decision turns the picture by, pixels: a finer aim would be skipped; walking corrects the rest"""
 CLOSE = 30.0
 """nearness, pixels, of a key that the next steps reach"""
 JUMP_UNITS = 60.0
@@ -49,10 +45,10 @@ def script(sight: Sight) -> Iterator[str]:
     """
     memory = _Memory()
     for button in _buttons(sight, memory):
-        place = _place(sight)
+        place = sight.place
         close = any(sight.nearness(thing) > CLOSE for thing in memory.wanted(sight))
         yield button
-        if _keys(sight) or math.dist(place, _place(sight)) > JUMP_UNITS:
+        if _keys(sight) or math.dist(place, sight.place) > JUMP_UNITS:
             memory.has_key = False
         elif close and button == "MOVE_FORWARD":
             memory.has_key = True
@@ -66,10 +62,10 @@ def _buttons(sight: Sight, memory: _Memory) -> Iterator[str]:
             yield from [sight.turn_from(touched[0])] * 2
             yield "MOVE_FORWARD"
         elif memory.ahead(sight):
-            place = _place(sight)
+            place = sight.place
             yield "MOVE_FORWARD"
-            if math.dist(place, _place(sight)) < STUCK_UNITS:
-                yield from _walk_on(sight)
+            if math.dist(place, sight.place) < STUCK_UNITS:
+                yield from sight.walk_on()
         else:
             turn = sight.turn_to(wanted[0]) if wanted else sight.turn_anywhere()
             for _ in range(FULL_TURN):
@@ -78,7 +74,7 @@ def _buttons(sight: Sight, memory: _Memory) -> Iterator[str]:
                     break
             else:
                 memory.has_key = True
-                yield from _walk_on(sight)
+                yield from sight.walk_on()
 
 
 def _keys(sight: Sight) -> "list[Label]":
@@ -87,12 +83,3 @@ def _keys(sight: Sight) -> "list[Label]":
 
 def _decoys(sight: Sight) -> "list[Label]":
     return [thing for thing in sight.nearest("Key") if not thing.object_name.startswith("Blue")]
-
-
-def _walk_on(sight: Sight) -> Iterator[str]:
-    yield from [sight.turn_anywhere()] * int(sight.rng.integers(3, 12))
-    yield from ["MOVE_FORWARD"] * 8
-
-
-def _place(sight: Sight) -> tuple[float, float]:
-    return sight.variables["POSITION_X"], sight.variables["POSITION_Y"]

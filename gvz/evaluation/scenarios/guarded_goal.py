@@ -3,16 +3,12 @@
 import math
 from collections.abc import Iterator
 
-from gvz.evaluation.scenarios.base import FULL_TURN, HALF_TURN, Moment, Pose, Sight
+from gvz.evaluation.scenarios.base import AIM, FULL_TURN, HALF_TURN, STUCK_UNITS, Moment, Pose, Sight
 
 SWEEP = (("MOVE_FORWARD", 8), ("ATTACK", 1), ("MOVE_FORWARD", 8), ("TURN_RIGHT", 6))
 MOMENTS = {"health_gathering.wad": Moment(seed=1, tics=20, pose=Pose(916, 300, 135))}
-STUCK_UNITS = 4.0
-"""map units; an agent that a step forward brings less far walks against something"""
 IN_RANGE = 7.0
 """nearness, pixels, of a guard worth a bullet"""
-AIM = 14.0
-"""half of what a decision turns the picture by, pixels: a finer aim would be skipped; walking corrects the rest"""
 
 
 def script(sight: Sight) -> Iterator[str]:
@@ -29,10 +25,10 @@ def script(sight: Sight) -> Iterator[str]:
             continue
         if {button, last} == {"TURN_LEFT", "TURN_RIGHT"}:
             button = "MOVE_FORWARD"
-        place = _place(sight)
+        place = sight.place
         yield (last := button)
-        if button == "MOVE_FORWARD" and math.dist(place, _place(sight)) < STUCK_UNITS:
-            yield from _walk_on(sight)
+        if button == "MOVE_FORWARD" and math.dist(place, sight.place) < STUCK_UNITS:
+            yield from sight.walk_on(5)
 
 
 def _button(sight: Sight) -> str | None:
@@ -54,13 +50,4 @@ def _search(sight: Sight) -> Iterator[str]:
         yield turn
         if any(thing.object_name == "Goal" for thing in sight.labels):
             return
-    yield from _walk_on(sight)
-
-
-def _walk_on(sight: Sight) -> Iterator[str]:
-    yield from [sight.turn_anywhere()] * int(sight.rng.integers(3, 12))
-    yield from ["MOVE_FORWARD"] * 5
-
-
-def _place(sight: Sight) -> tuple[float, float]:
-    return sight.variables["POSITION_X"], sight.variables["POSITION_Y"]
+    yield from sight.walk_on(5)

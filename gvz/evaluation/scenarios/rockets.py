@@ -3,14 +3,12 @@
 import math
 from collections.abc import Iterator
 
-from gvz.evaluation.scenarios.base import HALF_TURN, Moment, Pose, Sight
+from gvz.evaluation.scenarios.base import HALF_TURN, STUCK_UNITS, Moment, Pose, Sight
 
 SWEEP = (("MOVE_BACKWARD", 30), ("ATTACK", 200))
 MOMENTS = {"health_gathering.wad": Moment(seed=10, tics=90, pose=Pose(608, 180, 90))}
 TOO_NEAR = 25.0
 """nearness, pixels (some 150 map units), of an enemy at which a rocket would hurt the agent, too"""
-STUCK_UNITS = 4.0
-"""map units; an agent that a step brings less far walks against something"""
 
 
 def script(sight: Sight) -> Iterator[str]:
@@ -19,9 +17,9 @@ def script(sight: Sight) -> Iterator[str]:
     while True:
         enemies = sight.nearest("Monster")
         if enemies and sight.nearness(enemies[0]) > TOO_NEAR:
-            place = _place(sight)
+            place = sight.place
             yield "MOVE_BACKWARD"
-            if math.dist(place, _place(sight)) < STUCK_UNITS:
+            if math.dist(place, sight.place) < STUCK_UNITS:
                 yield from [sight.turn_anywhere()] * 5
                 yield from ["MOVE_FORWARD"] * 6
         elif any(sight.ahead(enemy, max(HALF_TURN, enemy.width / 2)) for enemy in enemies):
@@ -29,7 +27,3 @@ def script(sight: Sight) -> Iterator[str]:
         else:
             turn = sight.turn_to(enemies[0]) if enemies else turn
             yield turn
-
-
-def _place(sight: Sight) -> tuple[float, float]:
-    return sight.variables["POSITION_X"], sight.variables["POSITION_Y"]
