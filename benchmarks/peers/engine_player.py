@@ -3,7 +3,7 @@
     python engine_player.py
 
 Each line on its standard input is a sequence to play. The answer has one digest for each decision. PYTHONPATH says
-which package of vizdoom plays. Two packages give the same answers only if a player can read the same from both (`_seen`).
+which package of vizdoom plays. Two packages give the same answers only if a player reads the same from both (`_seen`).
 """
 
 import dataclasses
