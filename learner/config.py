@@ -205,6 +205,9 @@ class LearnerConfig:
     """decisions by which learner and actors may run apart"""
     batch_size: Annotated[int, Range(1, 65536)] = 32
     """transitions a gradient step"""
+    devices: Annotated[int, Range(1, 1024)] = 1
+    """devices of this machine that learn together, each with the replay of an equal part of the games and an equal part
+    of a batch (docs/CLUSTER.md)"""
     num_updates_per_call: Annotated[int | None, Range(1, 10**4)] = None
     """gradient steps in one jitted call; default 1 on a CPU, 8 on a GPU"""
     learning_rate: Annotated[float, Range(1e-12, 10.0)] = 1e-4
@@ -260,9 +263,16 @@ class OnPolicyConfig:
     """Adam"""
     max_grad_norm: Annotated[float | None, Range(1e-12, 1e12)] = 0.5
     """clip the global gradient norm"""
+    devices: int = 1
+    """always 1: several devices are for agents that learn from a replay"""
 
     def __post_init__(self) -> None:
         check_ranges("learner", self)
+        if self.devices != 1:
+            raise ConfigError(
+                f"learner.devices: got {self.devices} for an agent that learns on-policy, want 1: several devices are "
+                "for agents that learn from a replay"
+            )
 
     @property
     def updates_per_rollout(self) -> int:

@@ -65,7 +65,33 @@ class Ingest:
             steps[start:end], frames[start:end] = block.steps, block.frames
         for start in range(0, num_padded, size):
             part = slice(start, start + size)
-            yield _step_arrays(steps[part], frames[part], min(size, num_records - start))
+            yield _step_arrays(steps[part], frames[part], np.array(min(size, num_records - start), np.int32))
+
+    def shards(self, blocks: Sequence[StepBlock], params_version: int, num_shards: int) -> Iterator[StepArrays]:
+        """Yields all records as `arrays` does, those of each shard of the lanes apart.
+
+        A shard is `num_lanes / num_shards` lanes in a row, which are counted from its first one. The arrays of all
+        shards stand one after another, each padded to the block size: [num_shards * block, ...]; `num_valid` is
+        int32[num_shards].
+        """
+        self.check(blocks, params_version)
+        if not blocks:
+            return
+        size, num_lanes = self._block_size, self._spec.num_lanes // num_shards
+        steps = np.concatenate([block.steps for block in blocks])
+        frames = np.concatenate([block.frames for block in blocks])
+        shard = steps["lane"] // num_lanes
+        steps["lane"] %= num_lanes
+        of_shard = [np.flatnonzero(shard == d) for d in range(num_shards)]
+        for start in range(0, max(map(len, of_shard)), size):
+            padded_steps = np.zeros(num_shards * size, self._dtype)
+            padded_frames = np.empty((num_shards * size, *self._spec.frame_shape), np.uint8)
+            num_valid = np.zeros(num_shards, np.int32)
+            for d, all_rows in enumerate(of_shard):
+                rows = all_rows[start : start + size]
+                place = slice(d * size, d * size + len(rows))
+                padded_steps[place], padded_frames[place], num_valid[d] = steps[rows], frames[rows], len(rows)
+            yield _step_arrays(padded_steps, padded_frames, num_valid)
 
     def check(self, blocks: Sequence[StepBlock], params_version: int) -> None:
         """Checks and counts the records of `blocks`, which `arrays` does itself; arguments and errors are the same."""
@@ -151,7 +177,7 @@ class Ingest:
             self._ages[params_version - version] += count
 
 
-def _step_arrays(steps: np.ndarray, frames: np.ndarray, num_valid: int) -> StepArrays:
+def _step_arrays(steps: np.ndarray, frames: np.ndarray, num_valid: np.ndarray) -> StepArrays:
     return StepArrays(
         frames=frames,
         action=steps["action"].astype(np.int32),
@@ -163,5 +189,5 @@ def _step_arrays(steps: np.ndarray, frames: np.ndarray, num_valid: int) -> StepA
         truncated=steps["truncated"] != 0,
         vector=steps["vector"] if steps["vector"].size else None,
         extras=steps["extras"] if steps["extras"].size else None,
-        num_valid=np.array(num_valid, np.int32),
+        num_valid=num_valid,
     )

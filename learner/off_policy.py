@@ -5,7 +5,6 @@ Nothing here waits for the device but `take_metrics` and `check_finite`.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,24 +14,19 @@ import numpy as np
 
 from gvz.transport.messages import StepBlock
 from learner import replay, store, train_step
-from learner.agents.base import OffPolicyAgent, Params
+from learner.agents.base import Params
 from learner.checkpoint import Restored
-from learner.config import LearnerConfig, ReplayConfig
 from learner.export import flatten_params
 from learner.ingest import Ingest, Staleness
 from learner.kpi import TaskKpis
 from learner.limiter import RateLimiter
-from learner.replay import ReplaySpec
+from learner.sharding import Learning, placement
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class OffPolicyParts:
+class OffPolicyParts(Learning):
     """What an `OffPolicyLearner` is made of (`LearnerParts`)."""
 
-    agent: OffPolicyAgent
-    config: LearnerConfig
-    replay_config: ReplayConfig
-    replay_spec: ReplaySpec
     num_updates_per_call: int
     """gradient steps in one jitted call"""
 
@@ -54,10 +48,6 @@ class OffPolicyParts:
     def memory_bytes(self) -> int:
         return replay.memory_bytes(self.replay_spec)
 
-    def init(self, key: jax.Array) -> train_step.LearnerState:
-        """The state before the first update."""
-        return train_step.init(self.agent, self.replay_spec, self.config, key)
-
     def make(
         self, key: jax.Array, tasks: Sequence[str], diagnostics_dir: Path, restored: Restored | None = None
     ) -> "OffPolicyLearner":
@@ -78,7 +68,7 @@ class OffPolicyLearner:
         """As `LearnerParts.make`."""
         config, spec = parts.config, parts.replay_spec
         self._parts, self._tasks, self._diagnostics_dir = parts, tuple(tasks), diagnostics_dir
-        self._add = jax.jit(partial(replay.add, spec), donate_argnums=0)
+        self._placement = placement(parts)
         self._flatten = jax.jit(flatten_params)
         self._train_steps: dict[int, train_step.TrainStep] = {}
         self._ingest = Ingest(spec)
@@ -87,11 +77,10 @@ class OffPolicyLearner:
         )
         self._kpis = TaskKpis(spec.num_tasks, config)
         if restored is None:
-            self._state, self._replay = jax.jit(parts.init)(key), replay.init(spec)
+            self._state, self._replay = self._placement.init(key)
         else:
             arrays, state = restored.arrays, restored.host
-            # copies: a borrowed buffer cannot be donated
-            self._state, self._replay = jax.tree.map(jnp.array, (arrays["learner"], arrays["replay"]))
+            self._state, self._replay = self._placement.place(arrays["learner"], arrays["replay"])
             self._ingest.restore(state["ingest"])
             self._limiter.restore(state["limiter"])
             self._kpis.restore({name: np.asarray(values) for name, values in state["kpis"].items()})
@@ -99,14 +88,14 @@ class OffPolicyLearner:
     @property
     def params(self) -> Params:
         average = self._state.average_params
-        return self._state.params if average is None else average
+        return self._placement.one_copy(self._state.params if average is None else average)
 
     def num_steps_allowed(self) -> int:
         return self._limiter.num_steps_allowed()
 
     def add(self, blocks: Sequence[StepBlock], params_version: int) -> int:
-        for arrays in self._ingest.arrays(blocks, params_version):
-            self._replay = self._add(self._replay, arrays)
+        for arrays in self._placement.blocks(self._ingest, blocks, params_version):
+            self._replay = self._placement.add(self._replay, arrays)
         steps = self._ingest.take_env_steps()
         self._limiter.insert(steps)
         return steps
@@ -133,11 +122,8 @@ class OffPolicyLearner:
 
     def _train_step(self, num_updates: int) -> train_step.TrainStep:
         if num_updates not in self._train_steps:
-            parts = self._parts
-            replay.check_can_sample(parts.replay_spec, self._replay)
-            self._train_steps[num_updates] = train_step.make_train_step(
-                parts.agent, parts.replay_spec, parts.config, parts.replay_config, num_updates
-            )
+            replay.check_can_sample(self._parts.replay_spec, self._replay)
+            self._train_steps[num_updates] = self._placement.make_train_step(num_updates)
         return self._train_steps[num_updates]
 
     def epsilon(self, env_steps: int) -> float:
@@ -146,11 +132,12 @@ class OffPolicyLearner:
         return 1.0 if since_warmup < 0 else self._parts.agent.epsilon(since_warmup)
 
     def acting_params(self) -> jax.Array:
-        return self._flatten(self._state.params)
+        return self._flatten(self._placement.one_copy(self._state.params))
 
     def take_metrics(self) -> dict[str, float]:
         """Means of the train step as `learner/...`, shares of the tasks in the replay as `replay/share/...`."""
-        means, self._state = train_step.read_metrics(self._state, self._tasks, self._diagnostics_dir)
+        means, state = train_step.read_metrics(self._state, self._tasks, self._diagnostics_dir)
+        self._state = self._placement.settled(state)
         stored = np.asarray(store.records_per_task(self._parts.replay_spec, self._replay.store))
         shares = zip(self._tasks, (stored / stored.sum()).tolist(), strict=True)
         learner = {f"learner/{name}": value for name, value in means.items()}
@@ -163,7 +150,8 @@ class OffPolicyLearner:
         train_step.check_finite(self._state, self._diagnostics_dir)
 
     def arrays(self) -> dict[str, Any]:
-        return {"learner": self._state, "replay": self._replay}
+        state, replay_state = self._placement.canonical(self._state, self._replay)
+        return {"learner": state, "replay": replay_state}
 
     def state(self) -> dict[str, Any]:
         return {

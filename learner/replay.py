@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from gvz.core.errors import ConfigError
 from learner import store, sum_tree
+from learner.across import ALONE, Across
 from learner.observation import Observation
 from learner.store import StepArrays, Store, StoreSpec, Written, moved
 from learner.sum_tree import SumTree
@@ -116,11 +117,16 @@ def init(spec: ReplaySpec) -> ReplayState:
     """Returns an empty replay."""
     return ReplayState(
         store=store.init(spec),
-        tree=sum_tree.init(spec.num_slots, spec.num_lanes if spec.equal_shares else 1),
+        tree=sum_tree.init(spec.num_slots, num_groups(spec)),
         max_priority=jnp.ones((), jnp.float32),
         newest=jnp.full(spec.num_newest, spec.num_slots, jnp.int32),
         newest_head=jnp.zeros((), jnp.int32),
     )
+
+
+def num_groups(spec: ReplaySpec) -> int:
+    """Sum trees of a replay."""
+    return spec.num_lanes if spec.equal_shares else 1
 
 
 def memory_bytes(spec: ReplaySpec) -> int:
@@ -162,6 +168,7 @@ def sample(
     key: PRNGKeyArray,
     batch_size: int,
     is_exponent: Float[Array, ""] | float,
+    across: Across = ALONE,
 ) -> tuple[Transitions, SampleInfo]:
     """Draws a batch in proportion to priority; its last `num_newest` are the newest transitions instead.
 
@@ -171,6 +178,9 @@ def sample(
         key: consumed.
         batch_size: transitions, more than spec.num_newest.
         is_exponent: beta of the importance-sampling weights, 0..1.
+        across: the devices that draw the batch together, `batch_size` transitions each. P(i) is then that of a draw
+            from all of them, and weights are divided by the largest of all. A device that has nothing to draw yet
+            gives transitions of weight 0, and those of the others weigh more.
 
     Returns:
         The batch, and where it came from. The newest transitions are in every batch: their probability is 1, and
@@ -186,7 +196,10 @@ def sample(
     if num_drawn < 1:
         raise ValueError(f"replay.sample: got num_newest {spec.num_newest}, want less than batch size {batch_size}")
     slots, probabilities = sum_tree.sample(state.tree, key, num_drawn)
-    weights = (probabilities.min() / probabilities) ** is_exponent  # (1 / N P(i))^beta over its maximum: N drops out
+    if across.alone:
+        weights = _weights(probabilities, probabilities.min(), is_exponent)
+    else:
+        probabilities, weights = _of_all_devices(probabilities, is_exponent, across)
     if spec.num_newest > 0:
         stand_in = jnp.arange(spec.num_newest) % num_drawn
         there = state.newest < spec.num_slots
@@ -197,12 +210,38 @@ def sample(
     return _transitions(spec, state, slots), SampleInfo(slots=slots, weights=weights, probabilities=probabilities)
 
 
+def _weights(
+    probabilities: Float[Array, "B"], smallest: Float[Array, ""], is_exponent: Float[Array, ""] | float
+) -> Float[Array, "B"]:
+    """(1 / N P(i))^beta over its maximum: N drops out."""
+    return (smallest / probabilities) ** is_exponent
+
+
+def _of_all_devices(
+    probabilities: Float[Array, "B"], is_exponent: Float[Array, ""] | float, across: Across
+) -> tuple[Float[Array, "B"], Float[Array, "B"]]:
+    """P(i) and weights of a draw to which each device that has a transition gives the same part.
+
+    A device without one drew leaves of no tree: P(i) is infinite there, the weight 0. If none has one, it is NaN.
+    """
+    there = jnp.isfinite(probabilities).all()
+    num_there = across.sum(there.astype(jnp.float32))
+    probabilities = jnp.where(there, probabilities / num_there, jnp.inf)
+    weights = _weights(probabilities, across.min(probabilities.min()), is_exponent)
+    return probabilities, weights * (there * across.num_devices / num_there)
+
+
 def update_priorities(
-    spec: ReplaySpec, state: ReplayState, slots: Int[Array, "B"], td_errors: Float[Array, "B"]
+    spec: ReplaySpec,
+    state: ReplayState,
+    slots: Int[Array, "B"],
+    td_errors: Float[Array, "B"],
+    across: Across = ALONE,
 ) -> ReplayState:
     """Sets the priorities of drawn transitions to (|TD error| + min_priority)^omega; nothing if not prioritized.
 
-    A slot that was overwritten since it was drawn stays undrawable. Where a slot repeats, its largest error counts.
+    A slot that was overwritten since it was drawn stays undrawable. Where a slot repeats, its largest error counts. New
+    transitions enter with the largest priority of all devices.
 
     Source: thesis eq. 4.11, 4.12.
     """
@@ -213,7 +252,7 @@ def update_priorities(
     return replace(
         state,
         tree=sum_tree.set(state.tree, jnp.where(drawable, slots, spec.num_slots), priorities),
-        max_priority=jnp.maximum(state.max_priority, jnp.where(drawable, priorities, 0.0).max()),
+        max_priority=jnp.maximum(state.max_priority, across.max(jnp.where(drawable, priorities, 0.0).max())),
     )
 
 

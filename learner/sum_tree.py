@@ -76,6 +76,17 @@ def init(num_leaves: int, num_groups: int = 1) -> SumTree:
     return SumTree(nodes=jnp.zeros(size, jnp.float32), num_leaves=num_leaves, num_groups=num_groups)
 
 
+def of_leaves(leaves: np.ndarray, num_groups: int = 1) -> SumTree:
+    """The tree of these leaves, float32[num_leaves], made on the host: the one that `set` would make of them."""
+    level, levels = leaves.reshape(num_groups, -1), list[np.ndarray]()
+    for width in np.diff(_level_starts(level.shape[1]))[::-1]:
+        level = np.pad(level, ((0, 0), (0, width - level.shape[1])))
+        levels.insert(0, level)
+        level = _sum_row(level.reshape(num_groups, -1, FANOUT))
+    nodes: Any = np.concatenate(levels, axis=1).ravel()
+    return SumTree(nodes=nodes, num_leaves=len(leaves), num_groups=num_groups)
+
+
 def get(tree: SumTree, indices: Int[Array, "..."]) -> Float[Array, "..."]:
     """Returns the values of the leaves at `indices`, from 0; 0 for those of num_leaves and more."""
     begin, leaf = tree.place(indices)

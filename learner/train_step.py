@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from gvz.core.errors import NonFiniteError
 from learner import replay
+from learner.across import ALONE, Across
 from learner.agents.base import AgentLoss, OffPolicyAgent, Params
 from learner.config import LearnerConfig, ReplayConfig
 from learner.replay import ReplaySpec, ReplayState, SampleInfo, Transitions
@@ -153,16 +154,31 @@ def make_train_step(
         The jitted function. `task_weights` f32[num_tasks] scale the samples' losses (all 1: no effect). It compiles
         once, at its first call.
     """
+    train_step = of_one_device(agent, replay_spec, learner_config, replay_config, num_updates)
+    return jax.jit(train_step, donate_argnums=(0, 1))
+
+
+def of_one_device(
+    agent: OffPolicyAgent,
+    replay_spec: ReplaySpec,
+    learner_config: LearnerConfig,
+    replay_config: ReplayConfig,
+    num_updates: int,
+    across: Across = ALONE,
+) -> TrainStep:
+    """What `make_train_step` jits, and what each of several devices does: sizes and batch are those of one device."""
 
     def update(
         state: LearnerState, replay_state: ReplayState, task_weights: Float[Array, "Z"]
     ) -> tuple[LearnerState, ReplayState]:
         """One gradient step (thesis Algorithm 1 with prioritized replay)."""
-        key, key_sample, key_loss = jax.random.split(state.key, 3)
+        key, *keys = jax.random.split(state.key, 3)
+        key_sample, key_loss = map(across.own_key, keys)
         progress = jnp.minimum(state.num_updates / learner_config.total_updates, 1.0)
         start, end = replay_config.importance_sampling_exponent, replay_config.importance_sampling_exponent_end
+        is_exponent = start + progress * (end - start)
         batch, info = replay.sample(
-            replay_spec, replay_state, key_sample, learner_config.batch_size, start + progress * (end - start)
+            replay_spec, replay_state, key_sample, learner_config.batch_size, is_exponent, across
         )
         weights = info.weights * task_weights[batch.task]
 
@@ -172,7 +188,7 @@ def make_train_step(
 
         optimizer = _optimizer(learner_config)
         state, loss, losses, grad_norm = gradient_step(
-            state, optimizer, weighted_loss, batch, weights, hold_gradient=True
+            state, optimizer, weighted_loss, batch, weights, hold_gradient=True, across=across
         )
         if (ema := learner_config.target_ema) is not None:
             target_params = optax.incremental_update(state.params, state.target_params, 1 - ema)
@@ -182,10 +198,9 @@ def make_train_step(
         average_params = state.average_params
         if (ema := learner_config.average_ema) is not None and average_params is not None:
             average_params = optax.incremental_update(state.params, average_params, 1 - ema)
-        replay_state = replay.update_priorities(
-            replay_spec, replay_state, info.slots, jnp.where(jnp.isfinite(losses.priority), losses.priority, 0.0)
-        )
-        metrics = _add_metrics(state.metrics, loss, losses, grad_norm, info, batch.task)
+        priority = jnp.where(jnp.isfinite(losses.priority), losses.priority, 0.0)
+        replay_state = replay.update_priorities(replay_spec, replay_state, info.slots, priority, across)
+        metrics = _add_metrics(state.metrics, loss, losses, grad_norm, info, batch.task, across)
         state = replace(state, target_params=target_params, average_params=average_params, key=key, metrics=metrics)
         return state, replay_state
 
@@ -197,7 +212,7 @@ def make_train_step(
 
         return jax.lax.scan(one, (state, replay_state), length=num_updates)[0]
 
-    return jax.jit(train_step, donate_argnums=(0, 1))
+    return train_step
 
 
 def default_num_updates(learner_config: LearnerConfig) -> int:
@@ -268,6 +283,7 @@ def gradient_step(
     weights: Float[Array, "B"],
     *,
     hold_gradient: bool,
+    across: Across = ALONE,
 ) -> tuple[StateT, Float[Array, ""], LossesT, Float[Array, ""]]:
     """One gradient step, which is skipped and noted if its loss or its gradient is not finite.
 
@@ -279,11 +295,13 @@ def gradient_step(
         weights: of the samples; kept likewise.
         hold_gradient: do not let XLA compute multiples of the gradient ahead of the loop that `_when` is. The results
             differ in the last digits.
+        across: the devices whose losses and gradients are averaged.
 
     Returns:
         (state with new params, opt_state, num_updates and non_finite; loss; the samples' losses; norm of the gradient).
     """
     (loss, losses), grads = jax.value_and_grad(mean_loss, has_aux=True)(state.params)
+    loss, grads = across.mean((loss, grads))
     grad_norm = jnp.sqrt(sum(jnp.vdot(leaf, leaf) for leaf in jax.tree.leaves(grads)))
     finite = jnp.isfinite(loss) & jnp.isfinite(grad_norm)
 
@@ -335,22 +353,32 @@ def _add_metrics(
     grad_norm: Float[Array, ""],
     info: SampleInfo,
     task: Int[Array, "B"],
+    across: Across,
 ) -> MetricSums:
     magnitude = jnp.abs(losses.td_error)
+
+    def mean(values: Float[Array, "B"]) -> Float[Array, ""]:
+        return across.mean(values.mean())
+
+    def per_task(sums: Float[Array, "Z"], values: Float[Array, "B"] | float) -> Float[Array, "Z"]:
+        if across.alone:
+            return sums.at[task].add(values)
+        return sums + across.sum(jnp.zeros_like(sums).at[task].add(values))
+
     return MetricSums(
         num_updates=sums.num_updates + 1,
         loss=sums.loss + loss,
-        priority=sums.priority + losses.priority.mean(),
-        td_error=sums.td_error + magnitude.mean(),
-        q_mean=sums.q_mean + losses.q_tm1.mean(),
-        q_max=jnp.maximum(sums.q_max, losses.q_tm1.max()),
+        priority=sums.priority + mean(losses.priority),
+        td_error=sums.td_error + mean(magnitude),
+        q_mean=sums.q_mean + mean(losses.q_tm1),
+        q_max=jnp.maximum(sums.q_max, across.max(losses.q_tm1.max())),
         grad_norm=sums.grad_norm + grad_norm,
         grad_norm_max=jnp.maximum(sums.grad_norm_max, grad_norm),
-        importance_weight=sums.importance_weight + info.weights.mean(),
-        task_samples=sums.task_samples.at[task].add(1.0),
-        task_loss=sums.task_loss.at[task].add(losses.loss),
-        task_priority=sums.task_priority.at[task].add(losses.priority),
-        task_td_error=sums.task_td_error.at[task].add(magnitude),
+        importance_weight=sums.importance_weight + mean(info.weights),
+        task_samples=per_task(sums.task_samples, 1.0),
+        task_loss=per_task(sums.task_loss, losses.loss),
+        task_priority=per_task(sums.task_priority, losses.priority),
+        task_td_error=per_task(sums.task_td_error, magnitude),
     )
 
 

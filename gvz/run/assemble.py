@@ -27,6 +27,7 @@ from learner.off_policy import OffPolicyParts
 from learner.on_policy import OnPolicyParts
 from learner.replay import ReplaySpec
 from learner.rollouts import RolloutSpec
+from learner.sharding import devices
 from learner.store import StoreSpec
 from learner.train_step import default_num_updates
 
@@ -80,6 +81,7 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
     Raises:
         ConfigError: values that do not fit together.
     """
+    devices(config.learner.devices)
     table = config.table
     for task in table.tasks:
         compile_task(task, config.env.profile)  # once, here: the actors find it in the cache
@@ -117,6 +119,7 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
         footprint=Footprint(
             replay_bytes=learner.memory_bytes(),
             replay_on_host=jax.default_backend() == "cpu",
+            num_devices=config.learner.devices,
             params_bytes=4 * num_params,
             num_actors=0 if config.mode == "sync" else config.num_actors,
             actors_ask=config.actors.inference == "device",

@@ -148,6 +148,16 @@ class RunConfig:
                 f"replay.num_newest: got {replay.num_newest}, want less than learner.batch_size "
                 f"{learner.batch_size}: a batch also holds drawn transitions; lower the one or raise the other"
             )
+        for name, value in (
+            ("actors.num_actors times games_per_actor", self.num_lanes),
+            ("learner.batch_size", learner.batch_size),
+            ("replay.num_newest", replay.num_newest),
+        ):
+            if learner.devices > 1 and value % learner.devices:
+                raise ConfigError(
+                    f"learner.devices: got {learner.devices}, want a divisor of {name}, which is {value}: every device "
+                    "has an equal part of it; change the one or the other"
+                )
         n_steps = self.agent.n_steps if isinstance(self.agent, ValueConfig) else 1
         smallest = self.num_lanes * 4 * (max(self.agent.stack_size, self.agent.past_actions + 1) + n_steps)
         if replay.capacity < smallest:

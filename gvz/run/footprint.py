@@ -27,6 +27,8 @@ class Footprint:
 
     replay_bytes: int
     replay_on_host: bool
+    num_devices: int = 1
+    """which learn, each with an equal part of the replay"""
     params_bytes: int
     num_actors: int
     actors_ask: bool = False
@@ -52,7 +54,7 @@ class Footprint:
         """Host memory in all, shared memory included."""
         return (
             LEARNER_MEMORY_BYTES
-            + (self.replay_bytes if self.replay_on_host else 0)
+            + (self.replay_bytes + (self.num_devices - 1) * 4 * self.params_bytes if self.replay_on_host else 0)
             + self.snapshot_bytes
             + self.num_actors
             * (ASKING_ACTOR_MEMORY_BYTES if self.actors_ask else ACTOR_MEMORY_BYTES + 2 * self.params_bytes)
@@ -64,12 +66,16 @@ class Footprint:
     def lines(self) -> list[str]:
         """The footprint as a person reads it."""
         where = "host" if self.replay_on_host else "device"
+        learner = "1 learner"
+        if self.num_devices > 1:
+            where = f"{self.num_devices} devices" + (" of the host" if self.replay_on_host else "")
+            learner += f" on {self.num_devices} devices"
         shared = f"rings and {'requests' if self.actors_ask else 'parameter queue'}"
         return [
             f"replay {format_bytes(self.replay_bytes)} ({where}), checkpoint copy {format_bytes(self.snapshot_bytes)}",
             f"/dev/shm {format_bytes(self.shm_bytes)}, {shared} {format_bytes(self.transport_bytes)}, "
             f"host memory in all {format_bytes(self.memory_bytes)}",
-            f"processes: 1 learner, {self.num_actors} actors, {self.num_games} engines; {self.placement}",
+            f"processes: {learner}, {self.num_actors} actors, {self.num_games} engines; {self.placement}",
         ]
 
 

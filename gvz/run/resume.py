@@ -19,6 +19,7 @@ _MAY_CHANGE = (
     "actors.restart_window_s",
     "actors.recycle_episodes",
     "learner.num_updates_per_call",
+    "learner.devices",
     "agent.conv_form",
     "checkpoint.*",
     "log.*",

@@ -42,6 +42,17 @@ def test_the_lines_say_bytes_and_processes():
     assert "processes: 1 learner, 2 actors, 8 engines" in text
 
 
+def test_several_devices_share_the_replay_and_each_has_all_parameters():
+    several = dataclasses.replace(FOOTPRINT, num_devices=4)
+    assert several.memory_bytes - FOOTPRINT.memory_bytes == 3 * 4 * FOOTPRINT.params_bytes
+    assert several.snapshot_bytes == FOOTPRINT.snapshot_bytes
+    assert "replay 2.00 GB (4 devices of the host)" in several.lines()[0]
+    assert "processes: 1 learner on 4 devices, 2 actors" in several.lines()[2]
+    on_device = dataclasses.replace(several, replay_on_host=False)
+    assert "replay 2.00 GB (4 devices)" in on_device.lines()[0]
+    assert on_device.memory_bytes == dataclasses.replace(FOOTPRINT, replay_on_host=False).memory_bytes
+
+
 def test_what_fits_passes():
     check(FOOTPRINT, shm_free=FOOTPRINT.shm_bytes, memory_free=FOOTPRINT.memory_bytes)
 

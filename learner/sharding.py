@@ -1,0 +1,298 @@
+"""Where a learner's arrays live, and how its functions are compiled for that: one device, or several with a shard each.
+
+Several devices share the lanes: device d of D has the lanes from d * num_lanes / D on, with their slots, and a sum tree
+of its own over them. Parameters and all else that a gradient step changes are on every device, bit for bit the same.
+Every device draws its part of a batch from its own tree. Only sums and extremes cross devices (`learner.across`).
+
+A lane's slots are consecutive, so an array of all slots in the order of the lanes is the shards' arrays one after
+another: records look the same whatever D is. What does not is made the same for a checkpoint (`canonical`): the sum
+trees are rebuilt of their leaves, and anchors are counted from slot 0 of all lanes.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import PRNGKeyArray
+
+from gvz.core.errors import ConfigError
+from gvz.transport.messages import StepBlock
+from learner import replay, sum_tree, train_step
+from learner.across import AXIS, Across
+from learner.agents.base import OffPolicyAgent
+from learner.config import LearnerConfig, ReplayConfig
+from learner.ingest import Ingest
+from learner.replay import ReplaySpec, ReplayState
+from learner.store import StepArrays
+from learner.sum_tree import SumTree
+from learner.train_step import LearnerState, TrainStep
+
+SHARDED, REPLICATED = PartitionSpec(AXIS), PartitionSpec()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Learning:
+    """What is compiled: the agent's loss on batches of a replay, over all devices."""
+
+    agent: OffPolicyAgent
+    config: LearnerConfig
+    replay_config: ReplayConfig
+    replay_spec: ReplaySpec
+
+    def init(self, key: PRNGKeyArray) -> LearnerState:
+        """The state before the first update."""
+        return train_step.init(self.agent, self.replay_spec, self.config, key)
+
+    def of_one_of(self, num_devices: int) -> "Learning":
+        """What each of several devices has of it."""
+        spec, config = self.replay_spec, self.config
+        return replace(
+            self,
+            config=replace(config, batch_size=config.batch_size // num_devices, devices=1),
+            replay_spec=replace(
+                spec,
+                num_lanes=spec.num_lanes // num_devices,
+                capacity=spec.num_slots // num_devices,
+                num_newest=spec.num_newest // num_devices,
+            ),
+        )
+
+
+class Placement(Protocol):
+    """A learner's arrays on its device or devices."""
+
+    def init(self, key: PRNGKeyArray) -> tuple[LearnerState, ReplayState]:
+        """The state before the first update, and an empty replay."""
+        ...
+
+    def place(self, state: LearnerState, replay_state: ReplayState) -> tuple[LearnerState, ReplayState]:
+        """The same from numpy arrays in canonical form; copies, for a borrowed buffer cannot be donated."""
+        ...
+
+    def canonical(self, state: LearnerState, replay_state: ReplayState) -> tuple[LearnerState, ReplayState]:
+        """In the form that does not depend on the devices."""
+        ...
+
+    def settled(self, state: LearnerState) -> LearnerState:
+        """The same where parts of it were made anew elsewhere, such as empty sums of metrics."""
+        ...
+
+    def one_copy(self, tree: Any) -> Any:
+        """Replicated arrays on the default device alone."""
+        ...
+
+    def add(self, replay_state: ReplayState, arrays: StepArrays) -> ReplayState:
+        """`replay.add`, jitted; the replay is donated."""
+        ...
+
+    def blocks(self, ingest: Ingest, blocks: Sequence[StepBlock], params_version: int) -> Iterator[StepArrays]:
+        """Checked records in the blocks that `add` takes."""
+        ...
+
+    def make_train_step(self, num_updates: int) -> TrainStep:
+        """As `train_step.make_train_step`."""
+        ...
+
+
+class OneDevice:
+    """The default device (`Placement`)."""
+
+    def __init__(self, learning: Learning):
+        self._learning = learning
+        self._add = jax.jit(partial(replay.add, learning.replay_spec), donate_argnums=0)
+
+    def init(self, key: PRNGKeyArray) -> tuple[LearnerState, ReplayState]:
+        return jax.jit(self._learning.init)(key), replay.init(self._learning.replay_spec)
+
+    def place(self, state: LearnerState, replay_state: ReplayState) -> tuple[LearnerState, ReplayState]:
+        return jax.tree.map(jnp.array, (state, replay_state))
+
+    def canonical(self, state: LearnerState, replay_state: ReplayState) -> tuple[LearnerState, ReplayState]:
+        return state, replay_state
+
+    def settled(self, state: LearnerState) -> LearnerState:
+        return state
+
+    def one_copy(self, tree: Any) -> Any:
+        return tree
+
+    def add(self, replay_state: ReplayState, arrays: StepArrays) -> ReplayState:
+        return self._add(replay_state, arrays)
+
+    def blocks(self, ingest: Ingest, blocks: Sequence[StepBlock], params_version: int) -> Iterator[StepArrays]:
+        return ingest.arrays(blocks, params_version)
+
+    def make_train_step(self, num_updates: int) -> TrainStep:
+        one = self._learning
+        return train_step.make_train_step(one.agent, one.replay_spec, one.config, one.replay_config, num_updates)
+
+
+class SeveralDevices:
+    """The first devices of this process, a shard of the lanes on each (`Placement`)."""
+
+    def __init__(self, learning: Learning):
+        """Compiles nothing yet.
+
+        Raises:
+            ConfigError: there are not as many devices.
+        """
+        self._all, self._num_devices = learning, learning.config.devices
+        self._each = learning.of_one_of(self._num_devices)
+        self._mesh = Mesh(np.array(devices(self._num_devices)), (AXIS,))
+        self._add = self._jit(self._add_here, (self._replay_specs, SHARDED), self._replay_specs, donated=(0,))
+
+    def init(self, key: PRNGKeyArray) -> tuple[LearnerState, ReplayState]:
+        def empty() -> ReplayState:
+            return self._as_shard(replay.init(self._each.replay_spec))
+
+        state = self._put(jax.jit(self._all.init)(key), self._state_specs)
+        return state, self._jit(empty, (), self._replay_specs)()
+
+    def place(self, state: LearnerState, replay_state: ReplayState) -> tuple[LearnerState, ReplayState]:
+        sharded = regroup(replay_state, self._all.replay_spec, self._num_devices)
+        return self._put(state, self._state_specs), self._put(sharded, self._replay_specs)
+
+    def canonical(self, state: LearnerState, replay_state: ReplayState) -> tuple[LearnerState, ReplayState]:
+        return state, regroup(replay_state, self._all.replay_spec, None)
+
+    def settled(self, state: LearnerState) -> LearnerState:
+        return jax.device_put(state, jax.tree.map(self._sharding, self._state_specs))
+
+    def one_copy(self, tree: Any) -> Any:
+        return jax.tree.map(lambda leaf: leaf.addressable_data(0), tree)
+
+    def add(self, replay_state: ReplayState, arrays: StepArrays) -> ReplayState:
+        return self._add(replay_state, jax.device_put(arrays, self._sharding(SHARDED)))
+
+    def blocks(self, ingest: Ingest, blocks: Sequence[StepBlock], params_version: int) -> Iterator[StepArrays]:
+        return ingest.shards(blocks, params_version, self._num_devices)
+
+    def make_train_step(self, num_updates: int) -> TrainStep:
+        each = self._each
+        of_one_device = train_step.of_one_device(
+            each.agent, each.replay_spec, each.config, each.replay_config, num_updates, Across(self._num_devices)
+        )
+
+        def here(state: LearnerState, shard: ReplayState, task_weights: Any) -> tuple[LearnerState, ReplayState]:
+            state, own = of_one_device(state, self._of_shard(shard), task_weights)
+            return state, self._as_shard(own)
+
+        both = self._state_specs, self._replay_specs
+        return self._jit(here, (*both, REPLICATED), both, donated=(0, 1))
+
+    def _add_here(self, shard: ReplayState, arrays: StepArrays) -> ReplayState:
+        arrays = replace(arrays, num_valid=arrays.num_valid[0])
+        return self._as_shard(replay.add(self._each.replay_spec, self._of_shard(shard), arrays))
+
+    def _jit(self, here: Callable[..., Any], takes: Any, gives: Any, donated: tuple[int, ...] = ()) -> Any:
+        """Jits what each device does."""
+        mapped = jax.shard_map(here, mesh=self._mesh, in_specs=takes, out_specs=gives, check_vma=False)
+        return jax.jit(mapped, donate_argnums=donated)
+
+    def _put(self, tree: Any, specs: Any) -> Any:
+        """Copies of the leaves on the devices: `specs` has the tree's structure."""
+
+        return jax.device_put(tree, jax.tree.map(self._sharding, specs), may_alias=False)
+
+    def _sharding(self, spec: PartitionSpec) -> NamedSharding:
+        return NamedSharding(self._mesh, spec)
+
+    @cached_property
+    def _state_specs(self) -> Any:
+        """Everything is on all devices, but for the samples that are kept of an update that is not finite."""
+        sharded = tuple(f".non_finite.{name}" for name in ("batch", "loss", "weights"))
+
+        def spec(path: Any, _: Any) -> PartitionSpec:
+            return SHARDED if jax.tree_util.keystr(path).startswith(sharded) else REPLICATED
+
+        return jax.tree_util.tree_map_with_path(spec, jax.eval_shape(self._all.init, jax.random.key(0)))
+
+    @cached_property
+    def _replay_specs(self) -> Any:
+        shapes = jax.eval_shape(lambda: self._as_shard(replay.init(self._each.replay_spec)))
+        return replace(jax.tree.map(lambda _: SHARDED, shapes), max_priority=REPLICATED)
+
+    def _of_shard(self, shard: ReplayState) -> ReplayState:
+        """A device's shard as a replay of its own lanes."""
+        return replace(shard, tree=self._with_groups(shard.tree, 1), newest_head=shard.newest_head[0])
+
+    def _as_shard(self, own: ReplayState) -> ReplayState:
+        """A replay of a device's lanes as its part of the whole, in which its sum tree is one of several groups."""
+        return replace(own, tree=self._with_groups(own.tree, self._num_devices), newest_head=own.newest_head[None])
+
+    def _with_groups(self, tree: SumTree, num_shards: int) -> SumTree:
+        spec = self._each.replay_spec
+        return replace(tree, num_leaves=num_shards * spec.num_slots, num_groups=num_shards * replay.num_groups(spec))
+
+
+def placement(learning: Learning) -> Placement:
+    """Where `learning` happens.
+
+    Raises:
+        ConfigError: there are not as many devices as it wants.
+    """
+    return OneDevice(learning) if learning.config.devices == 1 else SeveralDevices(learning)
+
+
+def devices(num_devices: int) -> list[Any]:
+    """The first devices of this process.
+
+    Raises:
+        ConfigError: there are fewer.
+    """
+    present = jax.local_devices()
+    if num_devices > len(present):
+        raise ConfigError(
+            f"learner.devices: got {num_devices}, but JAX sees {len(present)} ({present[0].platform}); lower it, or "
+            "make more devices visible (CUDA_VISIBLE_DEVICES); to try it on a CPU, set "
+            f"XLA_FLAGS=--xla_force_host_platform_device_count={num_devices}"
+        )
+    return present[:num_devices]
+
+
+def regroup(state: ReplayState, spec: ReplaySpec, num_shards: int | None) -> ReplayState:
+    """The same replay in other shards, on the host.
+
+    Args:
+        state: in shards or in canonical form.
+        spec: of all lanes.
+        num_shards: as many; None for the canonical form, in which all lanes are one.
+    """
+    num_groups = spec.num_lanes if spec.equal_shares else num_shards or 1
+    begin = state.tree.starts[-2]
+    of_group = np.asarray(state.tree.nodes).reshape(state.tree.num_groups, -1)
+    leaves = of_group[:, begin : begin + spec.num_slots // state.tree.num_groups].ravel()
+    newest, heads = _regroup_newest(np.asarray(state.newest), np.asarray(state.newest_head), spec, num_shards or 1)
+    return replace(
+        state,
+        tree=sum_tree.of_leaves(leaves, num_groups),
+        newest=newest,
+        newest_head=heads[0] if num_shards is None else heads,
+    )
+
+
+def _regroup_newest(
+    newest: np.ndarray, heads: np.ndarray, spec: ReplaySpec, num_shards: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The circles of the newest anchors for other shards; of several circles the last ones of each are the newest."""
+    num_before, size = heads.size, spec.num_newest // num_shards
+    slots_before, slots = spec.num_slots // num_before, spec.num_slots // num_shards
+    aged = list[tuple[int, int]]()
+    for d, (circle, head) in enumerate(zip(newest.reshape(num_before, -1), heads.ravel(), strict=True)):
+        oldest_first = np.roll(circle, -int(head))
+        aged += [
+            (age, d * slots_before + int(slot)) for age, slot in enumerate(oldest_first[::-1]) if slot < slots_before
+        ]
+    anchors = np.array([anchor for _, anchor in sorted(aged, reverse=True)], np.int32)
+    circles = np.full((num_shards, size), slots, np.int32)
+    new_heads = np.zeros(num_shards, np.int32)
+    if size > 0:
+        for d in range(num_shards):
+            own = anchors[anchors // slots == d][-size:] - d * slots
+            circles[d, : len(own)], new_heads[d] = own, len(own) % size
+    return circles.ravel(), new_heads
