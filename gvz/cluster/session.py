@@ -42,7 +42,7 @@ class Session:
 
 
 @contextlib.contextmanager
-def connect(address: str, *, shm_bytes: int = 0, public: bool = False) -> Generator[Session]:
+def connect(address: str, *, shm_bytes: int = 0, public: bool = False, alike: bool = True) -> Generator[Session]:
     """Connects this process to a Ray cluster; the end of the block ends our tasks and actors there, and disconnects.
 
     Sets Ray's environment variables for this process: authentication by token, no usage statistics.
@@ -51,6 +51,7 @@ def connect(address: str, *, shm_bytes: int = 0, public: bool = False) -> Genera
         address: HOST:PORT of the head.
         shm_bytes: what each node must have free in /dev/shm.
         public: allow nodes whose addresses the whole Internet can reach.
+        alike: refuse nodes that differ from this machine in a version.
 
     Raises:
         ConfigError: no Ray here, an address that is malformed, public or silent, a cluster that lets everybody in, no
@@ -79,7 +80,8 @@ def connect(address: str, *, shm_bytes: int = 0, public: bool = False) -> Genera
         nodes = survey()
         for node in () if public else nodes:
             require_private(node.ip, f"cluster {address}: node {node.name}")
-        check_nodes(nodes, shm_bytes=shm_bytes)
+        if alike:
+            check_nodes(nodes, shm_bytes=shm_bytes)
         yield Session(address=where, nodes=nodes)
     finally:
         ray.shutdown()
@@ -108,7 +110,7 @@ def require_private(ip: str, where: str) -> None:
     if ipaddress.ip_address(ip).is_global:
         raise ConfigError(
             f"{where}: {ip} is a public address; start Ray on a private network (--node-ip-address=10...), "
-            "or say --cluster-public if a firewall stands before it"
+            "or allow it if a firewall stands before it (docs/CLUSTER.md, Safety)"
         )
 
 
@@ -116,13 +118,18 @@ def require_token(environment: Mapping[str, str]) -> None:
     """Raises ConfigError if Ray would not use a token, or finds none."""
     if (mode := environment.get("RAY_AUTH_MODE", "token").lower()) != "token":
         raise ConfigError(f"RAY_AUTH_MODE={mode}: want token, here and on every node of the cluster")
-    file = Path(environment.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token")
+    file = token_file(environment)
     if environment.get("RAY_AUTH_TOKEN") or (file.is_file() and file.stat().st_size):
         return
     raise ConfigError(
         f"no token of the cluster in RAY_AUTH_TOKEN, nor in {file}; copy the head's ~/.ray/auth_token to every node "
         "(`ray get-auth-token --generate` makes it)"
     )
+
+
+def token_file(environment: Mapping[str, str]) -> Path:
+    """Where Ray looks for the token if RAY_AUTH_TOKEN is not set."""
+    return Path(environment.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token")
 
 
 def _resolve(address: str, host: str, port: int) -> str:

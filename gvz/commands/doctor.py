@@ -1,9 +1,10 @@
 """`gvz doctor`: is this machine fit for a run?"""
 
-import dataclasses
-import json
 import sys
 from dataclasses import dataclass
+from pathlib import Path
+
+from gvz.core.errors import ConfigError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,29 +16,31 @@ class Doctor:
 
     clean: bool = False
     """first remove what dead runs of yours left: engines, shared memory, private directories"""
+    shared: Path | None = None
+    """check this directory instead, for several machines that work in it: locks, renames, fsync"""
+    hold: float | None = None
+    """hold a lock in the shared directory for so many seconds, for this command on another machine to see"""
     json: bool = False
     """one JSON object a line instead of a table"""
 
     def run(self) -> int:
         """Prints the findings."""
         from gvz.core import janitor
-        from gvz.run import doctor
+        from gvz.run import doctor, shared_directory
 
+        if self.hold is not None and (self.shared is None or self.hold <= 0):
+            raise ConfigError(f"--hold: got {self.hold:g}, want more than 0 seconds, and --shared DIR")
         if self.clean:
             for line in janitor.clean_dead_instances():
                 done = line if line.startswith("left alone") else f"removed {line}"
                 print(done, file=sys.stderr if self.json else sys.stdout)
-        bad = 0
-        for check in doctor.CHECKS:
-            finding = check()
-            bad += finding.state == "bad"
-            if self.json:
-                print(json.dumps(dataclasses.asdict(finding)), flush=True)
-                continue
-            print(f"{finding.state:5} {finding.name:10} {finding.found}", flush=True)
-            if finding.remedy:
-                print(f"{'':16} -> {finding.remedy}")
-        return 1 if bad else 0
+        if self.shared is None:
+            return doctor.show((check() for check in doctor.CHECKS), json_lines=self.json)
+        shared_directory.require_directory(self.shared)
+        if self.hold is not None:
+            shared_directory.hold(self.shared, self.hold, lambda line: print(line, flush=True))
+            return 0
+        return doctor.show((check(self.shared) for check in shared_directory.CHECKS), json_lines=self.json)
 
 
 COMMAND = Doctor

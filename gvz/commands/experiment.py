@@ -15,7 +15,8 @@ from gvz.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from gvz.experiments.costs import Cost
-    from gvz.experiments.jobs import Job, Slot
+    from gvz.experiments.jobs import Job
+    from gvz.experiments.places import Slot
     from gvz.experiments.plan import Plan
 
 DEFAULT_RESULTS = Path("runs/experiments")
@@ -74,7 +75,7 @@ class PlanFlags:
 
     def slots(self) -> "tuple[Slot, ...]":
         """The machine's shares."""
-        from gvz.experiments.schedule import gpus, make_slots
+        from gvz.experiments.places import gpus, make_slots
 
         return make_slots(self.jobs, sorted(os.sched_getaffinity(0)), gpus())
 
@@ -137,17 +138,39 @@ class RunCommand:
     """
 
     ask: Annotated[PlanFlags, tyro.conf.arg(name="")] = PlanFlags()
+    cluster: str | None = None
+    """HOST:PORT of a Ray cluster (docs/CLUSTER.md) whose nodes run the jobs; they all see the results directory"""
+    cluster_public: bool = False
+    """its nodes may have public addresses; whoever reaches them and has the token runs code there"""
+    job_cores: int | None = None
+    """of a node of the cluster, for a job; default 2"""
+    job_gpus: float | None = None
+    """likewise, while it trains: a part of a GPU (0.5), or whole ones; default one if a node of the cluster has any"""
 
     def run(self) -> int:
         """0 all done, 1 some failed, 130 or 143 stopped."""
+        from gvz.experiments.places import Machine
         from gvz.experiments.plan import parse_shard, write_plan
         from gvz.experiments.schedule import run_jobs
 
-        plan, slots = self.ask.plan(), self.ask.slots()
+        plan = self.ask.plan()
         index, count = parse_shard(self.ask.shard)
         _check_flags(plan)
-        write_plan(self.ask.results, plan)
-        return run_jobs(_jobs(plan, self.ask.results, index, count), slots)
+        if self.cluster is None:
+            if self.job_cores is not None or self.job_gpus is not None:
+                raise ConfigError(
+                    "--job-cores and --job-gpus are for a cluster (--cluster); here --jobs divides the cores"
+                )
+            slots = self.ask.slots()
+            write_plan(self.ask.results, plan)
+            return run_jobs(_jobs(plan, self.ask.results, index, count), Machine(slots))
+        from gvz.cluster.ray_jobs import open_places
+
+        results = self.ask.results.resolve()  # every node has working directories of its own
+        share = (2 if self.job_cores is None else self.job_cores, self.job_gpus, self.ask.jobs)
+        with open_places(self.cluster, results, *share, public=self.cluster_public) as places:
+            write_plan(results, plan)
+            return run_jobs(_jobs(plan, results, index, count), places)
 
 
 @dataclass(frozen=True, kw_only=True)

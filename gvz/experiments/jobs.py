@@ -1,19 +1,12 @@
-"""Jobs: what to do for one run (train, then evaluate) or one simple player, and the process that does it.
+"""Jobs: what to do for one run (train, then evaluate) or one simple player.
 
 The next command follows from the files on the disk, so an interrupted job goes on.
 """
 
-import os
-import shlex
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
-from gvz.core import janitor, records
 from gvz.evaluation.simple import SimplePlayerName
 from gvz.experiments import inventory
 from gvz.experiments.base import TrainingRun
@@ -157,71 +150,3 @@ def _words(value: Any) -> tuple[str, ...]:
 
 def _episodes(evaluation: Evaluation) -> tuple[str, ...]:
     return ("--tasks", *evaluation.tasks, "--episodes", str(evaluation.episodes))
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Slot:
-    """A share of the machine, for one job at a time."""
-
-    cores: tuple[int, ...]
-    environment: dict[str, str]
-    """added to ours: which GPU, how much of its memory"""
-
-
-class RunningJob:
-    """A command of a job at work in a slot.
-
-    The job's log is locked as long as the command runs. Its process holds the lock, too: if it saves its run after our
-    death, no other process starts the job before that is done.
-    """
-
-    def __init__(self, job: Job, command: Command, slot: Slot, log: IO[bytes]):
-        self.job, self.command, self.slot = job, command, slot
-        self._log = log
-        self._started_s = time.monotonic()
-        self._code: int | None = None
-        self._note(f"# {time.strftime('%Y-%m-%d %H:%M:%S')} python {shlex.join(command.arguments)}")
-        cores = ",".join(map(str, slot.cores))
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "gvz.experiments.child", str(os.getpid()), cores, *command.arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            env={**os.environ, **slot.environment, "PYTHONUNBUFFERED": "1"},
-            start_new_session=True,  # the terminal's Ctrl-C is for us, who then stop it in order
-        )
-
-    @classmethod
-    def start(cls, job: Job, command: Command, slot: Slot) -> "RunningJob | None":
-        """Starts a command; None if another process runs the job."""
-        file = inventory.log_file(job.results, job.id)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        log = file.open("ab", buffering=0)
-        if not records.lock(log):
-            log.close()
-            return None
-        return cls(job, command, slot, log)
-
-    def poll(self) -> int | None:
-        """Exit code of the command, as a shell says it; None while it runs."""
-        code = self._process.poll()
-        if code is not None and self._code is None:
-            self._code = 128 - code if code < 0 else code
-            self._note(f"{inventory.END_MARK}{self._code} after {time.monotonic() - self._started_s:.0f} s")
-            self._log.close()
-        return self._code
-
-    def stop(self) -> None:
-        """Asks the command to save what it has and to end."""
-        if self.poll() is None:
-            self._process.send_signal(signal.SIGINT)
-
-    def kill(self) -> None:
-        """Ends the command and all it started at once."""
-        if self.poll() is None:
-            os.killpg(self._process.pid, signal.SIGKILL)
-            janitor.reap_killed(self._process, self.job.id)
-            self.poll()
-
-    def _note(self, line: str) -> None:
-        self._log.write(f"{line}\n".encode())

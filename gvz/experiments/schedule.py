@@ -1,18 +1,17 @@
-"""Runs jobs on the machine's cores and GPUs, shows their progress, and stops them so that they save their runs."""
+"""Runs jobs where there is room, shows their progress, and stops them so that they save their runs."""
 
-import os
-import shutil
-import subprocess
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from gvz.core import records
-from gvz.core.errors import ConfigError
 from gvz.core.stop import StopRequest
 from gvz.core.watchdog import AwakeClock
 from gvz.experiments import inventory
-from gvz.experiments.jobs import Job, RunningJob, Slot
+from gvz.experiments.jobs import Command, Job
+from gvz.experiments.places import Places
+from gvz.experiments.process import LOST, TAKEN, Process
 from gvz.run.bars import Bar, Bars
 
 POLL_S = 0.5
@@ -22,49 +21,28 @@ STOP_TIMEOUT_S = 300.0
 """a job that has not saved itself by then is killed; a checkpoint of a full replay takes a minute on a slow disk"""
 LOCKED_TIMEOUT_S = 60.0
 """how long to wait for a job that another process runs, when nothing else is left to do"""
+LOST_TIMEOUT_S = 300.0
+"""likewise when a machine was lost: a file server takes up to minutes to give back the locks of a dead machine"""
+MAX_LOSSES = 3
+"""a job that takes so many machines along, one after the other, without any progress, has failed"""
 
 
-def gpus() -> tuple[str, ...]:
-    """Ids for CUDA_VISIBLE_DEVICES of the GPUs that are there and not hidden."""
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if visible is not None:
-        return tuple(id for id in visible.split(",") if id and id != "-1")
-    if shutil.which("nvidia-smi") is None:
-        return ()
-    listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, timeout=60, check=False).stdout
-    return tuple(str(n) for n, line in enumerate(listed.splitlines()) if line.startswith("GPU "))
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RunningJob:
+    """A command of a job at work."""
+
+    job: Job
+    command: Command
+    process: Process
 
 
-def make_slots(jobs: int | None, cores: Sequence[int], devices: Sequence[str]) -> tuple[Slot, ...]:
-    """Shares of these cores and GPUs for so many jobs at once; None: one a GPU, or without one a pair of cores.
-
-    Raises:
-        ConfigError: fewer than one job.
-    """
-    if jobs is None:
-        jobs = min(len(devices), len(cores)) if devices else max(1, len(cores) // 2)
-    if jobs < 1:
-        raise ConfigError(f"--jobs: got {jobs}, want at least 1")
-    slots = []
-    for n in range(jobs):
-        share = tuple(cores[n::jobs]) or (cores[n % len(cores)],)
-        environment = {}
-        if devices:
-            environment["CUDA_VISIBLE_DEVICES"] = devices[n % len(devices)]
-            together = -(-jobs // len(devices))
-            if together > 1:
-                environment["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{0.9 / together:.3f}"
-        slots.append(Slot(cores=share, environment=environment))
-    return tuple(slots)
-
-
-def run_jobs(jobs: Sequence[Job], slots: Sequence[Slot]) -> int:
+def run_jobs(jobs: Sequence[Job], places: Places) -> int:
     """Runs all jobs that are not done. A job that fails does not stop the others.
 
     Returns: 0 when all are done, 1 when some failed, 130 or 143 when a signal stopped us; what was running is saved.
     """
     with StopRequest() as stop, Bars(PLAIN_PERIOD_S) as bars:
-        schedule = Schedule(jobs, slots, bars)
+        schedule = Schedule(jobs, places, bars)
         try:
             while schedule.step() and not stop.requested:
                 time.sleep(POLL_S)
@@ -81,59 +59,87 @@ def run_jobs(jobs: Sequence[Job], slots: Sequence[Slot]) -> int:
 class Schedule:
     """Jobs that wait, run and have failed. `kill` leaves nothing running."""
 
-    def __init__(self, jobs: Sequence[Job], slots: Sequence[Slot], bars: Bars):
+    def __init__(self, jobs: Sequence[Job], places: Places, bars: Bars):
         self._waiting = deque(jobs)
-        self._free = deque(slots)
+        self._places = places
         self._running: list[RunningJob] = []
         self._failed: list[Job] = []
+        self._losses: Counter[tuple[str, str]] = Counter()
+        self._settling_since_s: dict[str, float] = {}
         self._bars, self._total, self._ended_jobs = bars, len(jobs), 0
         self._locked_since_s: float | None = None
 
     def step(self) -> bool:
         """Looks for commands that have ended, and starts others; False when nothing is left."""
         for running in list(self._running):
-            if (code := running.poll()) is not None:
+            code = running.process.poll()
+            if code is not None and not (code == 0 and self._settles(running)):
                 self._running.remove(running)
-                self._free.append(running.slot)
+                self._places.end(running.process)
                 self._ended(running, code)
         for _ in range(len(self._waiting)):
-            if not self._free:
+            if not self._places.room() or not self._begin(self._waiting.popleft()):
                 break
-            self._begin(self._waiting.popleft())
         if self._bars.due:
             self._show()
-        if self._waiting and not self._running:  # other processes run all that is left
+        if self._waiting and not self._running and self._places.room():  # other processes run all that is left
             now = time.monotonic()
             self._locked_since_s = now if self._locked_since_s is None else self._locked_since_s
-            return now - self._locked_since_s < LOCKED_TIMEOUT_S
+            return now - self._locked_since_s < (LOST_TIMEOUT_S if self._losses else LOCKED_TIMEOUT_S)
         self._locked_since_s = None
-        return bool(self._running)
+        return bool(self._running or self._waiting)
 
-    def _begin(self, job: Job) -> None:
-        if records.is_locked(inventory.log_file(job.results, job.id)):
+    def _begin(self, job: Job) -> bool:
+        """Starts the job's next command if the job is not done, nor run by another process; False for want of room."""
+        log = inventory.log_file(job.results, job.id)
+        if records.is_locked(log):
             self._waiting.append(job)
-            return
+            return True
         outlook = job.outlook()
         if outlook.next is None:
             self._end(job, "done")
-            return
-        running = RunningJob.start(job, outlook.next, self._free[0])
-        if running is None:  # another process took it just now
+            return True
+        if not self._places.room(outlook.next.step):
+            self._waiting.appendleft(job)
+            return False
+        process = self._places.start(log, outlook.next)
+        if process is None:  # another process took it just now
             self._waiting.append(job)
-            return
-        self._free.popleft()
-        self._running.append(running)
+            return True
+        self._running.append(RunningJob(job=job, command=outlook.next, process=process))
         self._bars.say(f"{outlook.next.step}: {job.id} ({outlook.text})")
+        return True
+
+    def _settles(self, running: RunningJob) -> bool:
+        """Whether what a command has written may not be visible here yet."""
+        following = running.job.outlook().next
+        if following is None or following.step != running.command.step:
+            return False
+        since_s = self._settling_since_s.setdefault(running.job.id, time.monotonic())
+        return time.monotonic() - since_s < self._places.settle_s
 
     def _ended(self, running: RunningJob, code: int) -> None:
-        following = running.job.outlook().next
-        if code == 0 and (following is None or following.step != running.command.step):
-            self._waiting.appendleft(running.job)
+        job = running.job
+        self._settling_since_s.pop(job.id, None)
+        if code == TAKEN:
+            self._waiting.append(job)
             return
-        why = f"exit code {code}" if code else f"it ended as if all were done, but {following} is left"
-        log = inventory.log_file(running.job.results, running.job.id)
-        self._failed.append(running.job)
-        self._end(running.job, f"FAILED ({running.command.step}: {why}; log {log})")
+        outlook = job.outlook()
+        if code == LOST:
+            self._losses[job.id, outlook.text] += 1
+            if self._losses[job.id, outlook.text] < MAX_LOSSES:
+                self._bars.say(f"lost with its machine {running.process.where}, goes on elsewhere: {job.id}")
+                self._waiting.appendleft(job)
+                return
+            why = f"lost {MAX_LOSSES} machines without progress, the last was {running.process.where}"
+        elif code == 0 and (outlook.next is None or outlook.next.step != running.command.step):
+            self._waiting.appendleft(job)
+            return
+        else:
+            why = f"exit code {code}" if code else f"it ended as if all were done, but {outlook.next} is left"
+        log = inventory.log_file(job.results, job.id)
+        self._failed.append(job)
+        self._end(job, f"FAILED ({running.command.step}: {why}; log {log})")
         for line in inventory.last_words(log):
             self._bars.say(f"    {line}")
 
@@ -146,16 +152,18 @@ class Schedule:
         for one in self._running:
             step, total = one.command.step, one.command.total
             done = one.job.done_count(step)
-            shown.append(Bar(name=f"{step} {one.job.id}", done=done, total=total, unit=one.command.unit))
+            name = f"{step} {one.job.id}"
+            where = f"{name} on {one.process.where}" if one.process.where else name
+            shown.append(Bar(name=name, done=done, total=total, unit=one.command.unit, text=where))
         self._bars.show(shown)
 
     def stop(self) -> None:
         """Asks the running jobs to save themselves and waits for that."""
         self._bars.say(f"stopping: {len(self._running)} jobs save themselves; once more to end at once")
         for running in self._running:
-            running.stop()
+            running.process.stop()
         clock = AwakeClock(2 * POLL_S)
-        while any(running.poll() is None for running in self._running):
+        while any(running.process.poll() is None for running in self._running):
             if clock.look() > STOP_TIMEOUT_S:
                 self._bars.say(f"waited {STOP_TIMEOUT_S:.0f} s for jobs to save themselves; they are killed")
                 return
@@ -164,7 +172,7 @@ class Schedule:
     def kill(self) -> None:
         """Ends whatever still runs."""
         for running in self._running:
-            running.kill()
+            running.process.kill()
 
     def summary(self) -> int:
         """Says what is not done; returns the exit code."""

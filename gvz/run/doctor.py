@@ -4,6 +4,7 @@ The engine and jax are tried in sub-processes, because a broken one can end its 
 """
 
 import dataclasses
+import json
 import os
 import platform
 import re
@@ -11,7 +12,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
@@ -215,6 +216,20 @@ CHECKS: tuple[Callable[[], Finding], ...] = (
     check_video,
 )
 """each after those that it depends on"""
+
+
+def show(findings: Iterable[Finding], *, json_lines: bool) -> int:
+    """Prints findings as they come; returns the exit code: 1 if one is bad."""
+    bad = False
+    for finding in findings:
+        bad |= finding.state == "bad"
+        if json_lines:
+            print(json.dumps(dataclasses.asdict(finding)), flush=True)
+            continue
+        print(f"{finding.state:5} {finding.name:10} {finding.found}", flush=True)
+        if finding.remedy:
+            print(f"{'':16} -> {finding.remedy}")
+    return int(bad)
 
 
 def _try(name: str, code: str, remedy: str) -> Finding:

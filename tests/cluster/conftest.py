@@ -48,11 +48,16 @@ class RayCluster:
         self.address: str = self._answer()["address"]
 
     def tell(self, command: str) -> int:
-        """`kill` or `add`; returns the number of nodes."""
+        """A command of three_nodes.py; returns the number of nodes."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{command}\n")
         self._process.stdin.flush()
         return self._answer()["nodes"]
+
+    def kill_node_of(self, process: psutil.Process) -> None:
+        """Ends the node that a process runs on, and all that runs there, as a power cut would."""
+        (raylet,) = [parent for parent in process.parents() if parent.name() == "raylet"]
+        self.tell(f"kill {raylet.pid}")
 
     def run(self, *arguments: str, timeout_s: float = 240, **environment: str) -> subprocess.CompletedProcess[str]:
         """A command of gvz, on the head's machine."""

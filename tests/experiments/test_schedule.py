@@ -1,6 +1,7 @@
 """The scheduler with real processes: small Python programs in place of training."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -13,8 +14,9 @@ import pytest
 from gvz.core import records
 from gvz.core.errors import ConfigError
 from gvz.experiments import inventory as progress
-from gvz.experiments.jobs import Command, Outlook, RunningJob, Slot
-from gvz.experiments.schedule import gpus, make_slots, run_jobs
+from gvz.experiments.jobs import Command, Outlook
+from gvz.experiments.places import Machine, Slot, gpus, make_slots
+from gvz.experiments.schedule import run_jobs
 
 CORES = tuple(sorted(os.sched_getaffinity(0)))
 SLOT = Slot(cores=CORES, environment={})
@@ -60,7 +62,7 @@ def test_jobs_are_done_command_by_command_and_done_ones_are_left_alone(tmp_path,
     two = Program(id="two", results=tmp_path, first="print('one')", second="print('two')")
     done = Program(id="done", results=tmp_path, first="raise SystemExit(9)")
     done.file.write_text("first done")
-    assert run_jobs([two, done], [SLOT]) == 0
+    assert run_jobs([two, done], Machine([SLOT])) == 0
     assert two.file.read_text() == "first done second done "
     assert log(two).count("# ended with exit code 0") == 2
     assert not progress.log_file(tmp_path, "done").exists()
@@ -72,7 +74,7 @@ def test_a_failure_sinks_no_other_job_and_is_named_with_its_log(tmp_path, capsys
     liar = Program(id="liar", results=tmp_path, first="import os; os._exit(0)")
     killed = Program(id="killed", results=tmp_path, first="import os; os.kill(os.getpid(), 9)")
     good = Program(id="good", results=tmp_path)
-    assert run_jobs([bad, liar, killed, good], make_slots(2, CORES, ())) == 1
+    assert run_jobs([bad, liar, killed, good], Machine(make_slots(2, CORES, ()))) == 1
     assert good.file.exists()
     err = capsys.readouterr().err
     assert f"FAILED (first: exit code 3; log {tmp_path}/logs/bad/one.log): bad/one" in err
@@ -86,7 +88,8 @@ def test_a_failure_sinks_no_other_job_and_is_named_with_its_log(tmp_path, capsys
 def test_a_job_stays_on_its_cores_and_has_its_slot_s_environment(tmp_path):
     shown = "import os; print(sorted(os.sched_getaffinity(0)), os.environ['CUDA_VISIBLE_DEVICES'])"
     job = Program(id="shown", results=tmp_path, first=shown)
-    assert run_jobs([job], [Slot(cores=CORES[:1], environment={"CUDA_VISIBLE_DEVICES": "7"})]) == 0
+    slot = Slot(cores=CORES[:1], environment={"CUDA_VISIBLE_DEVICES": "7"})
+    assert run_jobs([job], Machine([slot])) == 0
     assert f"[{CORES[0]}] 7" in log(job)
 
 
@@ -95,11 +98,12 @@ def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, capsys, monkey
     job = Program(id="held", results=tmp_path, first="import time; time.sleep(60)")
     command = job.outlook().next
     assert command is not None
-    holder = RunningJob.start(job, command, SLOT)
+    file = progress.log_file(job.results, job.id)
+    holder = Machine([SLOT]).start(file, command)
     assert holder is not None
     try:
-        assert RunningJob.start(job, command, SLOT) is None
-        assert run_jobs([job, Program(id="free", results=tmp_path)], [SLOT]) == 1
+        assert Machine([SLOT]).start(file, command) is None
+        assert run_jobs([job, Program(id="free", results=tmp_path)], Machine([SLOT])) == 1
     finally:
         holder.kill()
     assert "left alone: held, which another process runs" in capsys.readouterr().err
@@ -110,7 +114,7 @@ RUNNER = """
 import sys
 from pathlib import Path
 sys.path.insert(0, {directory!r})
-from test_schedule import SLOT, Program
+from test_schedule import SLOT, Machine, Program
 from gvz.experiments.schedule import run_jobs
 code = '''
 import os, pathlib, signal, sys, time
@@ -121,7 +125,7 @@ signal.signal(signal.SIGINT, saved); signal.signal(signal.SIGTERM, saved)
 pathlib.Path({pid!r} + ".new").write_text(str(os.getpid())); os.rename({pid!r} + ".new", {pid!r})
 time.sleep(100)
 '''
-sys.exit(run_jobs([Program(id="slow", results=Path({results!r}), first=code)], [SLOT]))
+sys.exit(run_jobs([Program(id="slow", results=Path({results!r}), first=code)], Machine([SLOT])))
 """
 
 
@@ -142,6 +146,34 @@ def test_a_signal_reaches_the_jobs_which_save_and_none_is_left(tmp_path, number,
         assert time.monotonic() < deadline, "the job holds its log still"
         time.sleep(0.05)
     assert progress.job_state(tmp_path, "slow", done=False, begun=True) == "stopped"
+
+
+QUEUE = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {directory!r})
+from test_schedule import SLOT, Machine, Program
+from gvz.experiments.schedule import run_jobs
+code = "import os, pathlib, time; pathlib.Path({results!r}, 'played').open('a').write('%s '); time.sleep(0.3)"
+jobs = [Program(id=f"job{{n}}", results=Path({results!r}), first=code % n, second="pass") for n in range(12)]
+sys.exit(run_jobs(jobs, Machine([SLOT])))
+"""
+
+
+def test_two_commands_in_one_directory_are_one_queue(tmp_path):
+    text = QUEUE.format(directory=str(Path(__file__).parent), results=str(tmp_path))
+    runners = [subprocess.Popen([sys.executable, "-c", text], stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    try:
+        said = [runner.communicate(timeout=120)[1] for runner in runners]
+    finally:
+        for runner in runners:
+            runner.kill()
+    assert [runner.returncode for runner in runners] == [0, 0], said
+    assert sorted((tmp_path / "played").read_text().split()) == sorted(str(n) for n in range(12)), "each job once"
+    begun = [set(re.findall(r"first: job(\d+)", text)) for text in said]
+    assert begun[0]
+    assert begun[1]
+    assert not begun[0] & begun[1]
 
 
 @pytest.mark.parametrize(

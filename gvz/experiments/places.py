@@ -1,0 +1,108 @@
+"""Where jobs run: shares of this machine's cores and GPUs. `gvz/cluster/jobs.py` has those of a cluster."""
+
+import os
+import shutil
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from gvz.core.errors import ConfigError
+from gvz.experiments.jobs import Command
+from gvz.experiments.process import LocalProcess, Process
+
+
+class Places(Protocol):
+    """Something that commands of jobs run on."""
+
+    settle_s: float
+    """how old a directory's contents may be here after a command has written to it there, seconds"""
+
+    def room(self, step: str | None = None) -> bool:
+        """Whether a command of this step (of any, if None) can start now.
+
+        Raises:
+            GvzError: none ever will.
+        """
+        ...
+
+    def start(self, log: Path, command: Command) -> Process | None:
+        """Starts a command; None if another process runs the job of this log."""
+        ...
+
+    def end(self, process: Process) -> None:
+        """Takes back the share of a process that has ended."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Slot:
+    """A share of the machine, for one job at a time."""
+
+    cores: tuple[int, ...]
+    environment: dict[str, str]
+    """added to ours: which GPU, how much of its memory"""
+
+
+class Machine:
+    """This machine, divided into slots."""
+
+    settle_s = 0.0
+
+    def __init__(self, slots: Sequence[Slot]):
+        self._free = list(slots)
+        self._used: dict[Process, Slot] = {}
+
+    def room(self, step: str | None = None) -> bool:
+        """Whether a slot is free."""
+        return bool(self._free)
+
+    def start(self, log: Path, command: Command) -> Process | None:
+        """Starts a command in a free slot; None if another process runs the job of this log."""
+        slot = self._free[0]
+        process = LocalProcess.start(log, command.arguments, slot.cores, {**os.environ, **slot.environment})
+        if process is not None:
+            self._used[process] = self._free.pop(0)
+        return process
+
+    def end(self, process: Process) -> None:
+        """Its slot is free again."""
+        self._free.append(self._used.pop(process))
+
+
+def gpus() -> tuple[str, ...]:
+    """Ids for CUDA_VISIBLE_DEVICES of the GPUs that are there and not hidden."""
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if visible is not None:
+        return tuple(id for id in visible.split(",") if id and id != "-1")
+    if shutil.which("nvidia-smi") is None:
+        return ()
+    listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, timeout=60, check=False).stdout
+    return tuple(str(n) for n, line in enumerate(listed.splitlines()) if line.startswith("GPU "))
+
+
+def make_slots(jobs: int | None, cores: Sequence[int], devices: Sequence[str]) -> tuple[Slot, ...]:
+    """Shares of these cores and GPUs for so many jobs at once; None: one a GPU, or without one a pair of cores.
+
+    Raises:
+        ConfigError: fewer than one job.
+    """
+    if jobs is None:
+        jobs = min(len(devices), len(cores)) if devices else max(1, len(cores) // 2)
+    if jobs < 1:
+        raise ConfigError(f"--jobs: got {jobs}, want at least 1")
+    slots = []
+    for n in range(jobs):
+        share = tuple(cores[n::jobs]) or (cores[n % len(cores)],)
+        environment = {}
+        if devices:
+            environment["CUDA_VISIBLE_DEVICES"] = devices[n % len(devices)]
+            environment |= memory_share(-(-jobs // len(devices)))
+        slots.append(Slot(cores=share, environment=environment))
+    return tuple(slots)
+
+
+def memory_share(jobs: float) -> dict[str, str]:
+    """What tells JAX its part of a GPU's memory when so many jobs use the GPU together."""
+    return {"XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.9 / jobs:.3f}"} if jobs > 1 else {}

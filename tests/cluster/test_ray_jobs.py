@@ -1,0 +1,219 @@
+"""Experiments on a cluster of three nodes: the real command, a node that loses its power, Ctrl-C, and bad input."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+
+from gvz.cluster.job_host import hold_cores
+from gvz.cluster.ray_jobs import Share
+from gvz.core import records
+from gvz.core.errors import ConfigError
+from gvz.experiments import inventory
+from gvz.experiments.jobs import PlayerJob
+from gvz.experiments.plan import read_plan
+
+pytestmark = pytest.mark.xdist_group("ray")
+RUN = "rainbow_4task/defend_the_center/train4/seed_1111"
+DRIVER = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {directory!r})
+from test_schedule import Program
+from gvz.cluster.ray_jobs import open_places
+from gvz.experiments.schedule import run_jobs
+results = Path({results!r})
+with open_places({address!r}, results, 1, None, None) as places:
+    sys.exit(run_jobs([Program(id=f"job{{n}}", results=results, first={code!r}) for n in range({count})], places))
+"""
+SHOW = """
+import json, os, pathlib, time
+shown = [sorted(os.sched_getaffinity(0)), [n for n in os.environ if n.startswith(("RAY_", "OMP_"))]]
+print(json.dumps([*shown, os.environ["CUDA_VISIBLE_DEVICES"]]))
+here = pathlib.Path({results!r}, f"at-{{os.getpid()}}")
+here.touch()
+while len(list(here.parent.glob("at-*"))) < 2:  # until a second job runs beside it
+    time.sleep(0.05)
+"""
+SAVE = """
+import os, pathlib, signal, sys, time
+here = pathlib.Path({results!r}, str(os.getpid()))
+def saved(number, _):
+    here.with_suffix(".saved").write_text(str(number))
+    sys.exit(128 + number)
+signal.signal(signal.SIGINT, saved); signal.signal(signal.SIGTERM, saved)
+here.with_suffix(".begun").touch()
+time.sleep(200)
+"""
+
+
+def begin(cluster, results: Path, code: str, count: int) -> subprocess.Popen[str]:
+    programs = str(Path(__file__).parents[1] / "experiments")
+    shown = {"directory": programs, "results": str(results), "address": cluster.address, "count": count}
+    text = DRIVER.format(code=code.format(results=str(results)), **shown)
+    command = [sys.executable, "-c", text]
+    return subprocess.Popen(command, env=cluster.environment, stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+
+def wait_until(true: Callable[[], bool], driver: subprocess.Popen[str]) -> None:
+    deadline_s = time.monotonic() + 150
+    while not true():
+        assert driver.poll() is None, driver.communicate()[1]
+        assert time.monotonic() < deadline_s
+        time.sleep(0.05)
+
+
+def all_done(driver: subprocess.Popen[str]) -> str:
+    """What it has said; kills it where it is stuck."""
+    try:
+        return driver.communicate(timeout=150)[1]
+    finally:
+        driver.kill()
+
+
+@pytest.mark.e2e
+def test_jobs_spread_over_the_nodes_each_on_a_core_of_its_own_and_know_nothing_of_ray(cluster, tmp_path):
+    driver = begin(cluster, tmp_path, SHOW, 2)
+    said = all_done(driver)
+    assert driver.returncode == 0, said
+    assert "done: job0" in said
+    assert "done: job1" in said
+    logs = [inventory.log_file(tmp_path, f"job{n}").read_text().splitlines() for n in range(2)]
+    shown = [json.loads(line) for log in logs for line in log if line.startswith("[[")]
+    assert [(rays, devices) for _, rays, devices in shown] == [([], ""), ([], "")]
+    if len(os.sched_getaffinity(0)) > 1:
+        (first, _, _), (second, _, _) = shown
+        assert len(first) == len(second) == 1
+        assert first != second
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize(("number", "code", "job_sees"), [(signal.SIGINT, 130, "2"), (signal.SIGKILL, -9, "15")])
+def test_a_signal_reaches_the_jobs_which_save_and_none_is_left(cluster, tmp_path, number, code, job_sees):
+    driver = begin(cluster, tmp_path, SAVE, 3)
+    try:
+        wait_until(lambda: len(list(tmp_path.glob("*.begun"))) == 2, driver)
+        jobs = [psutil.Process(int(file.stem)) for file in tmp_path.glob("*.begun")]
+        os.killpg(driver.pid, number)
+        said = driver.communicate(timeout=100)[1]
+    finally:
+        driver.kill()
+    assert driver.returncode == code, said
+    assert not psutil.wait_procs(jobs, timeout=60)[1]
+    assert [file.read_text() for file in tmp_path.glob("*.saved")] == [job_sees] * 2
+
+
+@pytest.mark.e2e
+@pytest.mark.engine
+@pytest.mark.parametrize("to_its_end", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_run_whose_node_loses_its_power_goes_on_elsewhere_from_its_checkpoint(cluster, tmp_path, to_its_end):
+    results = tmp_path / "results"
+    flags = ("--results", str(results), "--scale", "0.001", "--cluster", cluster.address, "--job-cores", "1")
+    command = [sys.executable, "-m", "gvz.cli", "experiment", "run", "rainbow_evaluation", *flags]
+    driver = subprocess.Popen(command, env=cluster.environment, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    log, directory = inventory.log_file(results, RUN), results / "runs" / RUN
+    try:
+        wait_until((directory / "checkpoints" / "100").exists, driver)
+        at_work = [p for p in psutil.process_iter() if str(directory) in cmdline(p) and "gvz.launch" in cmdline(p)]
+        cluster.kill_node_of(at_work[0])
+        cluster.tell("add")
+        wait_until(lambda: "goes on from update 100" in log.read_text(), driver)
+        plan = read_plan(results)
+        assert plan is not None
+        random_player = PlayerJob(results=results, player="random", evaluation=plan.players()["random"])
+        wait_until(lambda: random_player.outlook().next is None, driver)
+        if not to_its_end:
+            driver.send_signal(signal.SIGINT)
+        said = driver.communicate(timeout=250)[1]
+    finally:
+        driver.kill()
+    assert driver.returncode == (0 if to_its_end else 130), said
+    assert "lost with its machine" in said
+    assert list((directory / "checkpoints").iterdir())
+    assert not records.is_locked(log)
+    if to_its_end:
+        assert f"done: {RUN}" in said
+        assert "done: players/random" in said
+        (run,) = plan.runs()
+        rows = [json.loads(line) for line in (directory / "evaluation.jsonl").read_text().splitlines()]
+        played = [(row["num_updates"], row["task"], row["episode"]) for row in rows]
+        tasks = plan.evaluations()[run.id].tasks
+        assert sorted(played) == sorted((c, t, n) for c in run.checkpoints for t in tasks for n in range(2))
+
+
+@pytest.mark.e2e
+def test_a_cluster_that_a_job_does_not_fit_on_is_refused(cluster, tmp_path):
+    flags = ("--results", str(tmp_path / "results"), "--scale", "0.001", "--cluster", cluster.address)
+    done = cluster.run("experiment", "run", "rainbow_evaluation", *flags)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "no node has 2 cores and 0 GPUs for a job; lower --job-cores" in done.stderr
+    assert not (tmp_path / "results" / "plan.json").exists()
+
+
+def cmdline(process: psutil.Process) -> list[str]:
+    try:
+        return process.cmdline()
+    except psutil.Error:
+        return []
+
+
+@pytest.mark.parametrize(
+    ("cores", "gpus", "step", "fits"),
+    [
+        *[(2, 0.0, "train", 8), (2, 1.0, "train", 4), (2, 0.3, "train", 8), (1, 0.5, "train", 8), (1, 0.4, "train", 8)],
+        *[(2, 2.0, "train", 2), (2, 1.0, "evaluate", 8), (2, 1.0, None, 8), (17, 0.0, "train", 0)],
+    ],
+)
+def test_shares_of_a_node_with_16_cores_and_4_gpus(cores, gpus, step, fits):
+    assert Share(cores=cores, gpus=gpus).fits(16.0, 4.0, step) == fits
+
+
+@pytest.mark.parametrize(
+    ("flags", "text"),
+    [
+        (["--job-cores", "0", "--cluster", "10.0.0.1:1"], "--job-cores: got 0, want at least 1"),
+        (
+            ["--job-gpus", "1.5", "--cluster", "10.0.0.1:1"],
+            "--job-gpus: got 1.5, want a part of one (0.5), or whole ones",
+        ),
+        (["--job-gpus", "1"], "--job-cores and --job-gpus are for a cluster (--cluster)"),
+        (["--cluster", "ray://10.0.0.1:1"], "Ray's client (ray://) is not enough"),
+    ],
+)
+def test_bad_flags_are_one_line(flags, text, tmp_path, capsys, monkeypatch):
+    from gvz import cli
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("RAY_AUTH_TOKEN", "0" * 32)
+    assert cli.main(["experiment", "run", "rainbow_evaluation", "--scale", "0.001", *flags]) == 2
+    err = capsys.readouterr().err
+    assert text in err
+    assert err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_core_has_one_holder_and_too_few_free_cores_are_none(monkeypatch, tmp_path):
+    tmp_path.chmod(0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    allowed = sorted(os.sched_getaffinity(0))
+    first, locks = hold_cores(1)
+    assert first == tuple(allowed[:1])
+    assert hold_cores(len(allowed)) == (tuple(allowed), [])
+    for lock in locks:
+        lock.close()
+    every, locks = hold_cores(len(allowed))
+    assert (every, len(locks)) == (tuple(allowed), len(allowed))
+    for lock in locks:
+        lock.close()
+
+
+def test_a_share_of_nothing_is_refused():
+    with pytest.raises(ConfigError, match="--job-gpus: got -1"):
+        Share(gpus=-1)
