@@ -1,6 +1,7 @@
 """What a pool of actors is: its configuration, its counters, and what every pool can do."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, Self
 
@@ -22,11 +23,15 @@ class PoolConfig(Play, frozen=True, kw_only=True):
     """What a pool plays; its actors' environments get `recycle_episodes`, too.
 
     Lane i is game i % games_per_actor of actor i // games_per_actor. It plays task i % T until
-    `Pool.assign` gives it another.
+    `Pool.assign` gives it another. A pool may have some of a run's actors only, if other machines have the others.
     """
 
     num_actors: int
     games_per_actor: int
+    first_actor: int = 0
+    """number of the pool's first actor in the run"""
+    run_actors: int | None = None
+    """actors of the whole run; default: the pool's"""
     actors: ActorsConfig
     cores: tuple[int | None, ...] = ()
     """the core of each actor and its engines (actors.placement), None: any; empty: any for all"""
@@ -34,19 +39,27 @@ class PoolConfig(Play, frozen=True, kw_only=True):
     """private directory for logs and the engines' files"""
 
     def __post_init__(self) -> None:
-        if self.num_lanes < len(self.tasks):
+        run_actors = self.num_actors if self.run_actors is None else self.run_actors
+        if run_actors * self.games_per_actor < len(self.tasks):
             raise ConfigError(
-                f"actors: got {self.num_actors} actors with {self.games_per_actor} games for {len(self.tasks)} tasks, "
+                f"actors: got {run_actors} actors with {self.games_per_actor} games for {len(self.tasks)} tasks, "
                 "want at least one game a task"
             )
         if self.cores and len(self.cores) != self.num_actors:
             raise ConfigError(f"actors: got cores {self.cores}, want one for each of {self.num_actors} actors, or none")
-        if self.num_lanes > MAX_LANES:
-            raise ConfigError(f"actors: got {self.num_lanes} games, want at most {MAX_LANES} (a lane is a u16)")
+        if run_actors * self.games_per_actor > MAX_LANES:
+            got = run_actors * self.games_per_actor
+            raise ConfigError(f"actors: got {got} games, want at most {MAX_LANES} (a lane is a u16)")
 
     @property
     def num_lanes(self) -> int:
         return self.num_actors * self.games_per_actor
+
+    @property
+    def lanes(self) -> range:
+        """The lanes that this pool plays, of all lanes of the run."""
+        first = self.first_actor * self.games_per_actor
+        return range(first, first + self.num_lanes)
 
     @property
     def ring_capacity(self) -> int:
@@ -73,8 +86,8 @@ class PoolConfig(Play, frozen=True, kw_only=True):
             specs.append(
                 ActorSpec(
                     **shared,
-                    actor=actor,
-                    lanes=list(range(self.num_lanes))[own],
+                    actor=self.first_actor + actor,
+                    lanes=list(self.lanes[own]),
                     lane_tasks=lanes.tasks[own],
                     first_episodes=lanes.next_episodes[own],
                     ring_capacity=self.ring_capacity,
@@ -99,12 +112,15 @@ class PoolStatistics:
     """seconds actors waited for the learner to read, summed over actors"""
     waited_for_records_s: float
     """seconds the learner waited in `drain`"""
+    more: Mapping[str, float] = field(default_factory=dict[str, float])
+    """further scalars of this kind of pool, by their name in the records"""
 
 
 class Pool(Protocol):
     """Games that are played: step records and messages come out, parameters and tasks of lanes go in.
 
-    `actors.process_pool.ProcessPool` plays in processes of its own, `actors.inline.InlinePool` in this one. All
+    `actors.process_pool.ProcessPool` plays in processes of its own, `actors.inline.InlinePool` in this one,
+    `gvz.cluster.pool.ClusterPool` on other machines. All
     watching happens in `poll`, which the learner calls in every round; a thread there is only to answer actors that ask
     for their actions. Use one as a context manager, or `close` it.
     """
@@ -180,7 +196,7 @@ def lanes_to_begin_with(config: PoolConfig, state: dict[str, Any] | None) -> Lan
         ResumeError: `state` is of another number of lanes.
     """
     if state is None:
-        tasks = [lane % len(config.tasks) for lane in range(config.num_lanes)]
+        tasks = [lane % len(config.tasks) for lane in config.lanes]
         return LaneState(next_episodes=[0] * config.num_lanes, tasks=tasks)
     lanes = LaneState(next_episodes=list(state["next_episodes"]), tasks=list(state["tasks"]))
     if len(lanes.next_episodes) != config.num_lanes or len(lanes.tasks) != config.num_lanes:

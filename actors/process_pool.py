@@ -85,8 +85,9 @@ class ProcessPool(Pool):
 
     def assign(self, lane: int, task: int) -> None:
         """As `Pool.assign`; a restarted actor begins the lane's next episode with this task."""
-        self._lanes.tasks[lane] = task
-        self._actors[lane // self._config.games_per_actor].assign(lane, task)
+        index = self._config.lanes.index(lane)
+        self._lanes.tasks[index] = task
+        self._actors[index // self._config.games_per_actor].assign(lane, task)
 
     def drain(self, max_records: int, wait_s: float = 0.0) -> list[StepBlock]:
         """As `Pool.drain`: an equal share from every actor as far as it has one. The time of waiting is counted."""

@@ -1,6 +1,7 @@
 """Builds the parts of a run from its configuration: sizes, agent, learner, pool. No loop, no lifetime."""
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -47,6 +48,10 @@ class RunParts:
         """Starts the games: new ones, or from what `Pool.state()` gave."""
         if config.mode == "sync":
             return InlinePool(self.pool_config, state)
+        if config.cluster.hosts:
+            from gvz.cluster.pool import cluster_pool  # needs the extra `cluster`
+
+            return cluster_pool(self.pool_config, config.cluster, state)
         on_device = config.actors.inference == "device"
         return ProcessPool(self.pool_config, state, partial(DevicePolicy, self.learner.agent) if on_device else None)
 
@@ -89,7 +94,8 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
     spec, params = agent.spec, jax.eval_shape(agent.init, jax.random.key(0))
     num_params = sum(leaf.size for leaf in jax.tree.leaves(params))
     _, extras = jax.eval_shape(agent.act, params, jax.random.key(0), spec.zeros(), jnp.float32(0))
-    cores = () if config.mode == "sync" else tuple(actor_cores(config.actors.placement, config.num_actors))
+    plays_here = config.mode == "async" and not config.cluster.hosts
+    cores = tuple(actor_cores(config.actors.placement, config.num_actors)) if plays_here else ()
     pool_config = PoolConfig(
         tasks=table.ids,
         num_actors=config.num_actors,
@@ -121,13 +127,25 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
             replay_on_host=jax.default_backend() == "cpu",
             num_devices=config.learner.devices,
             params_bytes=4 * num_params,
-            num_actors=0 if config.mode == "sync" else config.num_actors,
+            num_actors=config.num_actors if plays_here else 0,
             actors_ask=config.actors.inference == "device",
-            num_games=config.num_lanes,
-            transport_bytes=0 if config.mode == "sync" else pool_config.shared_memory_bytes(),
-            placement=in_words(cores),
+            num_games=0 if config.cluster.hosts else config.num_lanes,
+            transport_bytes=_transport_bytes(config, pool_config),
+            placement=in_words(cores) if not config.cluster.hosts else _on_hosts(config),
         ),
     )
+
+
+def _transport_bytes(config: RunConfig, pool: PoolConfig) -> int:
+    """What lies between the games and the learner in this machine's memory."""
+    if config.cluster.hosts:
+        batch = config.cluster.batch_records * (pool.record_dtype.itemsize + math.prod(pool.frame_shape))
+        return config.cluster.hosts * (config.cluster.credits + 1) * batch
+    return 0 if config.mode == "sync" else pool.shared_memory_bytes()
+
+
+def _on_hosts(config: RunConfig) -> str:
+    return f"on {config.cluster.hosts} hosts {config.num_actors} actors with {config.num_lanes} engines"
 
 
 def _off_policy(config: RunConfig, agent: Agent, pool: PoolConfig) -> OffPolicyParts:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from actors.config import MAX_LANES, ActorsConfig
+from gvz.cluster.config import ClusterConfig
 from gvz.core.env_config import EnvConfig, leaves
 from gvz.core.errors import ConfigError
 from gvz.run.curriculum_config import CurriculumConfig, check_curriculum
@@ -25,6 +26,8 @@ from learner.config import (
     change_agent,
 )
 
+MIN_CLUSTER_SLOTS = 128
+"""step records that a game has room for in the replay of a run with actor hosts"""
 _SPLITS: dict[int, Split] = {1: "train1", 4: "train4", 8: "train8"}
 
 
@@ -81,6 +84,7 @@ class RunConfig:
     """where the run is kept; default runs/<name>/seed_<seed>"""
     env: EnvConfig = field(default_factory=EnvConfig)
     actors: ActorsConfig = field(default_factory=ActorsConfig)
+    cluster: ClusterConfig = field(default_factory=ClusterConfig)
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     agent: AgentConfig = field(default_factory=RainbowConfig)
     replay: ReplayConfig | None = field(default_factory=ReplayConfig)
@@ -110,6 +114,8 @@ class RunConfig:
                 'actors.inference: got "device" with mode "sync", where one process plays and learns in turn; '
                 'want "actors", or mode "async"'
             )
+        if self.cluster.hosts:
+            self._check_cluster()
         check_curriculum(self.curriculum, self.table)
         if self.num_lanes > MAX_LANES:
             raise ConfigError(
@@ -120,6 +126,16 @@ class RunConfig:
             self._check_rollouts()
         else:
             self._check_replay(*off_policy(self))
+
+    def _check_cluster(self) -> None:
+        for name, got, want in (("mode", self.mode, "async"), ("actors.inference", self.actors.inference, "actors")):
+            if got != want:
+                raise ConfigError(f'{name}: got "{got}" with cluster.hosts {self.cluster.hosts}; want "{want}"')
+        if self.replay is not None and self.replay.capacity < (least := MIN_CLUSTER_SLOTS * self.num_lanes):
+            raise ConfigError(
+                f"replay.capacity: got {self.replay.capacity}, want at least {least} with cluster.hosts, which is "
+                f"{MIN_CLUSTER_SLOTS} for each of {self.num_lanes} games: records of a host come in batches"
+            )
 
     def _check_rollouts(self) -> None:
         learner = self.learner
@@ -209,11 +225,12 @@ class RunConfig:
 
     @property
     def num_actors(self) -> int:
-        """Actor processes, one per core by default. In sync mode 1: all games are played in one place."""
-        return 1 if self.mode == "sync" else self._configured_actors
+        """Actor processes of the run, on all hosts. In sync mode 1: all games are played in one place."""
+        return 1 if self.mode == "sync" else self.actors_per_host * max(1, self.cluster.hosts)
 
     @property
-    def _configured_actors(self) -> int:
+    def actors_per_host(self) -> int:
+        """Actor processes of a machine that plays, one per core by default: of this machine's cores."""
         if self.actors.num_actors is not None:
             return self.actors.num_actors
         # a synchronous run must not depend on the machine it is on
@@ -222,7 +239,8 @@ class RunConfig:
     @property
     def games_per_actor(self) -> int:
         """Games of one actor process; in sync mode all games of the run."""
-        num_tasks, actors, games = len(self.table), self._configured_actors, self.actors.games_per_actor
+        num_tasks, games = len(self.table), self.actors.games_per_actor
+        actors = self.actors_per_host * max(1, self.cluster.hosts)
         if games is None:
             games = num_tasks * math.ceil(4 / num_tasks)
         if games * actors < num_tasks and self.curriculum.kind == "fixed":

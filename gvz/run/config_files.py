@@ -82,7 +82,7 @@ def config_to_dict(config: RunConfig) -> dict[str, Any]:
         "config": plain(config),
         "resolved": {
             "tasks": list(config.table.ids),
-            "num_actors": config.num_actors,
+            "num_actors": config.num_actors // max(1, config.cluster.hosts),
             "games_per_actor": config.games_per_actor,
             "support": config.support,
         },

@@ -102,6 +102,7 @@ class Monitor:
             "actors/staleness_max_versions": staleness.max,
             "run/processor_s": counts.processor_s,
             "replay/fill_share": min(1.0, counts.records / self._num_slots),
+            **statistics.more,
         }
 
     def _status(self, row: Mapping[str, float]) -> Status:
@@ -127,7 +128,9 @@ def _expected(config: RunConfig, parts: RunParts) -> Expected:
     tasks, learner = parts.table.ids, config.learner
     v_min, v_max = config.support or parts.table.return_range
     ahead = 2 * learner.step_tolerance if isinstance(learner, LearnerConfig) else 0
-    waiting = config.num_actors * parts.pool_config.ring_capacity + ahead
+    cluster = config.cluster
+    under_way = cluster.hosts * (cluster.credits + 1) * cluster.batch_records
+    waiting = config.num_actors * parts.pool_config.ring_capacity + under_way + ahead
     played = Counter(tasks[lane % len(tasks)] for lane in range(config.num_lanes))
     return Expected(
         games={task: played[task] for task in tasks} if config.curriculum.kind == "fixed" else {},

@@ -21,6 +21,7 @@ _MAY_CHANGE = (
     "learner.num_updates_per_call",
     "learner.devices",
     "agent.conv_form",
+    "cluster.*",
     "checkpoint.*",
     "log.*",
 )

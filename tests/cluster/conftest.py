@@ -14,6 +14,8 @@ from typing import Any
 import psutil
 import pytest
 
+FAKE_GAMES = Path(__file__).parents[1] / "actors"
+sys.path.append(str(FAKE_GAMES))
 SCRIPT = Path(__file__).with_name("three_nodes.py")
 QUICK_DEATHS = {
     "RAY_health_check_initial_delay_ms": "1000",

@@ -1,6 +1,7 @@
-"""Fuzz targets: what comes from another process. Control messages and their channel, rings, the parameter queue.
+"""Fuzz targets: what comes from another process. Control messages and their channel, rings, the parameter queue, and
+batches from other machines.
 
-Imports gvz.transport, learner for rings. Segments are real ones; then their bytes are overwritten.
+Imports gvz.transport, gvz.cluster.wire, learner for rings. Segments are real ones; then their bytes are overwritten.
 """
 
 import contextlib
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gvz.cluster import wire
 from gvz.core.errors import TransportError, WaitTimeoutError
 from gvz.transport import broadcast
 from gvz.transport.broadcast import BroadcastReader, BroadcastWriter
@@ -28,10 +30,12 @@ from gvz.transport.messages import (
     Ready,
     Render,
     Screens,
+    StepBlock,
     Stop,
     VectorSpec,
     decode,
     encode,
+    step_dtype,
 )
 from gvz.transport.ring import RingReader, WriterState
 from gvz.transport.segment import HEADER_BYTES, Segment
@@ -124,6 +128,27 @@ def message(_directory: Path) -> Target:
         b"\x91" * 600,
     ]
     return Target(run=run, seeds=[encode(one) for one in MESSAGES], words=words + odd)
+
+
+def batch(_directory: Path) -> Target:
+    """A batch of step records from a host of a cluster."""
+    steps = np.zeros(5, step_dtype(1))
+    steps["lane"] = [0, 0, 1, 1, 3]
+    blocks = [StepBlock(steps, np.arange(20, dtype=np.uint8).reshape(5, *FRAME_SHAPE))]
+    header = wire.BatchHeader(run_id="r", host=1, incarnation=2, number=3)
+
+    def run(data: bytes) -> bool:
+        try:
+            taken = wire.unpack(data, steps.dtype, FRAME_SHAPE, 64)
+        except TransportError:
+            return False
+        assert taken.block.frames.shape == (len(taken), *FRAME_SHAPE)
+        assert taken.block.steps.shape == (len(taken),) <= (64,)
+        return True
+
+    seeds = [wire.pack(header, MESSAGES[:3], blocks, compress=compress) for compress in (True, False)]
+    names = [bytes([0xA0 + len(name)]) + name.encode() for name in wire.BatchHeader.__struct_fields__]
+    return Target(run=run, seeds=[*seeds, wire.pack(header, [], [], compress=True)], words=WORDS + names)
 
 
 def channel(_directory: Path) -> Target:

@@ -10,7 +10,7 @@ TARGETS = {
     for module, names in {
         "maps": "wad udmf texture_lump decorate acs",
         "names": "task_name command_line config_name checkpoint_choice",
-        "peers": "message channel ring parameter_queue segment_header",
+        "peers": "message channel batch ring parameter_queue segment_header",
         "files": "saved_config records evaluation_records run_directory plan janitor_record",
         "checkpoints": "checkpoint_manifest checkpoint_files",
     }.items()

@@ -1,0 +1,54 @@
+"""Configuration of actor hosts."""
+
+from dataclasses import dataclass
+
+from gvz.core.errors import ConfigError
+
+MAX_HOSTS = 64
+"""of one learner; beyond some sixteen, several learners are faster (docs/CLUSTER.md)"""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ClusterConfig:
+    """Machines of a Ray cluster that play for this run. Times in seconds, sizes in step records."""
+
+    address: str | None = None
+    """HOST:PORT of the cluster's head; default: this machine plays, without a cluster"""
+    hosts: int = 0
+    """machines that play, each with actors.num_actors actors of actors.games_per_actor games; 0: this one alone"""
+    min_hosts: int = 1
+    """with fewer hosts that play, for patience_s, the run writes a checkpoint and ends with exit code 1"""
+    cpus_per_host: int | None = None
+    """cores that Ray reserves for a host; default one an actor"""
+    credits: int = 2
+    """batches of a host that may be under way or wait for the learner; more hide a slow network, and make records
+    older"""
+    batch_records: int = 512
+    """step records of a batch; a host that plays slowly sends fewer"""
+    compress: bool = True
+    """send frames compressed (zstd, level 1): a third of the bytes or less, for some 70 microseconds of processor time
+    a frame of 84x84x3"""
+    publish_period_s: float = 1.0
+    """parameters go to the hosts at most this often"""
+    silence_timeout_s: float = 30.0
+    """a host that gives no answer for this time is replaced"""
+    patience_s: float = 600.0
+    """time that a run goes on with fewer than min_hosts hosts"""
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("hosts", 0, MAX_HOSTS),
+            ("min_hosts", 1, max(1, self.hosts)),
+            ("cpus_per_host", 0, 2**16),
+            ("credits", 1, 64),
+            ("batch_records", 1, 2**16),
+        ):
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise ConfigError(f"cluster.{name}: got {value}, want {low}..{high}")
+        for name, low in (("publish_period_s", 0.0), ("silence_timeout_s", 3.0), ("patience_s", 0.0)):
+            if not getattr(self, name) >= low:
+                raise ConfigError(f"cluster.{name}: got {getattr(self, name)}, want at least {low:g} seconds")
+        if (self.address is None) != (self.hosts == 0):
+            given, missing = ("hosts", "address") if self.hosts else ("address", "hosts")
+            raise ConfigError(f"cluster.{given}: got {getattr(self, given)!r} without cluster.{missing}; give both")

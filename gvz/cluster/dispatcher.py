@@ -1,0 +1,395 @@
+"""The thread that speaks with the hosts: starts them, asks for batches, gives parameters, replaces what fails.
+
+It alone uses the cluster, so that nothing of it can hold up or end the learner: what fails there is a fault of a host.
+Batches are asked for under credits. A credit is free again when the learner has taken the batch, so its rate limiter
+holds back the hosts, and these their actors.
+"""
+
+import contextlib
+import secrets
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gvz.cluster.backend import Backend, Call, HostError, Machine
+from gvz.cluster.config import ClusterConfig
+from gvz.cluster.hello import Hello, differences
+from gvz.cluster.supervised import Incarnation, SupervisedHost
+from gvz.cluster.wire import Batch, read_header, unpack
+from gvz.core.errors import ConfigError, TransportError, WorkerError
+from gvz.core.watchdog import AwakeClock
+from gvz.transport.messages import Fault, Message, ParamsHeader, StepBlock
+
+_WAIT_S = 0.02
+"""longest wait for an answer before the credits are looked at again"""
+_LONGEST_PAUSE_S = 1.0
+"""most of a round that counts as a host's silence"""
+MAX_FAILED_STARTS = 3
+"""hosts in a row that did not come to play on a machine; then it is set aside"""
+_KEPT_VERSIONS = 1000
+
+
+@dataclass(kw_only=True, slots=True)
+class Inbox:
+    """What the dispatcher has for the learner's thread; both hold `changed` when they touch it."""
+
+    changed: threading.Condition = field(default_factory=threading.Condition)
+    batches: deque[tuple[SupervisedHost, StepBlock]] = field(default_factory=deque[tuple[SupervisedHost, StepBlock]])
+    """what the learner has not taken, in the order it came"""
+    messages: list[Message] = field(default_factory=list[Message])
+    failure: Exception | None = None
+    counts: Counter[str] = field(default_factory=Counter[str])
+    """received_bytes, dropped_records, cut_episodes, host_restarts"""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Asked:
+    """Whom a call was for, and what is done with its answer."""
+
+    host: SupervisedHost
+    life: Incarnation
+    answer: Callable[[SupervisedHost, Incarnation, Any], None]
+
+
+class Dispatcher:
+    """See the module. `begin`, then `start` the thread; `stop` it before the backend is closed."""
+
+    def __init__(self, backend: Backend, hosts: Sequence[SupervisedHost], config: ClusterConfig, ours: Hello):
+        """`ours` is what the learner's machine says of itself."""
+        self.inbox = Inbox()
+        self._backend, self._hosts, self._config, self._ours = backend, hosts, config, ours
+        self._run_id = secrets.token_hex(8)
+        self._calls: dict[Call, _Asked] = {}
+        self._failed_on: Counter[str] = Counter()
+        self._set_aside: set[str] = set()
+        self._forced: set[str] = set()  # machines on which a host was ended by force
+        self._clock = AwakeClock(_LONGEST_PAUSE_S)
+        self._enough_s = 0.0  # when enough hosts played last
+        self._last_failure = "none has been started"
+        self._published: tuple[ArrayLike, ParamsHeader] | None = None
+        self._published_s: dict[int, float] = {}
+        self._sent: tuple[Any, ParamsHeader] | None = None
+        self._sent_s = 0.0
+        self._stopping = False
+        self._greeting = True  # before the run: what differs ends it
+        self._thread = threading.Thread(target=self._run, name="gvz-cluster", daemon=True)
+
+    def begin(self, timeout_s: float) -> None:
+        """Waits until every host plays, or has failed to for good.
+
+        Raises:
+            ConfigError: a machine differs from this one, or has no room; fewer than `min_hosts` hosts came to play.
+        """
+        self._check_room()
+        start_s = time.monotonic()
+        while not all(host.is_playing or self._gave_up(host) for host in self._hosts):
+            if time.monotonic() - start_s > timeout_s:
+                break
+            self._round()
+        if (playing := self.num_playing) < self._config.min_hosts:
+            raise ConfigError(
+                f"cluster.hosts: {playing} of {len(self._hosts)} hosts came to play within {timeout_s:.0f} s, want "
+                f"at least cluster.min_hosts {self._config.min_hosts}; the last to fail: {self._last_failure}"
+            )
+        self._greeting = False
+
+    def start(self) -> None:
+        """From now on the thread does the rounds."""
+        self._enough_s = self._clock.look()
+        self._thread.start()
+
+    def stop(self, timeout_s: float) -> None:
+        """Ends the thread, or leaves it behind if the cluster holds it."""
+        self._stopping = True
+        if self._thread.ident is not None:
+            self._thread.join(timeout_s)
+
+    def end_hosts(self, grace_s: float) -> None:
+        """Ends every host, those that do not end in time by force, and cleans the machines where that was done."""
+        lives = [host.incarnation for host in self._hosts if host.incarnation is not None]
+        with contextlib.suppress(HostError):
+            closing = {life.remote.close(2 * grace_s): life for life in lives if life.playing_s and grace_s > 0.0}
+            ended = [call for call in self._wait_for_all(list(closing), 3 * grace_s) if self._backend.result(call)]
+            for life in lives:
+                life.remote.kill()
+            self._forced |= {life.machine for call, life in closing.items() if call not in ended}
+            if grace_s > 0.0:
+                self._wait_for_all([self._backend.clean(machine) for machine in sorted(self._forced)], 3 * grace_s)
+
+    def publish(self, params: ArrayLike, header: ParamsHeader) -> None:
+        """Newest parameters; they go out with the next round that may send some."""
+        self._published_s[header.version] = time.monotonic()
+        self._published = params, header
+
+    @property
+    def num_playing(self) -> int:
+        return sum(host.is_playing for host in self._hosts)
+
+    def _run(self) -> None:
+        try:
+            while not self._stopping:
+                self._round()
+                self._watch()
+        except WorkerError as error:
+            with self.inbox.changed:
+                self.inbox.failure = error
+        except Exception as error:  # the boundary of the thread: the learner saves and ends
+            failure = WorkerError(f"hosts: the thread that speaks with them failed: {type(error).__name__}: {error}")
+            failure.__cause__ = error
+            with self.inbox.changed:
+                self.inbox.failure = failure
+
+    def _round(self) -> None:
+        self._clock.look()
+        for host in self._hosts:
+            if host.incarnation is None:
+                self._start(host)
+            elif host.is_playing:
+                self._ask(host)
+        self._put_params()
+        self._receive()
+        for host in self._hosts:
+            self._check_silence(host)
+
+    # ------------------------------------------------------------------------------------------- starting
+
+    def _start(self, host: SupervisedHost) -> None:
+        if self._clock.now_s < host.start_at_s or (machine := self._choose(host)) is None:
+            return
+        try:
+            remote = self._backend.start(machine.id, self._cpus(host))
+            number, host.num_lives = host.num_lives, host.num_lives + 1
+            now_s = self._clock.now_s
+            life = host.incarnation = Incarnation(
+                number=number,
+                machine=machine.id,
+                name=machine.name,
+                remote=remote,
+                first_episodes=list(host.lanes.next_episodes),
+                began_s=now_s,
+                heard_s=now_s,
+            )
+            self._call(host, life, remote.greet(host.pool), self._greeted)
+        except HostError as error:
+            host.start_at_s = self._clock.now_s + 1.0
+            self._last_failure = f"{machine.name}: {error}"
+
+    def _greeted(self, host: SupervisedHost, life: Incarnation, answer: Any) -> None:
+        theirs = msgspec.msgpack.decode(answer, type=Hello)
+        problem = theirs.refusal
+        if differing := differences(self._ours, theirs):
+            problem = f"{differing[0]}; install the same on every node"
+        if problem and self._greeting:
+            raise ConfigError(f"cluster node {life.name}: {problem}")
+        if problem:
+            raise TransportError(problem)
+        with self.inbox.changed:
+            spec = host.spec(self._run_id, life.number)
+            life.first_episodes = list(host.lanes.next_episodes)
+            host.assigned.clear()  # they are in the spec
+        self._call(host, life, life.remote.begin(spec), self._began)
+
+    def _began(self, host: SupervisedHost, life: Incarnation, answer: Any) -> None:
+        del host, answer
+        life.playing_s = life.heard_s = self._clock.now_s
+
+    def _choose(self, host: SupervisedHost) -> Machine | None:
+        """A machine with room: rather one without a host, not where this one ended last, not the learner's."""
+        taken = Counter(h.incarnation.machine for h in self._hosts if h.incarnation is not None)
+        need = self._cpus(host)
+        try:
+            machines = [m for m in self._backend.machines() if m.id not in self._set_aside]
+        except HostError as error:
+            self._last_failure = str(error)
+            return None
+        fitting = [m for m in machines if m.cpus >= need * (taken[m.id] + 1)]
+        return min(fitting, key=lambda m: (taken[m.id], m.id == host.avoid, m.has_learner, m.name), default=None)
+
+    def _check_room(self) -> None:
+        """Raises ConfigError: the machines have not the cores for `min_hosts` hosts."""
+        need, machines = self._cpus(self._hosts[0]), self._backend.machines()
+        if sum(m.cpus // need if need else 1 for m in machines) < self._config.min_hosts:
+            sizes = ", ".join(f"{m.name} {m.cpus}" for m in machines)
+            raise ConfigError(
+                f"cluster.hosts: got {len(self._hosts)} hosts of {need} cores each, but the cluster's nodes have "
+                f"{sizes}; lower actors.num_actors or cluster.cpus_per_host, or add nodes"
+            )
+
+    def _cpus(self, host: SupervisedHost) -> int:
+        cpus = self._config.cpus_per_host
+        return host.pool.num_actors if cpus is None else cpus
+
+    def _gave_up(self, host: SupervisedHost) -> bool:
+        return host.incarnation is None and host.num_lives >= MAX_FAILED_STARTS
+
+    # ------------------------------------------------------------------------------------------- flow
+
+    def _ask(self, host: SupervisedHost) -> None:
+        """Uses the free credits, and gives the newest parameters."""
+        life = host.incarnation
+        assert life is not None
+        try:
+            while host.free_credits > 0:
+                with self.inbox.changed:
+                    assigned, host.assigned = host.assigned, []
+                if not life.asked:
+                    life.heard_s = self._clock.now_s
+                call = life.remote.next_batch(assigned)
+                life.asked.append(call)
+                self._call(host, life, call, self._take)
+            if self._sent is not None and not life.taking_params and life.params_version < self._sent[1].version:
+                life.taking_params, life.params_version = True, self._sent[1].version
+                self._call(host, life, life.remote.set_params(*self._sent), self._took_params)
+        except HostError as error:
+            self._discard(host, "host_died", str(error))
+
+    def _put_params(self) -> None:
+        """At most once a period: the newest parameters -> the cluster."""
+        if self._published is None or not any(host.is_playing for host in self._hosts):
+            return
+        params, header = self._published
+        due = self._sent is None or time.monotonic() - self._sent_s >= self._config.publish_period_s
+        if due and (self._sent is None or header.version > self._sent[1].version):
+            try:
+                self._sent, self._sent_s = (self._backend.put(np.asarray(params)), header), time.monotonic()
+            except HostError as error:  # the next round tries again
+                self._last_failure = str(error)
+            for version in list(self._published_s)[:-_KEPT_VERSIONS]:
+                del self._published_s[version]
+
+    def _took_params(self, host: SupervisedHost, life: Incarnation, answer: Any) -> None:
+        del host, answer
+        life.taking_params = False
+
+    def _receive(self) -> None:
+        if not self._calls:
+            time.sleep(_WAIT_S)
+            return
+        for call in self._backend.wait(list(self._calls), _WAIT_S):
+            asked = self._calls.pop(call)
+            host, life = asked.host, asked.life
+            try:
+                answer = self._backend.result(call)
+            except HostError as error:
+                if host.incarnation is life:
+                    self._discard(host, "host_died" if life.playing_s is not None else "host_start", str(error))
+                continue
+            if host.incarnation is not life:
+                self._drop(host, life, answer)
+                continue
+            life.heard_s = self._clock.now_s
+            try:
+                asked.answer(host, life, answer)
+            except (TransportError, msgspec.MsgspecError) as error:
+                self._discard(host, "host_answer", str(error))
+
+    def _take(self, host: SupervisedHost, life: Incarnation, answer: Any) -> None:
+        life.asked.popleft()
+        batch = unpack(answer, host.pool.record_dtype, host.pool.frame_shape, self._config.batch_records)
+        with self.inbox.changed:
+            host.take(batch, self._run_id)
+            self.inbox.messages += batch.messages
+            if len(batch):
+                self.inbox.batches.append((host, batch.block))
+                host.waiting_batches += 1
+                host.params_age_s = self._params_age_s(batch)
+                self.inbox.counts.update(received_bytes=len(answer))
+            self.inbox.changed.notify_all()
+        if batch.header.failure:
+            self._discard(host, "host_failed", batch.header.failure)
+
+    def _params_age_s(self, batch: Batch) -> float:
+        """Mean time since the publication of the parameters that chose the actions; 0 if that is too long ago."""
+        now_s, published_s = time.monotonic(), self._published_s
+        versions, counts = np.unique(batch.block.steps["params_version"], return_counts=True)
+        ages = [now_s - published_s.get(version, now_s) for version in versions.tolist()]
+        return float(np.average(ages, weights=counts))
+
+    # ------------------------------------------------------------------------------------------- faults
+
+    def _check_silence(self, host: SupervisedHost) -> None:
+        life = host.incarnation
+        if life is None or (host.is_playing and not life.asked):
+            return
+        silent_s = self._clock.now_s - life.heard_s
+        if not host.is_playing and silent_s > (limit_s := host.pool.actors.start_timeout_s):
+            what = f"gave no answer for {silent_s:.0f} s (actors.start_timeout_s {limit_s:g}) while it was started"
+            self._discard(host, "host_start", what)
+        elif host.is_playing and silent_s > (limit_s := self._config.silence_timeout_s):
+            what = f"gave no sign of life for {silent_s:.1f} s (cluster.silence_timeout_s {limit_s:g})"
+            self._discard(host, "host_silent", what)
+
+    def _discard(self, host: SupervisedHost, kind: str, what: str) -> None:
+        """Ends an incarnation; what it still sends is dropped. Its lanes go on with new episodes, elsewhere."""
+        life, now_s = host.incarnation, self._clock.now_s
+        assert life is not None
+        with self.inbox.changed:
+            cut = host.end(now_s)
+            self.inbox.counts.update(host_restarts=1, cut_episodes=cut)
+        life.remote.kill()
+        self._forced.add(life.machine)
+        self._last_failure = f"{life.name}: {_first_line(what)}"
+        wait_s = host.start_at_s - now_s
+        message = (
+            f"host {host.index} on {life.name} {_first_line(what)}; {cut} episodes cut, replaced in {wait_s:.1f} s"
+        )
+        self._say(kind, message, what)
+        self._failed_on[life.machine] = 0 if life.was_stable(now_s) else self._failed_on[life.machine] + 1
+        if self._failed_on[life.machine] >= MAX_FAILED_STARTS:
+            self._set_aside.add(life.machine)
+            message = f"node {life.name} is set aside: {MAX_FAILED_STARTS} hosts in a row did not stay up there"
+            self._say("node_set_aside", message)
+
+    def _drop(self, host: SupervisedHost, life: Incarnation, answer: Any) -> None:
+        """What an incarnation has sent after its end."""
+        if not isinstance(answer, bytes):
+            return
+        with contextlib.suppress(TransportError):  # a greeting
+            if count := read_header(answer)[0].num_records:
+                with self.inbox.changed:
+                    self.inbox.counts.update(dropped_records=count)
+                message = f"host {host.index} on {life.name} came too late with {count} records, which were dropped"
+                self._say("late_batch", message)
+
+    def _watch(self) -> None:
+        """Raises WorkerError: too few hosts have played for too long."""
+        now_s, wanted = self._clock.now_s, self._config.min_hosts
+        if self.num_playing >= wanted:
+            self._enough_s = now_s
+        elif (waited_s := now_s - self._enough_s) > self._config.patience_s:
+            raise WorkerError(
+                f"hosts: {self.num_playing} of {len(self._hosts)} play, want at least cluster.min_hosts {wanted}; "
+                f"waited {waited_s:.0f} s (cluster.patience_s) for others. The last to fail: {self._last_failure}"
+            )
+
+    def _say(self, kind: str, message: str, details: str = "") -> None:
+        with self.inbox.changed:
+            self.inbox.messages.append(Fault(actor=-1, lane=None, kind=kind, message=message, traceback=details))
+
+    def _call(
+        self,
+        host: SupervisedHost,
+        life: Incarnation,
+        call: Call,
+        answer: Callable[[SupervisedHost, Incarnation, Any], None],
+    ) -> None:
+        self._calls[call] = _Asked(host=host, life=life, answer=answer)
+
+    def _wait_for_all(self, calls: Sequence[Call], timeout_s: float) -> list[Call]:
+        """Those that have ended in time."""
+        waiting, deadline_s = list(calls), time.monotonic() + timeout_s
+        while waiting and time.monotonic() < deadline_s:
+            ended = self._backend.wait(waiting, _WAIT_S)
+            waiting = [call for call in waiting if call not in ended]
+        return [call for call in calls if call not in waiting]
+
+
+def _first_line(text: str) -> str:
+    return next(iter(text.strip().splitlines()), "gave no reason")
