@@ -26,7 +26,7 @@ class NoisyDense(nn.Module):
     """Dense layer y = (b + W x) + (b_noisy * eps_b + (W_noisy * eps_w) x). Source: thesis eq. 4.14.
 
     Kernels are [outputs, inputs], as W is: on a CPU W x^T streams the weights through the cache, while x W^T of a batch
-    of a few rows copies them first (eight products of 4 rows with 512x3136: 3 ms against 14 ms on one core).
+    of a few rows copies them first (two products of 4 rows with 512x3136 on one core: 0.5 ms against 1.7 ms).
 
     Factorized noise is eps_w = f(e_out) f(e_in)^T and eps_b = f(e_out) with f(e) = sign(e) sqrt|e| and e ~ N(0, 1);
     independent noise is N(0, 1) for every entry. Source: Fortunato et al. 2018, section 3.
@@ -57,7 +57,7 @@ class NoisyDense(nn.Module):
             kernel_init, bias_init = nn.initializers.zeros, nn.initializers.constant(jnp.asarray(self.outputs))
         kernel = self.param("kernel", kernel_init, shape).astype(x.dtype)
         bias = self.param("bias", bias_init, shape[:1]).astype(x.dtype)[None]
-        y = (kernel @ x.T).T + bias
+        y = _product(kernel, x) + bias
         if self.sigma is None:
             return y
         sigma = nn.initializers.constant(self.sigma)
@@ -66,7 +66,12 @@ class NoisyDense(nn.Module):
         if noise is None:
             return y
         f_in, f_out = jnp.split(noise.astype(x.dtype), [shape[1]], axis=1)
-        return y + ((kernel_sigma @ (x * f_in).T).T + bias_sigma) * f_out
+        return y + (_product(kernel_sigma, x * f_in) + bias_sigma) * f_out
+
+
+def _product(kernel: Float[Array, "Q P"], x: Float[Array, "B P"]) -> Float[Array, "B Q"]:
+    """x W^T as (W x^T)^T. Without the barrier XLA turns the latter back into the former."""
+    return jax.lax.optimization_barrier(kernel @ x.T).T
 
 
 def draw_noise(params: Params, key: PRNGKeyArray, num_rows: int) -> dict[str, Float[Array, "B P+Q"]]:
