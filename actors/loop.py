@@ -145,6 +145,8 @@ class ActorLoop:
             num_params=spec.num_params,
             obs=self._obs.arrays,
             seed=derive_seed(spec.seed, spec.actor, *spec.first_episodes),
+            fold=spec.fold,
+            fold_period_steps=spec.fold_period_steps,
         )
 
     def _make_env(self, task: int) -> gymnasium.Env[np.ndarray, int]:

@@ -71,18 +71,38 @@ class ExportedPolicy:
     """An acting function that was serialized with `jax.export` for a CPU (`learner.export.export_policy`).
 
     The leaves of its parameters are cut from the flat vector in order. The key of a call is the seed's key folded with
-    the number of calls, which is the attribute `num_calls`.
+    the number of calls, which is the attribute `num_calls`. With a `fold`, what it makes of the leaves is acted by for
+    a stretch of calls. Its key is that of the stretch's first call, so a run that is resumed within a stretch goes on
+    with the same noise.
+
+    Args:
+        serialized: the acting function.
+        num_params: P.
+        obs: arrays of observations, with valid values.
+        seed: 31 bits.
+        fold: a function that was serialized likewise (`learner.export.export_fold`); empty: none.
+        fold_period_steps: calls in a stretch.
 
     Raises:
         ValueError: the function is for other parameters or other observations.
     """
 
-    def __init__(self, serialized: bytes, num_params: int, obs: Mapping[str, np.ndarray], seed: int):
+    def __init__(
+        self,
+        serialized: bytes,
+        num_params: int,
+        obs: Mapping[str, np.ndarray],
+        seed: int,
+        fold: bytes = b"",
+        fold_period_steps: int = 1,
+    ):
         import jax
         import jax.export
 
         exported = jax.export.deserialize(bytearray(serialized))
-        arguments, _ = jax.tree.unflatten(exported.in_tree, exported.in_avals)
+        folding = jax.export.deserialize(bytearray(fold)) if fold else None
+        first = exported if folding is None else folding
+        arguments, _ = jax.tree.unflatten(first.in_tree, first.in_avals)
         self._shapes = [aval.shape for aval in arguments[0]]
         self._ends = list(itertools.accumulate(math.prod(shape) for shape in self._shapes))
         if self._ends[-1] != num_params:
@@ -95,6 +115,12 @@ class ExportedPolicy:
                 params, obs, jax.random.fold_in(key, num_calls), epsilon
             )
         )
+        self._fold = self._folded = self._folded_at = None
+        self._fold_period_steps = fold_period_steps
+        if folding is not None:
+            self._fold = jax.jit(
+                lambda params, key, num_calls: folding.call(params, jax.random.fold_in(key, num_calls))
+            )
         self.num_calls = 0
         # compiles now, and shows now whether the function fits this actor's games
         self.set_params(np.zeros(num_params, np.float32), ParamsHeader(version=0, num_updates=0))
@@ -106,15 +132,25 @@ class ExportedPolicy:
         self.params_version = header.version
         leaves = np.split(params, self._ends[:-1])
         leaves = [leaf.reshape(shape) for leaf, shape in zip(leaves, self._shapes, strict=True)]
-        self._params = self._jax.device_put(leaves, self._cpu)
+        self._params, self._folded_at = self._jax.device_put(leaves, self._cpu), None
         self._epsilon = self._jax.device_put(np.float32(header.epsilon), self._cpu)
 
     def act(self, obs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """The arrays of an `ObservationBatch` -> (action int32[B], extras float32[B, E])."""
         num_calls = np.uint32(self.num_calls % 2**32)
-        action, extras = self._act(self._params, dict(obs), self._seed_key, num_calls, self._epsilon)
+        action, extras = self._act(self._acting_params(), dict(obs), self._seed_key, num_calls, self._epsilon)
         self.num_calls += 1
         return np.asarray(action), np.asarray(extras)
+
+    def _acting_params(self) -> Any:
+        """The leaves that the acting function takes; folded once for a stretch, and for new parameters."""
+        if self._fold is None:
+            return self._params
+        first = self.num_calls // self._fold_period_steps * self._fold_period_steps
+        if first != self._folded_at:
+            self._folded = self._fold(self._params, self._seed_key, np.uint32(first % 2**32))
+            self._folded_at = first
+        return self._folded
 
 
 class AskedPolicy:
@@ -140,9 +176,16 @@ class AskedPolicy:
 
 
 def make_policy(
-    serialized: bytes, *, num_actions: int, num_params: int, obs: Mapping[str, np.ndarray], seed: int
+    serialized: bytes,
+    *,
+    num_actions: int,
+    num_params: int,
+    obs: Mapping[str, np.ndarray],
+    seed: int,
+    fold: bytes = b"",
+    fold_period_steps: int = 1,
 ) -> Policy:
-    """The policy of an actor: the exported function, or chance if `serialized` is empty. `seed` has 31 bits."""
+    """The policy of an actor: an `ExportedPolicy`, whose arguments these are, or chance if `serialized` is empty."""
     if not serialized:
         return RandomPolicy(num_actions, len(obs["task"]), seed)
-    return ExportedPolicy(serialized, num_params, obs, seed)
+    return ExportedPolicy(serialized, num_params, obs, seed, fold, fold_period_steps)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_type
 from gvz.core.errors import ConfigError
 from gvz.core.registry import find
 
-ConvForm = Literal["auto", "direct", "shifted"]
+ConvForm = Literal["auto", "direct", "shifted", "paired"]
 
 
 class Range(NamedTuple):
@@ -72,7 +72,8 @@ class AgentConfig:
     conv_strides: tuple[int, ...] = (4, 2, 1)
     """strides, pixels"""
     conv_form: ConvForm = "auto"
-    """how convolutions are computed: shifted (matmul and shifted adds, for a CPU) or direct (nn.Conv)"""
+    """how convolutions are computed: shifted (matmul and shifted adds, for a CPU), direct (nn.Conv), or paired (direct,
+    two images at a time); auto: actors paired, the learner shifted on a CPU and direct elsewhere"""
     hidden_units: Annotated[int, Range(1, 65536)] = 512
     """units of the hidden layer, per stream if dueling"""
     activation_dtype: Literal["float32", "bfloat16"] = "float32"

@@ -1,7 +1,8 @@
-"""Valid strided convolution in two forms with the same parameters, `direct` and `shifted`, and stacks of it.
+"""Valid strided convolution in three forms with the same parameters, and stacks of it.
 
-XLA's own convolution is right on a GPU. On a CPU a few large matrix products are much faster, above all for the
-first layer (few input channels, large kernel, large stride).
+XLA's own convolution, `direct`, is right on a GPU. To learn on a CPU, the few large matrix products of `shifted` are
+much faster, above all for the first layer (few input channels, large kernel, large stride). To act on one core,
+`paired` is: direct, but two images at a time, so that they stay in its cache.
 """
 
 from typing import Literal
@@ -16,11 +17,16 @@ from learner.config import AgentConfig, ConvForm
 
 
 def conv2d(
-    x: Float[Array, "B H W C"], kernel: Float[Array, "k k C F"], stride: int, form: Literal["direct", "shifted"]
+    x: Float[Array, "B H W C"],
+    kernel: Float[Array, "k k C F"],
+    stride: int,
+    form: Literal["direct", "shifted", "paired"],
 ) -> Float[Array, "B h w F"]:
     """Convolution without padding; h = (H - k) // stride + 1."""
     if form == "shifted":
         return _shifted(x, kernel, stride)
+    if form == "paired" and len(x) > 2:
+        return jax.lax.map(lambda image: conv2d(image[None], kernel, stride, "direct")[0], x, batch_size=2)
     return jax.lax.conv_general_dilated(
         x, kernel, (stride, stride), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
     )

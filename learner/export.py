@@ -1,19 +1,22 @@
 """The acting function as bytes, and parameters as one flat vector.
 
 The bytes are `jax.export` of the agent's own acting function (StableHLO in a flatbuffer, not a pickle), lowered for a
-CPU wherever the learner runs. An actor calls them without importing this package.
+CPU wherever the learner runs. An actor calls them without importing this package. So it does with the function that
+folds parameters, if the agent has one.
 """
 
 import hashlib
 import itertools
+from collections.abc import Callable
 from dataclasses import fields
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import export
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from learner.agents.base import Agent, Params
+from learner.agents.base import Agent, Params, folding
 from learner.observation import Observation
 
 
@@ -48,23 +51,56 @@ def export_policy(agent: Agent, template: Params, batch_size: int) -> bytes:
     Returns:
         Bytes for `jax.export.deserialize`; `.call` takes (the parameters' leaves as a list, the observation as a dict
         of the fields of `learner.observation.Observation`, key u32[2], epsilon f32[]) and returns what `Agent.act`
-        does. A flat vector is cut into leaves by the caller, once a version: within the function it would be copied in
-        every call (27 MB, 2.5 ms).
+        does. The leaves are those that `export_fold`'s function returns, if it has one. A flat vector is cut into
+        leaves by the caller, once a version: within the function it would be copied in every call (27 MB, 2.5 ms).
     """
+    if folder := folding(agent):
+        template = jax.eval_shape(folder.fold, template, jax.random.key(0))
     template_leaves, treedef = jax.tree.flatten(template)
 
     def policy(
         leaves: list[Array], obs: dict[str, Array], key_data: Array, epsilon: Array
     ) -> tuple[Int[Array, "B"], Float[Array, "B E"]]:
         params = jax.tree.unflatten(treedef, leaves)
-        key = jax.random.wrap_key_data(key_data, impl="threefry2x32")
-        return agent.act(params, key, Observation(**obs), epsilon)
+        return agent.act(params, _key(key_data), Observation(**obs), epsilon)
 
     observation = jax.eval_shape(lambda: agent.spec.zeros(batch_size))
-    arguments = (
-        [jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in template_leaves],
+    return _serialized(
+        policy,
+        _float32(template_leaves),
         {f.name: shape for f in fields(observation) if (shape := getattr(observation, f.name)) is not None},
-        jax.ShapeDtypeStruct((2,), jnp.uint32),
+        _KEY_DATA,
         jax.ShapeDtypeStruct((), jnp.float32),
     )
-    return bytes(export.export(jax.jit(policy), platforms=["cpu"])(*arguments).serialize())
+
+
+def export_fold(agent: Agent, template: Params) -> bytes:
+    """Serializes the function that folds parameters for a stretch of decisions, see `FoldingAgent`, for a CPU.
+
+    Returns:
+        As `export_policy`; `.call` takes (the parameters' leaves as a list, key u32[2]) and returns the leaves that the
+        acting function takes. Empty if the agent folds nothing.
+    """
+    if (folder := folding(agent)) is None:
+        return b""
+    template_leaves, treedef = jax.tree.flatten(template)
+
+    def fold(leaves: list[Array], key_data: Array) -> list[Array]:
+        return jax.tree.leaves(folder.fold(jax.tree.unflatten(treedef, leaves), _key(key_data)))
+
+    return _serialized(fold, _float32(template_leaves), _KEY_DATA)
+
+
+_KEY_DATA = jax.ShapeDtypeStruct((2,), jnp.uint32)
+
+
+def _key(key_data: Array) -> PRNGKeyArray:
+    return jax.random.wrap_key_data(key_data, impl="threefry2x32")
+
+
+def _float32(leaves: list[Any]) -> list[jax.ShapeDtypeStruct]:
+    return [jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in leaves]
+
+
+def _serialized(function: Callable[..., Any], *arguments: Any) -> bytes:
+    return bytes(export.export(jax.jit(function), platforms=["cpu"])(*arguments).serialize())

@@ -1,7 +1,8 @@
 """The Q-network: an encoder of frames, then one or two streams of (noisy) dense layers.
 
 One module with switches serves every agent. Parameters are float32; activations may be bfloat16; outputs are
-float32. Noise is explicit: `add_noise` moves the parameters, or the network is given what `draw_noise` drew.
+float32. Noise is explicit: `add_noise` moves the parameters (`fold_noise` for acting), or the network is given what
+`draw_noise` drew.
 """
 
 from functools import cache
@@ -20,6 +21,7 @@ from learner.observation import Observation
 
 Params = Any
 """A pytree of float32 arrays: {"params": {layer: {name: array}}}."""
+_SIGMAS = ("kernel_sigma", "bias_sigma")
 
 
 class NoisyDense(nn.Module):
@@ -112,6 +114,17 @@ def add_noise(params: Params, key: PRNGKeyArray, noisy: Noisy) -> Params:
             "bias": layer["bias"] + layer["bias_sigma"] * eps_b,
         }
     return {"params": params["params"] | moved}
+
+
+def fold_noise(params: Params, key: PRNGKeyArray, noisy: Noisy) -> Params:
+    """`add_noise` without the sigmas: parameters of the network without noise, half as many to read at a decision."""
+    moved = add_noise(params, key, noisy)["params"]
+    return {"params": {name: {k: w for k, w in layer.items() if k not in _SIGMAS} for name, layer in moved.items()}}
+
+
+def is_folded(params: Params) -> bool:
+    """No layer has noise."""
+    return not _noisy_layers(params)
 
 
 def _noisy_layers(params: Params) -> Params:

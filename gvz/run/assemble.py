@@ -20,9 +20,9 @@ from gvz.run.footprint import Footprint
 from gvz.scenarios.compiler import compile_task
 from gvz.task_table import TaskTable
 from learner.acting import DevicePolicy
-from learner.agents.base import Agent, AgentSpec, OffPolicyAgent, OnPolicyAgent, make_agent
+from learner.agents.base import Agent, AgentSpec, OffPolicyAgent, OnPolicyAgent, folding, make_agent
 from learner.config import OnPolicyConfig, ValueConfig
-from learner.export import export_policy, layout_hash
+from learner.export import export_fold, export_policy, layout_hash
 from learner.learner import LearnerParts
 from learner.off_policy import OffPolicyParts
 from learner.on_policy import OnPolicyParts
@@ -110,7 +110,7 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
         num_extras=extras.shape[1],
         action_masks=table.action_masks,
         num_actions=spec.num_actions,
-        policy=export_policy(agent, params, config.games_per_actor) if config.actors.inference == "actors" else b"",
+        **_acting(config, agent),
         num_params=num_params,
         layout_hash=layout_hash(params),
         actors=config.actors,
@@ -146,6 +146,21 @@ def _transport_bytes(config: RunConfig, pool: PoolConfig) -> int:
 
 def _on_hosts(config: RunConfig) -> str:
     return f"on {config.cluster.hosts} hosts {config.num_actors} actors with {config.num_lanes} engines"
+
+
+def _acting(config: RunConfig, agent: Agent) -> dict[str, Any]:
+    """What an actor chooses its actions by, as fields of `Play`: nothing if it asks for them."""
+    if config.actors.inference == "device":
+        return {"policy": b""}
+    acting = agent
+    if config.agent.conv_form == "auto":
+        acting = make_agent(dataclasses.replace(config.agent, conv_form="paired"), agent.spec)
+    params, folder = jax.eval_shape(acting.init, jax.random.key(0)), folding(acting)
+    return {
+        "policy": export_policy(acting, params, config.games_per_actor),
+        "fold": export_fold(acting, params),
+        "fold_period_steps": 1 if folder is None else folder.fold_period_steps,
+    }
 
 
 def _off_policy(config: RunConfig, agent: Agent, pool: PoolConfig) -> OffPolicyParts:

@@ -19,7 +19,7 @@ import numpy as np
 
 from gvz.core.errors import TransportError
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 """Increased by one when the meaning or layout of anything in this file changes."""
 
 
@@ -165,6 +165,10 @@ class Play(_Message, frozen=True, kw_only=True):
     policy: bytes
     """serialized jax.export of the acting function; empty for a uniformly random policy, and for actors
     that ask for their actions"""
+    fold: bytes = b""
+    """serialized jax.export of what makes the acting function's parameters; empty: it takes them as they come"""
+    fold_period_steps: Count = 1
+    """calls of the acting function before they are made again"""
     num_params: Count
     """length of the flat float32 parameter vector; 0 for a random policy, which has no queue"""
     layout_hash: Count

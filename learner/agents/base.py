@@ -117,6 +117,28 @@ class Agent(Protocol):
 
 
 @runtime_checkable
+class FoldingAgent(Agent, Protocol):
+    """An agent that can act by parameters of another form than it learns, made once for a stretch of decisions.
+
+    `act` takes both forms.
+    """
+
+    @property
+    def fold_period_steps(self) -> int:
+        """Decisions of each game in a stretch; 0: nothing is folded."""
+        ...
+
+    def fold(self, params: Params, key: PRNGKeyArray) -> Params:
+        """What `act` takes for a stretch. `act` gets the same key at the first of its decisions."""
+        ...
+
+
+def folding(agent: Agent) -> FoldingAgent | None:
+    """The agent, if its actors are to fold its parameters."""
+    return agent if isinstance(agent, FoldingAgent) and agent.fold_period_steps else None
+
+
+@runtime_checkable
 class OffPolicyAgent(Agent, Protocol):
     """An agent that learns from transitions of a replay."""
 

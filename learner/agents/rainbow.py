@@ -16,7 +16,7 @@ from learner import losses
 from learner.agents.base import AgentLoss, Evaluation, NetworkAgent, Params, allowed_values, epsilon_greedy
 from learner.agents.configs.rainbow import RainbowConfig
 from learner.augment import training_view
-from learner.networks import QNetwork, add_noise, draw_noise, initial_logits
+from learner.networks import QNetwork, add_noise, draw_noise, fold_noise, initial_logits, is_folded
 from learner.observation import Observation
 from learner.replay import Transitions
 
@@ -67,17 +67,32 @@ class Rainbow(NetworkAgent):
     def act(
         self, params: Params, key: PRNGKeyArray, obs: Observation, epsilon: Float[Array, ""]
     ) -> tuple[Int[Array, "B"], Float[Array, "B E"]]:
-        """Greedy in a freshly drawn noisy network, each game with noise of its own if factorized."""
-        if self.config.noisy == "off":
-            logits = self.outputs(params, obs)
-        else:
-            key_noise, key = jax.random.split(key)
-            if self.config.noisy == "factorized":
-                logits = self.outputs(params, obs, draw_noise(params, key_noise, obs.task.shape[0]))
-            else:
-                logits = self.outputs(add_noise(params, key_noise, "independent"), obs)
-        action = epsilon_greedy(key, self.q_values(logits), epsilon, obs.mask)
+        """Greedy in a freshly drawn noisy network, each game with noise of its own if factorized.
+
+        With parameters that `fold` made, greedy in their network.
+        """
+        key_noise, key = (key, key) if self.config.noisy == "off" else jax.random.split(key)
+        q = self.q_values(self.exploring_logits(params, key_noise, obs))
+        action = epsilon_greedy(key, q, epsilon, obs.mask)
         return action, jnp.zeros((action.shape[0], 0))
+
+    def exploring_logits(self, params: Params, key: PRNGKeyArray, obs: Observation) -> Float[Array, "B A N"]:
+        """The network's answer with noise that is drawn by `key`, unless there is none or it was folded in."""
+        if is_folded(params):
+            return jnp.asarray(self.network().clone(noisy_sigma=None).apply(params, obs))
+        if self.config.noisy == "factorized":
+            return self.outputs(params, obs, draw_noise(params, key, obs.task.shape[0]))
+        return self.outputs(add_noise(params, key, "independent"), obs)
+
+    @property
+    def fold_period_steps(self) -> int:
+        steps = self.config.noisy_period_steps
+        return steps if self.config.noisy != "off" and steps > 1 else 0
+
+    def fold(self, params: Params, key: PRNGKeyArray) -> Params:
+        """Moves the means by one draw of noise: the draw of `act` with this key, were it for a single game."""
+        key_noise, _ = jax.random.split(key)
+        return fold_noise(params, key_noise, self.config.noisy)
 
     def evaluate(self, params: Params, obs: Observation) -> Evaluation:
         logits = self.outputs(params, obs)

@@ -73,10 +73,20 @@ def test_shifted_equals_the_defining_sum(size: int, k: int, stride: int, channel
     np.testing.assert_allclose(y, oracle(x, kernel, stride), atol=1e-4)
 
 
+@pytest.mark.parametrize("num_images", [1, 2, 5, 8])
+def test_paired_equals_the_defining_sum_for_any_number_of_images(num_images: int):
+    rng = np.random.default_rng(num_images)
+    x = rng.normal(size=(num_images, 9, 11, 3)).astype(np.float32)
+    kernel = rng.normal(size=(4, 4, 3, 5)).astype(np.float32)
+    y = jax.jit(conv2d, static_argnums=(2, 3))(x, kernel, 2, "paired")
+    np.testing.assert_allclose(y, oracle(x, kernel, 2), atol=1e-4)
+
+
 def test_every_form_has_the_same_parameters():
     x = jax.ShapeDtypeStruct((1, 20, 20, 3), jnp.float32)
-    trees = [jax.eval_shape(Conv(6, 4, 2, form).init, jax.random.key(0), x) for form in ("auto", "direct", "shifted")]
-    assert trees[0] == trees[1] == trees[2]
+    forms = ("auto", "direct", "shifted", "paired")
+    trees = [jax.eval_shape(Conv(6, 4, 2, form).init, jax.random.key(0), x) for form in forms]
+    assert all(tree == trees[0] for tree in trees)
     assert {name: leaf.shape for name, leaf in trees[0]["params"].items()} == {"kernel": (4, 4, 3, 6), "bias": (6,)}
 
 

@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import msgpack
 import numpy as np
 import pytest
 
@@ -18,6 +19,7 @@ from gvz.run.train import train
 from learner.agents.configs.dqn import DQNConfig
 from learner.agents.configs.ppo import PPOConfig
 from learner.agents.configs.pqn import PQNConfig
+from learner.agents.configs.rainbow import RainbowConfig
 from learner.config import LearnerConfig, OnPolicyConfig, ReplayConfig
 from tests.e2e.command import arrays_of
 
@@ -90,6 +92,21 @@ def test_a_run_that_explores_by_epsilon_goes_on_bit_for_bit_between_two_publicat
     assert (len(tasks_of_lanes) > 2) == (curriculum == "uniform")
     assert logged_updates(tmp_path / "whole") == [20, 40, 60, 80]
     assert logged_updates(tmp_path / "cut") == [50, 60, 80]
+
+
+def test_a_run_goes_on_bit_for_bit_within_a_stretch_of_noise(tmp_path):
+    """About 110 decisions of each game: the cut at 80 of them lies in the third stretch, after the warm-up."""
+    agent = RainbowConfig(**NETWORK, noisy_sigma=0.5, noisy_period_steps=30, num_atoms=5)
+    config = replace(DQN, name="rainbow", agent=agent)
+    go_on(tmp_path / "whole", config, 80)
+    go_on(tmp_path / "cut", config, 50)
+    saved = msgpack.unpackb((tmp_path / "cut" / "checkpoints" / "50" / "host.msgpack").read_bytes())
+    assert saved["pool"]["loop"]["num_calls"] % 30 not in (0, 29)
+    go_on(tmp_path / "cut", config, 80)
+    whole, cut = (arrays_of(tmp_path / name / "checkpoints" / "80") for name in ("whole", "cut"))
+    assert [name for name in whole if not np.array_equal(whole[name], cut[name])] == []
+    assert (tmp_path / "whole" / "episodes.jsonl").read_bytes() == (tmp_path / "cut" / "episodes.jsonl").read_bytes()
+    assert len(np.unique(whole["['replay'].store.action"])) > 1
 
 
 NETWORK = {"conv_channels": (4,), "conv_kernels": (8,), "conv_strides": (4,), "hidden_units": 16, "past_actions": 2}

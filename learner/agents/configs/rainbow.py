@@ -45,6 +45,10 @@ class RainbowConfig(ValueConfig):
     """largest atom; default from the scenario's reward range"""
     noisy_sigma: Annotated[float, Range(0.0, 10.0)] = 0.017
     """initial sigma of the noisy layers"""
+    noisy_period_steps: Annotated[int, Range(1, 10**6)] = 1
+    """decisions of each game for which an actor keeps one draw of noise. 1: every decision of every game has its own.
+    More: all games of an actor share the draw, which is folded into the weights, so that acting costs as much as
+    without noise. Each decision's noise has the same distribution, but within a stretch the policy is deterministic"""
     noisy_epsilon: Share = 0.0
     """probability of a uniformly random action beside the noise"""
 
