@@ -180,6 +180,7 @@ def test_the_arithmetic_of_a_decision_is_that_of_its_layers():
 
     from benchmarks import workload
     from gvz.run.assemble import run_agent
+    from learner.agents.rainbow import Rainbow
 
     agent = run_agent(workload.run_config(dataclasses.replace(QUICK, quick=False)))
     params = jax.eval_shape(agent.init, jax.random.key(0))
@@ -187,6 +188,10 @@ def test_the_arithmetic_of_a_decision_is_that_of_its_layers():
     convolutions = 20 * 20 * 8 * 8 * 12 * 32 + 9 * 9 * 4 * 4 * 32 * 64 + 7 * 7 * 3 * 3 * 64 * 64
     dense = 2 * (2 * 3136 * 512 + 512 * 51 + 512 * 3 * 51)  # each layer has noisy weights too
     assert found == pytest.approx(2 * (convolutions + dense), rel=0.05)  # the rest draws the noise
+    assert isinstance(agent, Rainbow)
+    folded = jax.eval_shape(agent.fold, params, jax.random.key(0))
+    found = workload.flops(workload.direct(agent).act, folded, jax.random.key(0), agent.spec.zeros(), jnp.float32(0))
+    assert found == pytest.approx(2 * (convolutions + dense / 2), rel=0.02)
 
 
 # --------------------------------------------------------------------------------------------- peers
