@@ -142,8 +142,7 @@ def test_values_within_a_stretch_are_the_same_and_over_stretches_as_with_a_draw_
 
 def test_the_device_chooses_what_an_actor_does_and_new_parameters_keep_the_stretchs_noise():
     agent = Telling(CONFIG, SPEC)
-    obs, params = observed(GAMES), params_of(agent)
-    found = {}
+    obs, found = observed(GAMES), {}
     for kind in ("exported", "device"):
         policy = policy_of(kind, agent, obs)
         outcomes = []
@@ -159,7 +158,6 @@ def test_the_device_chooses_what_an_actor_does_and_new_parameters_keep_the_stret
     second = params_of(agent, 2)
     _, q = agent.act(agent.fold(second, key), key, Observation(**obs), jnp.float32(0))
     np.testing.assert_allclose(found["exported"][call][1], q, rtol=1e-4, atol=1e-5)
-    del params
 
 
 @pytest.mark.parametrize("kind", ["exported", "device"])
