@@ -19,7 +19,7 @@ from benchmarks import workload
 from benchmarks.remote import Remote, count_per_s
 from benchmarks.rounds import Budget, Row, alternate, goal, measured, rates
 
-_POOLS = ((8, 1), (4, 16), (8, 16), (16, 16))
+_POOLS = ((8, 1), (8, 16), (16, 16))
 """games of an actor, and decisions of each for which it keeps a draw of noise"""
 _NOISE_OF = {1: "each decision", 16: "16 decisions"}
 
