@@ -3,18 +3,20 @@
 The limit is the rate of N bare processes that only call `make_action` and `get_state` at the same render size, with
 the best N. The pool does everything that a run does except the network: resize, stack, ring, drain in the learner's
 process. EnvPool runs asynchronously with one thread per core, LevDoom bare (without its wrappers) under gymnasium's
-AsyncVectorEnv; for both the better of two sizes counts. Goals: the pool reaches 0.85 of the limit, 4 times EnvPool, 8
-times LevDoom at its default of 320x240 and 6 times at our 256x144.
+AsyncVectorEnv. Of every group the better of two or three sizes counts. Goals: the pool reaches 0.85 of the limit, 4
+times EnvPool (6 times with the tuned engine), 8 times LevDoom at its default of 320x240 and 6 times at our 256x144.
 """
 
 import contextlib
+import dataclasses
 import os
 import tempfile
-from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 
 from benchmarks import workload
-from benchmarks.remote import Remote, count_per_s, start_peer
-from benchmarks.rounds import Budget, Row, absent, alternate, goal, rates, ratios
+from benchmarks.candidates import Candidates, engine_is_tuned
+from benchmarks.rounds import Budget, Row, alternate, rates
 
 
 def measure(budget: Budget) -> list[Row]:
@@ -23,57 +25,31 @@ def measure(budget: Budget) -> list[Row]:
 
     cores = len(os.sched_getaffinity(0))
     config = workload.run_config(budget)
-    rows: list[Row] = []
     with contextlib.ExitStack() as stack:
-        bodies: dict[str, Callable[[], float]] = {}
-        groups: dict[str, list[str]] = {"limit": [], "envpool": [], "levdoom 320x240": [], "levdoom 256x144": []}
-
-        def bare(count: int) -> None:
-            size = (str(config.env.render_width), str(config.env.render_height))
-            remotes = [stack.enter_context(Remote("bare_engine", workload.TASK, *size)) for _ in range(count)]
-            name = f"bare engines x{count}, 256x144"
-            groups["limit"].append(name)
-            bodies[name] = lambda: count_per_s(remotes, {"seconds": budget.body_s})
-
-        def peer(group: str, name: str, script: str, *arguments: str) -> None:
-            remote = start_peer(script, budget.peers, *arguments)
-            if isinstance(remote, str):
-                rows.append(absent(name, remote))
-                return
-            stack.enter_context(remote)
-            groups[group].append(name)
-            bodies[name] = lambda: count_per_s([remote], {"seconds": budget.body_s})
-
-        for count in (1,) if budget.quick else (cores, 2 * cores, 4 * cores):
-            bare(count)
-        directory = stack.enter_context(tempfile.TemporaryDirectory(prefix="gvz-benchmark-"))
-        parts = assemble(config, workload.work_directory(directory))
-        pool = stack.enter_context(workload.playing(workload.random_players(parts.pool_config)))
-        ours = "actor pool, random play, 256x144"
-        bodies[ours] = lambda: workload.decisions_per_s(pool, budget.body_s)
-        for count in (1,) if budget.quick else (cores, 4 * cores):
-            peer(
-                "envpool",
-                f"EnvPool, {count} games, {cores} threads",
-                "envpool_doom",
-                str(count),
-                str(min(count, cores)),
+        candidates = Candidates(budget, stack)
+        candidates.add_limit((1,) if budget.quick else (cores, 2 * cores))
+        directory = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gvz-benchmark-")))
+        for games in (4,) if budget.quick else (1, 2, 4):
+            actors = dataclasses.replace(config.actors, games_per_actor=games)
+            parts = assemble(
+                dataclasses.replace(config, actors=actors), workload.work_directory(str(directory / str(games)))
             )
-            peer("levdoom 320x240", f"LevDoom, {count} games, 320x240", "levdoom_async", str(count))
-            peer("levdoom 256x144", f"LevDoom, {count} games, 256x144", "levdoom_async", str(count), "256X144")
-        values = alternate(budget.rounds, bodies)
-        profile = workload.processor_times(budget.rounds, {name: bodies[name] for name in (groups["limit"][0], ours)})
-    rows = [*(rates(name, decisions_per_s=found) for name, found in values.items()), *rows, *profile]
-    best = {
-        group: [max(found) for found in zip(*(values[n] for n in names), strict=True)]
-        for group, names in groups.items()
+            pool = stack.enter_context(workload.playing(workload.random_players(parts.pool_config)))
+            name = f"actor pool, random play, {games} games an actor"
+            candidates.add("actor pool", name, partial(workload.decisions_per_s, pool, budget.body_s))
+        candidates.add_peers((1,) if budget.quick else (cores, 4 * cores))
+        values = alternate(budget.rounds, candidates.bodies)
+        profiled = [name for name in candidates.bodies if name.startswith(("bare", "actor"))]
+        profile = workload.processor_times(budget.rounds, {name: candidates.bodies[name] for name in profiled})
+    wanted = {
+        "limit": 0.85,
+        "EnvPool": 6.0 if engine_is_tuned() else 4.0,
+        "LevDoom 320x240": 8.0,
+        "LevDoom 256x144": 6.0,
     }
-    for group, text, at_least in (
-        ("limit", "actor pool against the engine's limit", 0.85),
-        ("envpool", "actor pool against EnvPool", 4.0),
-        ("levdoom 320x240", "actor pool against LevDoom at its default size", 8.0),
-        ("levdoom 256x144", "actor pool against LevDoom at equal size", 6.0),
-    ):
-        if best[group]:
-            rows.append(goal(1, text, ratios(values[ours], best[group]), at_least=at_least, unit="x"))
-    return rows
+    return [
+        *(rates(name, decisions_per_s=found) for name, found in values.items()),
+        *candidates.rows,
+        *profile,
+        *candidates.goals(1, "actor pool", values, wanted),
+    ]

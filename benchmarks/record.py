@@ -38,6 +38,14 @@ class Record:
     versions: dict[str, str]
     rows: list[Row]
 
+    @property
+    def variant(self) -> str:
+        """What sets the record apart from one of a CPU and the released engine: "gpu", "tuned" (the engine), or
+        nothing.
+        """
+        tuned = "tuned" if "+gvz" in self.versions.get("vizdoom", "") else ""
+        return "_".join(word for word in (self.device if self.device != "cpu" else "", tuned) if word)
+
 
 def environment() -> dict[str, str]:
     """The environment of measured commands: ours without PYTHONDONTWRITEBYTECODE, so that bytecode is cached."""
@@ -59,9 +67,9 @@ def describe_commit() -> str:
 
 
 def write(record: Record, directory: Path) -> Path:
-    """Writes `<benchmark>.json` (`<benchmark>_<device>.json` if it is not a CPU), one row per line."""
+    """Writes `<benchmark>.json`, or `<benchmark>_<variant>.json`, one row per line."""
     directory.mkdir(parents=True, exist_ok=True)
-    suffix = "" if record.device == "cpu" else f"_{record.device}"
+    suffix = f"_{record.variant}" if record.variant else ""
     file = directory / f"{record.benchmark}{suffix}.json"
     fields = asdict(record)
     rows = ",\n    ".join(json.dumps(row) for row in fields.pop("rows"))

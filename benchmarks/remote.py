@@ -64,7 +64,8 @@ class Remote:
             self.close()
             raise RemoteError(f"{script}: there is no interpreter {python}; make one with `make bench-peers`")
         root = str(PEERS.parent.parent)
-        path = [root] if str(python) == sys.executable else []  # peers do not see our modules
+        # peers do not see our modules, nor what stands before the installed ones
+        path = [root, os.environ.get("PYTHONPATH", "")] if str(python) == sys.executable else []
         with self._errors.open("wb") as errors:
             self._process = subprocess.Popen(
                 [str(Path(python).absolute()), str(PEERS / f"{script}.py"), *arguments],
@@ -73,7 +74,7 @@ class Remote:
                 stderr=errors,
                 cwd=self._directory.name,
                 pass_fds=pass_fds,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(path), **environment},
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, path)), **environment},
             )
         self._buffer = b""
         try:

@@ -62,7 +62,7 @@ def goals_table(records: Sequence[Record]) -> str:
         if not rows and not mine:
             lines.append(f"| {head} | | | not measured | |")
         for i, (made, row) in enumerate(rows):
-            where = "" if made.device == "cpu" else f" ({made.device})"
+            where = f" ({made.variant})" if made.variant else ""
             verdict = "met" if rounds.met(row) else "**missed**"
             unit = f" {row['unit']}" if row["unit"] else ""
             lines.append(

@@ -1,22 +1,24 @@
-"""Decisions per second of `gvz.make_vec`: the engine's limit, `step`, `send` and `recv`, gymnasium's AsyncVectorEnv.
+"""Decisions per second of `gvz.make_vec`: `step`, and `send` and `recv`, beside the engine's limit and others.
 
 The limit is the rate of N bare processes that only call `make_action` and `get_state` at the same render size, with
-the best N. The vector environments play at random with four games for each core. `recv` waits for half of the games.
-AsyncVectorEnv plays the same environments with a process for each game, and with as many games as cores, too; the
-better of the two counts. Goals: `step` and `recv` reach 0.85 of the limit and are faster than AsyncVectorEnv.
+the best N. `recv` waits for half of the games. Gymnasium's AsyncVectorEnv plays the same environments with a process
+for each game; EnvPool and LevDoom are those of `actors`. All play at random. Of every group the better of two sizes
+counts. Goals: 0.85 of the limit, faster than AsyncVectorEnv, 4 times EnvPool (6 times with the tuned engine) and 8
+times LevDoom at its default of 320x240.
 """
 
 import contextlib
 import os
 import time
-from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from benchmarks import workload
-from benchmarks.remote import Remote, count_per_s
-from benchmarks.rounds import Budget, Row, alternate, goal, rates, ratios
+from benchmarks.candidates import Candidates, engine_is_tuned
+from benchmarks.remote import Remote
+from benchmarks.rounds import Budget, Row, alternate, rates
 
 if TYPE_CHECKING:
     from gvz.vector.env import DoomVectorEnv
@@ -25,42 +27,37 @@ if TYPE_CHECKING:
 def measure(budget: Budget) -> list[Row]:
     """Rates of all candidates in alternating rounds, and the ratios of the goals."""
     import gvz
-    from gvz.core.env_config import EnvConfig
 
     cores = len(os.sched_getaffinity(0))
-    games = 2 if budget.quick else 4 * cores
-    size = (str(EnvConfig().render_width), str(EnvConfig().render_height))
-    step, recv = f"make_vec, step, {games} games", f"make_vec, send and recv, {games} games"
+    sizes = (2,) if budget.quick else (2 * cores, 4 * cores)
     with contextlib.ExitStack() as stack:
-        bodies: dict[str, Callable[[], float]] = {}
-        groups: dict[str, list[str]] = {"limit": [], "gymnasium": []}
-
-        def remote(group: str, name: str, count: int, *arguments: str) -> None:
-            remotes = [stack.enter_context(Remote(*arguments)) for _ in range(count)]
-            groups[group].append(name)
-            bodies[name] = lambda: count_per_s(remotes, {"seconds": budget.body_s})
-
-        for count in (1,) if budget.quick else (cores, 2 * cores, 4 * cores):
-            remote("limit", f"bare engines x{count}", count, "bare_engine", workload.TASK, *size)
-        for count in (1,) if budget.quick else (cores, games):
-            name = f"AsyncVectorEnv, {count} games"
-            remote("gymnasium", name, 1, "gymnasium_async", workload.TASK, str(count))
-        for name, batch_size, play in ((step, games, _step_per_s), (recv, games // 2, _recv_per_s)):
-            envs = stack.enter_context(contextlib.closing(gvz.make_vec(workload.TASK, games, batch_size=batch_size)))
-            envs.reset(seed=0)
-            bodies[name] = lambda envs=envs, play=play: play(envs, budget.body_s)
-        values = alternate(budget.rounds, bodies)
-    best = {
-        group: [max(found) for found in zip(*(values[name] for name in names), strict=True)]
-        for group, names in groups.items()
+        candidates = Candidates(budget, stack)
+        candidates.add_limit((1,) if budget.quick else (cores, 2 * cores))
+        for games in (1,) if budget.quick else (cores, 4 * cores):
+            remote = Remote("gymnasium_async", workload.TASK, str(games))
+            candidates.add_remotes("AsyncVectorEnv", f"AsyncVectorEnv, {games} games", [remote])
+        for games in sizes:
+            for group, batch_size, play in (("step", games, _step_per_s), ("send and recv", games // 2, _recv_per_s)):
+                envs = gvz.make_vec(workload.TASK, games, batch_size=batch_size)
+                stack.enter_context(contextlib.closing(envs))
+                envs.reset(seed=0)
+                candidates.add(group, f"make_vec, {group}, {games} games", partial(play, envs, budget.body_s))
+        candidates.add_peers((1,) if budget.quick else (4 * cores,))
+        values = alternate(budget.rounds, candidates.bodies)
+        profiled = [name for name in candidates.bodies if name.startswith(("bare", "make_vec"))]
+        profile = workload.processor_times(1, {name: candidates.bodies[name] for name in profiled})
+    wanted = {
+        "limit": 0.85,
+        "AsyncVectorEnv": 1.0,
+        "EnvPool": 6.0 if engine_is_tuned() else 4.0,
+        "LevDoom 320x240": 8.0,
     }
-    rows = [rates(name, decisions_per_s=found) for name, found in values.items()]
-    for name, text in ((step, "step"), (recv, "send and recv")):
-        against = (("limit", "the engine's limit", 0.85), ("gymnasium", "AsyncVectorEnv", 1.0))
-        for group, other, at_least in against:
-            found = ratios(values[name], best[group])
-            rows.append(goal(10, f"{text} against {other}", found, at_least=at_least, unit="x"))
-    return rows
+    return [
+        *(rates(name, decisions_per_s=found) for name, found in values.items()),
+        *candidates.rows,
+        *profile,
+        *(row for group in ("step", "send and recv") for row in candidates.goals(10, group, values, wanted)),
+    ]
 
 
 def _step_per_s(envs: "DoomVectorEnv", seconds: float) -> float:

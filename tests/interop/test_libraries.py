@@ -10,8 +10,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 EXAMPLES = Path(__file__).parent.parent.parent / "examples"
 
 
@@ -33,10 +31,9 @@ def test_this_environment_has_no_jax():
     assert importlib.util.find_spec("jax") is None
 
 
-@pytest.mark.parametrize("processes", ["--processes", "--no-processes"])
-def test_stable_baselines3_trains_and_is_evaluated_by_the_protocol(tmp_path, processes):
+def test_stable_baselines3_trains_and_is_evaluated_by_the_protocol(tmp_path):
     small = ("--steps", "128", "--n-steps", "32", "--episodes", "1", "--max-tasks", "1")
-    out = run("stable_baselines3_ppo.py", *small, processes, where=tmp_path)
+    out = run("stable_baselines3_ppo.py", *small, where=tmp_path)
     assert "total_timesteps | 128" in " ".join(out.split())
     (row,) = map(json.loads, (tmp_path / "sb3_ppo.jsonl").read_text().splitlines())
     assert (row["player"], row["task"]) == ("sb3_ppo@128", "defend_the_center/gore+mossy_bricks")
