@@ -81,6 +81,7 @@ def test_imports_point_down(module: str, file: Path):
         ("import gvz", ("jax", "vizdoom", "cv2")),
         ("import gvz.launch", ("jax", "vizdoom", "orbax", "flax")),
         ("import gvz.env, gvz.tasks", ("jax", "flax", "orbax", "tyro")),
+        ("import gvz.cli, gvz.run.train, gvz.experiments.schedule", ("ray", "gvz.cluster.wire")),
     ],
 )
 def test_an_import_does_not_load(statement: str, forbidden: tuple[str, ...]):

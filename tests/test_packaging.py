@@ -1,6 +1,7 @@
 """Wheel and sdist: what they hold, that they install, and that the benchmark runs where JAX cannot be imported."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -82,6 +83,15 @@ def test_the_wheel_holds_every_file_of_the_packages_and_nothing_else(built):
     assert {name.partition("/")[0] for name in names} == set(PACKAGES)
     for needed in ("gvz/py.typed", "gvz/reports/templates/report.html.j2"):
         assert needed in names
+
+
+def test_ray_comes_with_the_extra_cluster_alone(built):
+    (wheel,) = built.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        (metadata,) = [archive.read(n).decode() for n in archive.namelist() if n.endswith(".dist-info/METADATA")]
+    wanted = [line for line in metadata.splitlines() if re.match(r"Requires-Dist: (ray|zstandard)\b", line)]
+    assert len([line for line in wanted if line.endswith("extra == 'cluster'")]) == 2
+    assert all("; extra == " in line for line in wanted), "of what is installed without an extra"
 
 
 def test_the_sdist_holds_what_a_wheel_is_built_from(built):

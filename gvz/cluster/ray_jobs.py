@@ -206,8 +206,6 @@ class ClusterPlaces:
 
     def _look(self) -> None:
         """Which nodes are alive. Ray would end this process if its head is gone, so that is asked first."""
-        import ray
-
         self._looked_s = now_s = time.monotonic()
         host, _, port = self._address.rpartition(":")
         try:
@@ -218,7 +216,10 @@ class ClusterPlaces:
                     f"cluster {self._address}: its head is gone; the jobs save themselves and end. Start the cluster, "
                     "and give the same command again"
                 ) from error
+            self._nodes = []  # nothing begins before it answers again: Ray would wait for it
             return
+        import ray
+
         self._answered_s = now_s
         shares = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         self._nodes = [(share.get("CPU", 0.0), share.get("GPU", 0.0)) for share in shares]

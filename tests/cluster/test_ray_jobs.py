@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -12,10 +13,11 @@ from pathlib import Path
 import psutil
 import pytest
 
+from gvz.cluster import ray_jobs
 from gvz.cluster.job_host import hold_cores
 from gvz.cluster.ray_jobs import Share
 from gvz.core import records
-from gvz.core.errors import ConfigError
+from gvz.core.errors import ConfigError, GvzError
 from gvz.experiments import inventory
 from gvz.experiments.jobs import PlayerJob
 from gvz.experiments.plan import read_plan
@@ -212,6 +214,19 @@ def test_a_core_has_one_holder_and_too_few_free_cores_are_none(monkeypatch, tmp_
     assert (every, len(locks)) == (tuple(allowed), len(allowed))
     for lock in locks:
         lock.close()
+
+
+def test_a_head_that_is_gone_is_named(monkeypatch):
+    monkeypatch.setattr(ray_jobs, "HEAD_TIMEOUT_S", 0.1)
+    with socket.create_server(("127.0.0.1", 0)) as head:
+        address = f"127.0.0.1:{head.getsockname()[1]}"
+        places = ray_jobs.ClusterPlaces.__new__(ray_jobs.ClusterPlaces)  # connecting is the other tests' matter
+        places._address, places._answered_s, places._nodes = address, time.monotonic(), [(16.0, 0.0)]
+    places._look()  # for a moment, that may be the network
+    assert places._nodes == []
+    time.sleep(0.2)
+    with pytest.raises(GvzError, match=f"cluster {address}: its head is gone; the jobs save themselves"):
+        places._look()
 
 
 def test_a_share_of_nothing_is_refused():

@@ -1,0 +1,63 @@
+"""`gvz cluster doctor` on a cluster of three nodes, and what it finds where something is wrong."""
+
+import json
+import socket
+
+import pytest
+
+from gvz.cluster.checkup import closed_ports, security
+from gvz.run import shared_directory
+
+pytestmark = pytest.mark.xdist_group("ray")
+
+
+@pytest.mark.e2e
+def test_every_node_is_checked(cluster, tmp_path):
+    done = cluster.run("cluster", "doctor", cluster.address, "--shared", str(tmp_path), "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert {row["state"] for row in rows} <= {"ok", "note"}  # clocks may jump on a machine that was asleep
+    names = [row["name"] for row in rows]
+    of_each = ("versions", "/dev/shm", "clock", "ports", "token", "directory")
+    assert {name: names.count(name) for name in of_each} == dict.fromkeys(of_each, 3)
+    assert rows[0]["found"].startswith("3 with 2 cores and 0 GPUs; ")
+    assert "reaches all 7 of the head and the nodes" in rows[names.index("ports")]["found"]
+    assert list(tmp_path.iterdir()) == []
+    here = cluster.run("cluster", "doctor", cluster.address, "--shared", "/dev/null")
+    assert (here.returncode, here.stdout) == (2, "")
+    assert "/dev/null is no directory that you can write to" in here.stderr
+
+
+def test_a_cluster_that_cannot_be_entered_is_one_line(capsys, monkeypatch):
+    from gvz import cli
+
+    monkeypatch.setenv("RAY_AUTH_TOKEN", "0" * 32)
+    monkeypatch.delenv("RAY_AUTH_MODE", raising=False)
+    assert cli.main(["cluster", "doctor", "ray://10.0.0.1:10001"]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("error: cluster ray://10.0.0.1:10001: want HOST:PORT")
+    assert err.count("\n") == 1
+
+
+def test_closed_ports_are_named():
+    with socket.create_server(("127.0.0.1", 0)) as open_port, socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        wanted = [("127.0.0.1", s.getsockname()[1], what) for s, what in ((open_port, "open"), (closed, "a node"))]
+        (found,) = closed_ports(wanted)
+    assert found == f"127.0.0.1:{wanted[1][1]} (a node: Connection refused)"
+
+
+def test_tokens_that_are_not_asked_for_or_not_private_are_found(tmp_path):
+    file = tmp_path / "token"
+    file.write_text("0" * 32)
+    file.chmod(0o644)
+    here = {"RAY_AUTH_TOKEN_PATH": str(file), "RAY_USAGE_STATS_ENABLED": "0"}
+    assert security(here) == ("RAY_AUTH_MODE=token was not in its environment when it started", False)
+    assert security({**here, "RAY_AUTH_MODE": "token"}) == (f"others can read {file}; chmod 600", False)
+    file.chmod(0o600)
+    assert security({**here, "RAY_AUTH_MODE": "token"}) == ("", False)
+    assert security({"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0" * 32}) == ("", True)
+
+
+def test_the_problem_of_a_directory_begins_like_a_sentence_about_a_node():
+    assert shared_directory.problem("/nowhere/file", "").startswith("does not see the files of /nowhere")

@@ -1,0 +1,82 @@
+"""The examples for Slurm and Kubernetes: read by ShellCheck and by a parser of YAML; the array script is also run."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+import yaml
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "cluster"
+BIN = Path(sys.executable).parent
+SCRIPTS = sorted(EXAMPLES.glob("*.sbatch"))
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
+def test_shellcheck_finds_nothing(script):
+    done = subprocess.run([BIN / "shellcheck", script], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (0, "")
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
+def test_a_job_is_requeued_and_told_of_its_end_in_time(script):
+    options = [line.removeprefix("#SBATCH ") for line in script.read_text().splitlines() if line.startswith("#SBATCH")]
+    assert {"--requeue", "--signal=B:TERM@300", "--open-mode=append"} <= set(options)
+    assert all(option.startswith("--") for option in options)
+
+
+@pytest.mark.e2e
+@pytest.mark.engine
+def test_an_array_task_that_is_out_of_time_saves_its_run_and_goes_back_into_the_queue(tmp_path):
+    queue = tmp_path / "bin"
+    queue.mkdir()
+    (queue / "scontrol").write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/requeued\n')  # Slurm's; there is none here
+    (queue / "scontrol").chmod(0o700)
+    environment = {
+        **os.environ,
+        "PATH": f"{queue}:{BIN}:{os.environ['PATH']}",
+        "RESULTS": str(tmp_path / "results"),
+        "SLURM_ARRAY_JOB_ID": "7",
+        "SLURM_ARRAY_TASK_ID": "3",
+    }
+    bash = shutil.which("bash")
+    assert bash is not None
+    command = [bash, str(EXAMPLES / "slurm_array.sbatch"), "rainbow_evaluation", "--scale", "0.001"]
+    task = subprocess.Popen(command, env=environment, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    directory = tmp_path / "results" / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111"
+    try:
+        deadline_s = time.monotonic() + 150
+        while not (directory / "metrics.jsonl").exists():
+            assert task.poll() is None, task.communicate()[1]
+            assert time.monotonic() < deadline_s
+            time.sleep(0.05)
+        task.send_signal(signal.SIGTERM)
+        said = task.communicate(timeout=120)[1]
+    finally:
+        task.kill()
+    assert task.returncode == 143, said
+    assert (tmp_path / "requeued").read_text() == "requeue 7_3\n"
+    assert list((directory / "checkpoints").iterdir())
+
+
+def test_the_kubernetes_cluster_asks_for_a_token_shares_results_and_has_shared_memory():
+    claim, cluster = yaml.safe_load_all((EXAMPLES / "kuberay.yaml").read_text())
+    assert (claim["kind"], claim["spec"]["accessModes"]) == ("PersistentVolumeClaim", ["ReadWriteMany"])
+    assert (cluster["apiVersion"], cluster["kind"]) == ("ray.io/v1", "RayCluster")
+    spec = cluster["spec"]
+    assert spec["authOptions"] == {"mode": "token"}
+    groups = [spec["headGroupSpec"], *spec["workerGroupSpecs"]]
+    assert all(isinstance(value, str) for group in groups for value in group["rayStartParams"].values())
+    for pod in (group["template"]["spec"] for group in groups):
+        (container,) = pod["containers"]
+        assert container["image"] == f"registry.example.com/gvizdoom:{version('gvizdoom')}"
+        assert {"name": "RAY_USAGE_STATS_ENABLED", "value": "0"} in container["env"]
+        mounts = {mount["mountPath"]: mount["name"] for mount in container["volumeMounts"]}
+        volumes = {volume["name"]: volume for volume in pod["volumes"]}
+        assert volumes[mounts["/dev/shm"]]["emptyDir"]["medium"] == "Memory"
+        assert volumes[mounts["/results"]]["persistentVolumeClaim"]["claimName"] == claim["metadata"]["name"]
