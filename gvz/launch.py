@@ -14,7 +14,7 @@ from typing import Annotated
 
 import tyro
 
-from gvz.core.errors import GvzError
+from gvz.core.errors import ConfigError, GvzError
 from gvz.core.stop import StopRequest
 from gvz.run.config import RunConfig, with_agent
 from gvz.run.config_files import load_config
@@ -78,10 +78,13 @@ def resumed_config(run: RunDir, config: RunConfig) -> RunConfig:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns the exit code: 0 done, 1 failed, 2 bad input, 130 and 143 stopped and saved."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    in_group = False
     with StopRequest(at_once=True) as stop:  # before the trainer exists, a signal ends the command at once
         try:
             launch = parse(arguments)
             directory = launch.run.resolved_run_dir
+            if launch.fresh and launch.run.group.num_processes > 1:
+                raise ConfigError("--fresh: got it for a group of learner processes; give all another --run-dir")
             if launch.fresh and (moved := move_aside(directory)) is not None:
                 print(f"moved the old run to {moved}", file=sys.stderr)
             with RunDir(Path(directory)) as run:
@@ -90,10 +93,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 stop.importing = True
                 from gvz.run.train import train  # imports jax, so only after the input is checked
 
-                stop.importing = False
+                stop.importing, in_group = False, config.group.num_processes > 1
                 return train(config, run, stop)
         except GvzError as error:
             print(f"error: {error}", file=sys.stderr)
+            if in_group:
+                sys.stderr.flush()
+                os._exit(error.exit_code)  # a normal exit would wait for the other processes
             return error.exit_code
         except KeyboardInterrupt:
             print("stopped at once", file=sys.stderr)

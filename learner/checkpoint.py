@@ -87,7 +87,14 @@ def _checkpointer() -> ocp.Checkpointer:
     logging.getLogger("absl").setLevel(logging.ERROR)  # orbax warns, at every save, of what is meant to be so
     handler = ocp.type_handlers.NumpyHandler(deepcopy_host_arrays=False)
     registry = ocp.type_handlers.create_type_handler_registry((np.ndarray, handler))
-    return ocp.Checkpointer(ocp.PyTreeCheckpointHandler(use_ocdbt=False, type_handler_registry=registry))
+    alone = ocp.options.MultiprocessingOptions()
+    if jax.distributed.is_initialized():
+        # each process writes a whole checkpoint of its own; orbax would write host arrays in process 0 alone, and wait
+        # for all within its threads, where collectives of ours may be under way
+        ocp.multihost.process_index = lambda: 0
+        alone = ocp.options.MultiprocessingOptions(active_processes={0})
+    tree = ocp.PyTreeCheckpointHandler(use_ocdbt=False, type_handler_registry=registry, multiprocessing_options=alone)
+    return ocp.Checkpointer(tree, multiprocessing_options=alone)
 
 
 def _blocks(leaves: list[np.ndarray]) -> dict[str, np.ndarray]:
@@ -201,14 +208,16 @@ def checkpoint_steps(directory: Path) -> list[int]:
     return sorted(int(p.name) for p in directory.glob("*") if p.is_dir() and p.name.isdecimal())
 
 
-def restore_newest(directory: Path, template: Any) -> Restored | None:
-    """Reads the newest valid checkpoint; None if there is no checkpoint at all.
+def restore_newest(directory: Path, template: Any, newest: int | None = None) -> Restored | None:
+    """Reads the newest valid checkpoint, of at most `newest` updates; None if there is no checkpoint at all.
 
     Raises:
         CheckpointError: there are checkpoints but none is valid; names the damage of each.
     """
     damage: list[str] = []
     for step in reversed(checkpoint_steps(directory)):
+        if newest is not None and step > newest:
+            continue
         try:
             arrays, host = read(directory / str(step), template)
         except CheckpointError as error:
@@ -243,8 +252,12 @@ class Checkpointer:
         """A checkpoint is being written."""
         return self._thread is not None and self._thread.is_alive()
 
-    def save(self, num_updates: int, arrays: Any, params: Any, host: dict[str, Any]) -> None:
+    def save(
+        self, num_updates: int, arrays: Any, params: Any, host: dict[str, Any], *, keep_from: int | None = None
+    ) -> None:
         """Snapshots `arrays` now and writes them in the background, `params` beside them for evaluation.
+
+        Checkpoints of `keep_from` updates or more are kept, however many those are.
 
         Waits for an earlier save first. How it ended is kept for `outcome`; a failure is never raised here.
 
@@ -261,6 +274,8 @@ class Checkpointer:
                 # what is newer was damaged when the run went on from an older one: it takes no place among the kept
                 steps = [step for step in checkpoint_steps(self._checkpoints) if step <= num_updates]
                 for step in steps[: -self._keep]:
+                    if keep_from is not None and step >= keep_from:
+                        break
                     shutil.rmtree(self._checkpoints / str(step), ignore_errors=True)
                 self._outcome = ""
             except CheckpointError as error:

@@ -136,7 +136,8 @@ class OffPolicyLearner:
 
     def take_metrics(self) -> dict[str, float]:
         """Means of the train step as `learner/...`, shares of the tasks in the replay as `replay/share/...`."""
-        means, state = train_step.read_metrics(self._state, self._tasks, self._diagnostics_dir)
+        state = self._placement.local(self._state)
+        means, state = train_step.read_metrics(state, self._tasks, self._diagnostics_dir)
         self._state = self._placement.settled(state)
         stored = np.asarray(store.records_per_task(self._parts.replay_spec, self._replay.store))
         shares = zip(self._tasks, (stored / stored.sum()).tolist(), strict=True)
@@ -147,7 +148,7 @@ class OffPolicyLearner:
         return self._ingest.take_staleness()
 
     def check_finite(self) -> None:
-        train_step.check_finite(self._state, self._diagnostics_dir)
+        train_step.check_finite(self._placement.local(self._state), self._diagnostics_dir)
 
     def arrays(self) -> dict[str, Any]:
         state, replay_state = self._placement.canonical(self._state, self._replay)

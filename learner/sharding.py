@@ -79,7 +79,11 @@ class Placement(Protocol):
         ...
 
     def settled(self, state: LearnerState) -> LearnerState:
-        """The same where parts of it were made anew elsewhere, such as empty sums of metrics."""
+        """What `local` gave on all devices again, where parts of it were made elsewhere, such as empty sums."""
+        ...
+
+    def local(self, state: LearnerState) -> LearnerState:
+        """What this process has of it."""
         ...
 
     def one_copy(self, tree: Any) -> Any:
@@ -115,6 +119,9 @@ class OneDevice:
     def canonical(self, state: LearnerState, replay_state: ReplayState) -> tuple[LearnerState, ReplayState]:
         return state, replay_state
 
+    def local(self, state: LearnerState) -> LearnerState:
+        return state
+
     def settled(self, state: LearnerState) -> LearnerState:
         return state
 
@@ -133,7 +140,11 @@ class OneDevice:
 
 
 class SeveralDevices:
-    """The first devices of this process, a shard of the lanes on each (`Placement`)."""
+    """The first devices of every process, a shard of the process's lanes on each (`Placement`).
+
+    The learner's state is of all processes. A replay is of one: its arrays are made parts of larger ones for a train
+    step, without a copy.
+    """
 
     def __init__(self, learning: Learning):
         """Compiles nothing yet.
@@ -143,64 +154,99 @@ class SeveralDevices:
         """
         self._all, self._num_devices = learning, learning.config.devices
         self._each = learning.of_one_of(self._num_devices)
-        self._mesh = Mesh(np.array(devices(self._num_devices)), (AXIS,))
-        self._add = self._jit(self._add_here, (self._replay_specs, SHARDED), self._replay_specs, donated=(0,))
+        here = devices(self._num_devices)
+        of_all = [device for process in range(jax.process_count()) for device in _of_process(process)[: len(here)]]
+        self._here, self._everywhere = (Mesh(np.array(found), (AXIS,)) for found in (here, of_all))
+        specs = self._replay_specs
+        self._add = _jit(self._add_here, self._here, (specs, SHARDED), specs, donated=(0,))
 
     def init(self, key: PRNGKeyArray) -> tuple[LearnerState, ReplayState]:
         def empty() -> ReplayState:
             return self._as_shard(replay.init(self._each.replay_spec))
 
         state = self._put(jax.jit(self._all.init)(key), self._state_specs)
-        return state, self._jit(empty, (), self._replay_specs)()
+        return self._joined(state, self._state_specs), _jit(empty, self._here, (), self._replay_specs)()
 
     def place(self, state: LearnerState, replay_state: ReplayState) -> tuple[LearnerState, ReplayState]:
         sharded = regroup(replay_state, self._all.replay_spec, self._num_devices)
-        return self._put(state, self._state_specs), self._put(sharded, self._replay_specs)
+        state = self._joined(self._put(state, self._state_specs), self._state_specs)
+        return state, self._put(sharded, self._replay_specs)
 
     def canonical(self, state: LearnerState, replay_state: ReplayState) -> tuple[LearnerState, ReplayState]:
-        return state, regroup(replay_state, self._all.replay_spec, None)
+        return self.local(state), regroup(replay_state, self._all.replay_spec, None)
+
+    def local(self, state: LearnerState) -> LearnerState:
+        return self._parted(state, self._state_specs)
 
     def settled(self, state: LearnerState) -> LearnerState:
-        return jax.device_put(state, jax.tree.map(self._sharding, self._state_specs))
+        return self._joined(jax.device_put(state, self._shardings(self._state_specs)), self._state_specs)
 
     def one_copy(self, tree: Any) -> Any:
         return jax.tree.map(lambda leaf: leaf.addressable_data(0), tree)
 
     def add(self, replay_state: ReplayState, arrays: StepArrays) -> ReplayState:
-        return self._add(replay_state, jax.device_put(arrays, self._sharding(SHARDED)))
+        return self._add(replay_state, jax.device_put(arrays, NamedSharding(self._here, SHARDED)))
 
     def blocks(self, ingest: Ingest, blocks: Sequence[StepBlock], params_version: int) -> Iterator[StepArrays]:
         return ingest.shards(blocks, params_version, self._num_devices)
 
     def make_train_step(self, num_updates: int) -> TrainStep:
-        each = self._each
+        each, state_specs, replay_specs = self._each, self._state_specs, self._replay_specs
+        across = Across(self._everywhere.size)
         of_one_device = train_step.of_one_device(
-            each.agent, each.replay_spec, each.config, each.replay_config, num_updates, Across(self._num_devices)
+            each.agent, each.replay_spec, each.config, each.replay_config, num_updates, across
         )
 
-        def here(state: LearnerState, shard: ReplayState, task_weights: Any) -> tuple[LearnerState, ReplayState]:
-            state, own = of_one_device(state, self._of_shard(shard), task_weights)
+        def on_each(state: LearnerState, shard: ReplayState, task_weights: Any) -> tuple[LearnerState, ReplayState]:
+            state, own = of_one_device(state, self._of_shard(shard), task_weights[0])
             return state, self._as_shard(own)
 
-        both = self._state_specs, self._replay_specs
-        return self._jit(here, (*both, REPLICATED), both, donated=(0, 1))
+        both = state_specs, replay_specs
+        compiled = _jit(on_each, self._everywhere, (*both, SHARDED), both, donated=(0, 1))
+
+        def step(state: LearnerState, replay_state: ReplayState, task_weights: Any) -> tuple[LearnerState, ReplayState]:
+            weights = self._put(np.tile(np.asarray(task_weights), (self._num_devices, 1)), SHARDED)
+            state, replay_state = compiled(
+                state, self._joined(replay_state, replay_specs), self._joined(weights, SHARDED)
+            )
+            return state, self._parted(replay_state, replay_specs)
+
+        return step
 
     def _add_here(self, shard: ReplayState, arrays: StepArrays) -> ReplayState:
         arrays = replace(arrays, num_valid=arrays.num_valid[0])
         return self._as_shard(replay.add(self._each.replay_spec, self._of_shard(shard), arrays))
 
-    def _jit(self, here: Callable[..., Any], takes: Any, gives: Any, donated: tuple[int, ...] = ()) -> Any:
-        """Jits what each device does."""
-        mapped = jax.shard_map(here, mesh=self._mesh, in_specs=takes, out_specs=gives, check_vma=False)
-        return jax.jit(mapped, donate_argnums=donated)
-
     def _put(self, tree: Any, specs: Any) -> Any:
-        """Copies of the leaves on the devices: `specs` has the tree's structure."""
+        """Copies of the leaves on this process's devices; `specs` has the tree's structure."""
+        return jax.device_put(tree, self._shardings(specs), may_alias=False)
 
-        return jax.device_put(tree, jax.tree.map(self._sharding, specs), may_alias=False)
+    def _shardings(self, specs: Any) -> Any:
+        return jax.tree.map(lambda spec: NamedSharding(self._here, spec), specs)
 
-    def _sharding(self, spec: PartitionSpec) -> NamedSharding:
-        return NamedSharding(self._mesh, spec)
+    def _joined(self, tree: Any, specs: Any) -> Any:
+        """This process's arrays as parts of arrays of all processes: the same bytes."""
+        num_processes = jax.process_count()
+        if num_processes == 1:
+            return tree
+
+        def join(leaf: jax.Array, spec: PartitionSpec) -> jax.Array:
+            shape = (leaf.shape[0] * num_processes, *leaf.shape[1:]) if spec == SHARDED else leaf.shape
+            return _of_parts(shape, NamedSharding(self._everywhere, spec), leaf)
+
+        return jax.tree.map(join, tree, specs)
+
+    def _parted(self, tree: Any, specs: Any) -> Any:
+        """The parts of this process: the inverse of `_joined`."""
+        num_processes = jax.process_count()
+        if num_processes == 1:
+            return tree
+
+        def part(leaf: jax.Array, spec: PartitionSpec) -> jax.Array:
+            shape = (leaf.shape[0] // num_processes, *leaf.shape[1:]) if spec == SHARDED else leaf.shape
+            return _of_parts(shape, NamedSharding(self._here, spec), leaf)
+
+        return jax.tree.map(part, tree, specs)
 
     @cached_property
     def _state_specs(self) -> Any:
@@ -230,13 +276,33 @@ class SeveralDevices:
         return replace(tree, num_leaves=num_shards * spec.num_slots, num_groups=num_shards * replay.num_groups(spec))
 
 
+def _jit(here: Callable[..., Any], mesh: Mesh, takes: Any, gives: Any, donated: tuple[int, ...] = ()) -> Any:
+    """Jits what each device does."""
+    mapped = jax.shard_map(here, mesh=mesh, in_specs=takes, out_specs=gives, check_vma=False)
+    return jax.jit(mapped, donate_argnums=donated)
+
+
+def _of_parts(shape: tuple[int, ...], sharding: NamedSharding, leaf: jax.Array) -> jax.Array:
+    """An array of this shape whose parts on this process's devices are those of `leaf`."""
+    parts = [shard.data for shard in leaf.addressable_shards]
+    if leaf.size == 0:  # jit gives arrays without elements any sharding
+        empty = np.zeros(sharding.shard_shape(shape), leaf.dtype)
+        parts = [jax.device_put(empty, device) for device in sharding.addressable_devices]
+    return jax.make_array_from_single_device_arrays(shape, sharding, parts)
+
+
+def _of_process(process: int) -> list[Any]:
+    return [device for device in jax.devices() if device.process_index == process]
+
+
 def placement(learning: Learning) -> Placement:
     """Where `learning` happens.
 
     Raises:
         ConfigError: there are not as many devices as it wants.
     """
-    return OneDevice(learning) if learning.config.devices == 1 else SeveralDevices(learning)
+    alone = learning.config.devices == jax.process_count() == 1
+    return OneDevice(learning) if alone else SeveralDevices(learning)
 
 
 def devices(num_devices: int) -> list[Any]:

@@ -56,6 +56,10 @@ class WorkerError(GvzError):
     """An actor failed for good: its restart budget is spent. Carries the last log lines in its message."""
 
 
+class GroupError(GvzError):
+    """A process of a group of learners is gone, so that the others cannot go on."""
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """A hint at the known name that is most similar to `name`, for an error message; empty if none is similar."""
     match = get_close_matches(name, list(known), n=1)

@@ -131,7 +131,8 @@ def read_results(paths: Sequence[Path]) -> Results:
     asked = []
     for path in paths:
         for config in sorted(path.rglob("config.json")) if path.is_dir() else []:
-            if config.parent.resolve() not in runs and "discarded" not in config.parts:
+            of_group = (config.parents[1] / "config.json").exists()  # a further learner process of that run
+            if config.parent.resolve() not in runs and "discarded" not in config.parts and not of_group:
                 run, found = _read_run(config, path)
                 problems += found
                 if run is not None:

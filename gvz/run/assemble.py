@@ -100,7 +100,7 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
         tasks=table.ids,
         num_actors=config.num_actors,
         games_per_actor=config.games_per_actor,
-        seed=config.seed,
+        seed=config.games_seed,
         env_entry_point=ENV_ENTRY_POINT,
         env_config=dataclasses.asdict(config.env),
         frame_shape=config.env.frame_shape,

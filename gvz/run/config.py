@@ -13,6 +13,7 @@ from gvz.cluster.config import ClusterConfig
 from gvz.core.env_config import EnvConfig, leaves
 from gvz.core.errors import ConfigError
 from gvz.run.curriculum_config import CurriculumConfig, check_curriculum
+from gvz.run.group_config import GroupConfig
 from gvz.scenarios.base import Split
 from gvz.task_table import TaskTable, task_table
 from gvz.tasks import named_tasks
@@ -90,6 +91,7 @@ class RunConfig:
     replay: ReplayConfig | None = field(default_factory=ReplayConfig)
     """None for an agent that learns on-policy"""
     learner: LearnerConfig | OnPolicyConfig = field(default_factory=LearnerConfig)
+    group: GroupConfig = field(default_factory=GroupConfig)
     checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
     log: LogConfig = field(default_factory=LogConfig)
 
@@ -116,6 +118,8 @@ class RunConfig:
             )
         if self.cluster.hosts:
             self._check_cluster()
+        if self.group.num_processes > 1:
+            self._check_group()
         check_curriculum(self.curriculum, self.table)
         if self.num_lanes > MAX_LANES:
             raise ConfigError(
@@ -136,6 +140,17 @@ class RunConfig:
                 f"replay.capacity: got {self.replay.capacity}, want at least {least} with cluster.hosts, which is "
                 f"{MIN_CLUSTER_SLOTS} for each of {self.num_lanes} games: records of a host come in batches"
             )
+
+    def _check_group(self) -> None:
+        for name, got, fits, wanted in (
+            ("agent.name", self.agent.name, not self.agent.on_policy, "an agent that learns from a replay"),
+            ("mode", self.mode, self.mode == "async", "async"),
+            ("max_processor_s", self.max_processor_s, self.max_processor_s is None, "none: all must end together"),
+            ("cluster.hosts", self.cluster.hosts, not self.cluster.hosts, "0: these two were never tried together"),
+            ("checkpoint.keep", self.checkpoint.keep, self.checkpoint.keep > 1, "at least 2: one that all have stays"),
+        ):
+            if not fits:
+                raise ConfigError(f"{name}: got {got} with {self.group.num_processes} learner processes, want {wanted}")
 
     def _check_rollouts(self) -> None:
         learner = self.learner
@@ -257,7 +272,14 @@ class RunConfig:
 
     @property
     def resolved_run_dir(self) -> Path:
-        return self.run_dir if self.run_dir is not None else Path("runs") / self.name / f"seed_{self.seed}"
+        """Of process 0 of a group; that of another one is within it."""
+        path = self.run_dir if self.run_dir is not None else Path("runs") / self.name / f"seed_{self.seed}"
+        return path / f"process_{self.group.own_id}" if self.group.own_id else path
+
+    @property
+    def games_seed(self) -> int:
+        """What the games' seeds are made of: another number in every process of a group."""
+        return (self.seed + self.group.own_id * 0x9E3779B1) % 2**31
 
 
 def off_policy(config: RunConfig) -> tuple[LearnerConfig, ReplayConfig]:

@@ -20,6 +20,8 @@ _MAY_CHANGE = (
     "actors.recycle_episodes",
     "learner.num_updates_per_call",
     "learner.devices",
+    "group.process_id",
+    "group.coordinator",
     "agent.conv_form",
     "cluster.*",
     "checkpoint.*",

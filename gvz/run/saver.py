@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 from gvz.core.errors import CheckpointError
 from gvz.run.config import CheckpointConfig
+from gvz.run.group import Group
 from gvz.run.monitor import Counts
 from gvz.run.rundir import RunDir
 from learner.checkpoint import Checkpointer, checkpoint_steps
@@ -47,16 +48,27 @@ class Saver:
         self._checkpointer = Checkpointer(run.path, keep=config.keep)
         self._take, self._report = take, report
         self._num_failed, self._retry_at_s = 0, 0.0
+        self.num_saved = counts.saved_updates
+        """gradient steps of the newest whole checkpoint"""
 
-    def save_when_due(self) -> None:
-        """Begins a checkpoint at every multiple of the period, and again some time after one failed."""
-        if self._checkpointer.busy:
+    @property
+    def busy(self) -> bool:
+        """A checkpoint is being written."""
+        return self._checkpointer.busy
+
+    def save_when_due(self, group: Group) -> None:
+        """Begins a checkpoint at every multiple of the period, and again some time after one failed.
+
+        With other processes only when all do, and not again before the next multiple.
+        """
+        if self.busy:
             return
         self._hear()
         counts, period = self._counts, self._period_updates
         due = counts.updates // period > counts.saved_updates // period
-        if due or (self._num_failed and time.monotonic() > self._retry_at_s):
-            self._begin()
+        alone = group.num_common_saved is None
+        if (due and group.may_save()) or (alone and self._num_failed and time.monotonic() > self._retry_at_s):
+            self._begin(group.num_common_saved)
 
     def save_last(self, begun: Callable[[], None]) -> None:
         """Writes the last checkpoint and waits for it; if it fails it is tried once more.
@@ -96,9 +108,9 @@ class Saver:
         self._checkpointer.wait()
         return self._hear()
 
-    def _begin(self) -> None:
+    def _begin(self, keep_from: int | None = None) -> None:
         self._counts.saved_updates = self._counts.updates
-        self._checkpointer.save(self._counts.updates, *self._take())
+        self._checkpointer.save(self._counts.updates, *self._take(), keep_from=keep_from)
 
     def _hear(self) -> str:
         """Takes note of how a save ended, if one did; returns why it failed."""
@@ -106,7 +118,7 @@ class Saver:
         if failure is None:
             return ""
         if not failure:
-            self._num_failed = 0
+            self._num_failed, self.num_saved = 0, self._counts.saved_updates
             return ""
         retry_s = min(SAVE_RETRY_S * 2**self._num_failed, LONGEST_SAVE_RETRY_S)
         self._num_failed += 1

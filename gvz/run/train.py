@@ -7,7 +7,6 @@ waits for the device between log periods but a checkpoint, and a publication to 
 
 import contextlib
 import dataclasses
-import time
 
 import jax
 import jax.numpy as jnp
@@ -15,20 +14,22 @@ import jax.numpy as jnp
 from actors.pool import STOP_TIMEOUT_S
 from gvz.core import janitor
 from gvz.core.cache import xla_cache_directory
-from gvz.core.errors import CheckpointError, GvzError, WaitTimeoutError, WorkerError
+from gvz.core.errors import CheckpointError, WaitTimeoutError, WorkerError
 from gvz.core.stop import StopRequest
 from gvz.core.watchdog import AwakeClock, Watchdog
 from gvz.run import footprint, machine
 from gvz.run.assemble import RunParts, assemble
 from gvz.run.config import RunConfig
 from gvz.run.curriculum import Curriculum
+from gvz.run.group import Group, join
 from gvz.run.monitor import Counts, Monitor
 from gvz.run.progress import Progress
-from gvz.run.rundir import START_RECORDS, RunDir
+from gvz.run.restore import note_start, restore, state_checked
+from gvz.run.rundir import RunDir
 from gvz.run.saver import Saver, Snapshot
 from gvz.run.telemetry import Telemetry
 from gvz.transport.messages import EpisodeStats, Fault, ParamsHeader
-from learner.checkpoint import Restored, restore_newest
+from learner.checkpoint import Restored
 from learner.memory import keep_freed_memory
 
 DRAIN_RECORDS = 256
@@ -46,9 +47,17 @@ LONGEST_ROUND_S = 1800.0
 class Trainer:
     """One run, from its first update or its newest checkpoint to its last. `close` ends all that it started."""
 
-    def __init__(self, config: RunConfig, run: RunDir, parts: RunParts, progress: Progress, restored: Restored | None):
+    def __init__(
+        self,
+        config: RunConfig,
+        run: RunDir,
+        parts: RunParts,
+        group: Group,
+        progress: Progress,
+        restored: Restored | None,
+    ):
         host = None if restored is None else restored.host
-        self._config, self._run, self._parts, self._progress = config, run, parts, progress
+        self._config, self._run, self._parts, self._group, self._progress = config, run, parts, group, progress
         self._counts = Counts() if host is None else Counts(**host["counts"])
         self._processor_start_s = machine.processor_s() - self._counts.processor_s
         self._learner = parts.learner.make(jax.random.key(config.seed), parts.table.ids, run.path, restored)
@@ -56,7 +65,7 @@ class Trainer:
         self._telemetry = Telemetry(run, parts.table, config.log, self._counts.updates)
         if host is not None:
             self._telemetry.restore(host["telemetry"])
-        self._curriculum = Curriculum(config.curriculum, parts.table, config.seed, host and host["curriculum"])
+        self._curriculum = Curriculum(config.curriculum, parts.table, config.games_seed, host and host["curriculum"])
         self._monitor = Monitor(config, parts, progress, self._telemetry, self._counts)
         self._saver = Saver(run, config.checkpoint, self._counts, self._snapshot, self._monitor.failed_save)
         self._clock, self._collected_s = AwakeClock(LONGEST_WAIT_S), 0.0
@@ -77,14 +86,15 @@ class Trainer:
         self._monitor.look(self._pool.statistics(), self._learner.take_staleness)  # rates count from here
         try:
             with Watchdog("the learner", LONGEST_ROUND_S) as watchdog:
-                while not self._is_done() and not stop.requested:
+                while not self._is_done() and not self._group.stops(stop):
                     watchdog.beat()
                     self._collect()
                     self._supervise()
-                    self._counts.updates += self._learner.update()
+                    if self._group.may_update(self._learner.can_update(), self._saver.busy, self._saver.num_saved):
+                        self._counts.updates += self._learner.update()
                     self._broadcast()
                     self._record()
-                    self._saver.save_when_due()
+                    self._saver.save_when_due(self._group)
         except (WorkerError, WaitTimeoutError):
             with contextlib.suppress(CheckpointError, WaitTimeoutError):  # already reported; the first error is raised
                 self._saver.save_last(self._record_row)
@@ -212,37 +222,23 @@ def train(config: RunConfig, run: RunDir, stop: StopRequest) -> int:
     with Progress() as progress:
         for line in janitor.clean_dead_instances():
             progress.say(f"removed what a dead run left: {line}")
+        group = join(config, progress.say)
         parts = assemble(config, run.work)
         progress.say("\n".join(parts.footprint.lines()))
         footprint.check(parts.footprint)
         acting = jax.ShapeDtypeStruct((parts.pool_config.num_params,), jnp.float32)
-        restored = restore_newest(run.checkpoints, {**parts.learner.array_shapes(), "acting": acting})
-        if restored is None:
-            progress.say(f"new run in {run.path}")
-            run.truncate_records(dict.fromkeys(run.record_lengths(), 0))
-        else:
-            for damage in restored.damage:
-                progress.say(f"damaged checkpoint passed over: {damage}")
-            progress.say(f"run in {run.path} goes on from update {restored.num_updates}")
+        restored = restore(run, {**parts.learner.array_shapes(), "acting": acting}, group, progress.say)
         run.write_config(config)
-        started_from = 0 if restored is None else restored.num_updates
-        run.append(START_RECORDS, {"num_updates": started_from, "time_s": time.time(), **machine.describe()})
+        note_start(run, restored)
         stop.at_once = False
-        try:
-            if restored is not None:
-                run.truncate_records(restored.host["records"])
-            trainer = Trainer(config, run, parts, progress, restored)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            if restored is None or isinstance(error, GvzError):
-                raise
-            raise CheckpointError(
-                f"{run.checkpoints / str(started_from)}: its host state is not one of a run ({error!r}); move it "
-                "aside, and the run goes on from the checkpoint before it"
-            ) from error
+        with state_checked(run, restored):
+            trainer = Trainer(config, run, parts, group, progress, restored)
         del restored
         with contextlib.closing(trainer):
             try:
-                trainer.run(stop)
+                with group.blamed():
+                    trainer.run(stop)
+                    group.leave()
             except KeyboardInterrupt:
                 trainer.close(abandon_save=True)
                 raise

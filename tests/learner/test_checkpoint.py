@@ -42,9 +42,10 @@ def equal(a, b) -> bool:
     return all(np.array_equal(plain(x), plain(y)) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
-def save(run: Path, step: int, keep: int = 2) -> None:
+def save(run: Path, step: int, keep: int = 2, keep_from: int | None = None) -> None:
     saver = checkpoint.Checkpointer(run, keep=keep)
-    saver.save(step, example(step), example(step)["params"], {"num_updates": step, "note": "é"})
+    host = {"num_updates": step, "note": "é"}
+    saver.save(step, example(step), example(step)["params"], host, keep_from=keep_from)
     saver.wait()
     assert saver.outcome() == ""
 
@@ -84,6 +85,16 @@ def test_old_checkpoints_are_pruned_and_parameters_kept(tmp_path):
     assert checkpoint.checkpoint_steps(tmp_path / "policies") == [1, 2, 3]
     params, _ = checkpoint.read(tmp_path / "policies" / "1", example()["params"])
     assert equal(params, example(1)["params"])
+
+
+def test_what_other_processes_go_on_from_is_kept_and_read(tmp_path):
+    for step, keep_from in ((1, None), (2, 0), (3, 2), (4, 2), (5, 2)):
+        save(tmp_path, step, keep_from=keep_from)
+    assert checkpoint.checkpoint_steps(tmp_path / "checkpoints") == [2, 3, 4, 5]
+    restored = checkpoint.restore_newest(tmp_path / "checkpoints", jax.eval_shape(example), newest=3)
+    assert restored is not None
+    assert restored.num_updates == 3
+    assert checkpoint.restore_newest(tmp_path / "checkpoints", jax.eval_shape(example), newest=1) is None
 
 
 def flip(file: Path) -> None:

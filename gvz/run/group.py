@@ -1,0 +1,234 @@
+"""How the processes of one run act as one: they do the same gradient steps, stop after the same, save the same.
+
+Gradients cross processes inside the train step (`learner.sharding`), which all must call equally often. Each call is
+agreed upon before: a process proposes it when its own limiter allows it, and does it when all have. So none waits in
+the device for another one that lacks records. A wish to stop is told to all at once; the next proposals then say so,
+and all stop before the same step.
+"""
+
+import contextlib
+import signal
+from collections.abc import Callable, Generator
+from typing import Any, Protocol
+
+import jax
+
+from gvz.core.env_config import leaves
+from gvz.core.errors import ConfigError, GvzError
+from gvz.core.stop import StopRequest
+from gvz.run import machine
+from gvz.run.config import RunConfig
+from gvz.run.link import Link
+from gvz.run.relay import Forward, Relay, free_port
+from learner.checkpoint import Restored
+
+DECISION_WAIT_S = 0.02
+"""longest wait for the others' proposals before the loop looks after its actors again"""
+ANSWER_TIMEOUT_S = 1800.0
+"""for reading and writing checkpoints"""
+FAILURE_WAIT_S = 5.0
+"""for the news that a process is gone, after an error that this may have caused"""
+_OWN = ("group.process_id", "run_dir", "name", "max_processor_s", "log.", "actors.")
+"""fields that may differ between processes"""
+_MUST_AGREE = ("python", "gvizdoom", "jax", "jaxlib")
+
+
+class Group(Protocol):
+    """The processes that train together."""
+
+    num_common_saved: int | None
+    """gradient steps of the newest checkpoint that all have; None without others"""
+
+    def stops(self, stop: StopRequest) -> bool:
+        """All stop now, because of a signal to any of them; `stop` then has it, too."""
+        ...
+
+    def may_update(self, ready: bool, busy: bool, num_saved: int) -> bool:
+        """All do a call of the train step now.
+
+        Args:
+            ready: this process can.
+            busy: it is writing a checkpoint.
+            num_saved: gradient steps of its newest whole checkpoint.
+        """
+        ...
+
+    def may_save(self) -> bool:
+        """No process was writing a checkpoint when the last call was agreed upon."""
+        ...
+
+    def restored(self, read: Callable[[int | None], Restored | None]) -> Restored | None:
+        """The newest checkpoint that all have; `read` gives this process's newest of at most so many updates."""
+        ...
+
+    def blamed(self) -> contextlib.AbstractContextManager[None]:
+        """Within it, an error that a gone process has caused is raised as GroupError."""
+        ...
+
+    def leave(self) -> None:
+        """All have done their work and go."""
+        ...
+
+
+class Alone:
+    """A run of one process (`Group`)."""
+
+    num_common_saved: int | None = None
+
+    def stops(self, stop: StopRequest) -> bool:
+        return stop.requested
+
+    def may_update(self, ready: bool, busy: bool, num_saved: int) -> bool:
+        return True
+
+    def may_save(self) -> bool:
+        return True
+
+    def restored(self, read: Callable[[int | None], Restored | None]) -> Restored | None:
+        return read(None)
+
+    def blamed(self) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext()
+
+    def leave(self) -> None:
+        pass
+
+
+class Several:
+    """One of several processes (`Group`)."""
+
+    def __init__(self, config: RunConfig, say: Callable[[str], None]):
+        """Waits for the other processes, and makes their devices known to each other. Before any other use of jax.
+
+        Raises:
+            ConfigError: the processes differ in their configuration or their versions. WaitTimeoutError: some do not
+            come.
+        """
+        group = config.group
+        host, port = group.address
+        self._process, self._num_processes = group.own_id, group.num_processes
+        say(f"learner process {self._process} of {self._num_processes}: waiting for the others at {host}:{port}")
+        self._relay = None
+        hello: dict[str, Any] = {"config": _settings(config), "versions": machine.versions(_MUST_AGREE)}
+        if self._process == 0:
+            try:
+                self._relay, hello["port"] = Relay((host, port), self._num_processes), free_port(host)
+            except OSError as error:
+                raise ConfigError(
+                    f"group.coordinator: process 0 cannot listen at {host}:{port} ({error.strerror}); want an address "
+                    "of this machine and a free port"
+                ) from error
+        self._link = Link((host, port), self._process, self._num_processes, hello)
+        if (different := _difference(self._link.hellos)) is not None:
+            with contextlib.suppress(GvzError):
+                self._link.gather("seen", None, FAILURE_WAIT_S, "to see that they differ")
+            raise ConfigError(different)
+        self._join_jax(host, self._link.hellos[0]["port"])
+        self._round, self._proposed, self._stopped, self._told, self._may_save = 0, False, False, False, True
+        self.num_common_saved: int | None = 0
+
+    def _join_jax(self, host: str, port: int) -> None:
+        near = f"{host}:{port}" if self._process == 0 else f"127.0.0.1:{Forward((host, port)).port}"
+        jax.config.update("jax_cpu_collectives_implementation", "gloo")
+        jax.distributed.initialize(
+            near,
+            self._num_processes,
+            self._process,
+            cluster_detection_method="deactivate",
+            coordinator_bind_address=f"{host}:{port}",
+        )
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))  # JAX has taken it, for preemptions
+
+    def stops(self, stop: StopRequest) -> bool:
+        if stop.requested and not self._told:
+            self._link.send("stop", stop.signal)
+            self._told = True
+        if self._stopped:
+            stop.signal = stop.signal or self._link.stop_signal
+        elif self._link.stop_signal is not None and not self._proposed:
+            self._propose(stops=True)
+        return self._stopped
+
+    def may_update(self, ready: bool, busy: bool, num_saved: int) -> bool:
+        self._link.check()
+        if ready and not self._proposed:
+            self._propose(busy=busy, num_saved=num_saved)
+        if not self._proposed:
+            return False
+        proposals = self._link.values("propose", self._round, DECISION_WAIT_S)
+        if proposals is None:
+            return False
+        self._round, self._proposed = self._round + 1, False
+        self._stopped = any(proposal["stops"] for proposal in proposals)
+        if self._stopped:
+            return False
+        self._may_save = not any(proposal["busy"] for proposal in proposals)
+        self.num_common_saved = min(proposal["num_saved"] for proposal in proposals)
+        return True
+
+    def _propose(self, *, stops: bool = False, busy: bool = False, num_saved: int = 0) -> None:
+        self._proposed = True
+        self._link.send("propose", {"stops": stops, "busy": busy, "num_saved": num_saved}, self._round)
+
+    def may_save(self) -> bool:
+        return self._may_save
+
+    def restored(self, read: Callable[[int | None], Restored | None]) -> Restored | None:
+        """As `Group.restored`.
+
+        Raises:
+            CheckpointError: one process has lost its checkpoints.
+        """
+        limit = None
+        while True:
+            found = read(limit)
+            steps = self._link.gather(
+                "checkpoint", 0 if found is None else found.num_updates, ANSWER_TIMEOUT_S, "to read its checkpoint"
+            )
+            if len(set(steps)) == 1:
+                return found
+            limit = min(steps)
+            del found
+
+    @contextlib.contextmanager
+    def blamed(self) -> Generator[None]:
+        try:
+            yield
+        except Exception:
+            self._link.wait_for_failure(FAILURE_WAIT_S)
+            raise
+
+    def leave(self) -> None:
+        self._link.gather("done", None, ANSWER_TIMEOUT_S, "to write its last checkpoint")
+        jax.distributed.shutdown()
+        self._link.close()
+        if self._relay is not None:
+            self._relay.close()
+
+
+def join(config: RunConfig, say: Callable[[str], None]) -> Group:
+    """The group of this process, once all are there.
+
+    Raises:
+        ConfigError, WaitTimeoutError: as `Several`.
+    """
+    return Alone() if config.group.num_processes == 1 else Several(config, say)
+
+
+def _settings(config: RunConfig) -> dict[str, str]:
+    """What must be the same in all processes, by name."""
+    return {name: repr(value) for name, value in leaves(config) if not name.startswith(_OWN)}
+
+
+def _difference(hellos: list[dict[str, Any]]) -> str | None:
+    """What is not the same in all processes, in words."""
+    first = hellos[0]
+    for process, hello in enumerate(hellos):
+        for part, what in (("versions", "the version of "), ("config", "")):
+            for name in {**first[part], **hello[part]}:
+                one, other = first[part].get(name), hello[part].get(name)
+                if one != other:
+                    return (
+                        f"group: {what}{name} is {one} in learner process 0 and {other} in {process}; want it the same"
+                    )
+    return None

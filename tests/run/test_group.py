@@ -1,0 +1,253 @@
+"""Processes that act as one, here as threads without devices: what is agreed, refused, and noticed."""
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from gvz.core.errors import ConfigError, GroupError, WaitTimeoutError
+from gvz.core.stop import StopRequest
+from gvz.launch import main
+from gvz.run import link, relay
+from gvz.run.config import CheckpointConfig
+from gvz.run.config_files import load_config
+from gvz.run.group import Several
+from gvz.run.group_config import GroupConfig
+from gvz.run.relay import Forward, Relay, free_port
+from learner.checkpoint import Restored
+
+CONFIG = load_config("rainbow_4task")
+
+
+class WithoutDevices(Several):
+    def _join_jax(self, host: str, port: int) -> None:
+        assert port > 0
+
+
+def in_threads(works: list[Callable[[], Any]], timeout_s: float = 60.0) -> list[Any]:
+    """What each gave, or the error that it raised."""
+    found: list[Any] = [None] * len(works)
+
+    def run(i: int) -> None:
+        try:
+            found[i] = works[i]()
+        except Exception as error:
+            found[i] = error
+
+    threads = [threading.Thread(target=run, args=(i,), daemon=True) for i in range(len(works))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(timeout_s)
+        assert not thread.is_alive()
+    return found
+
+
+def joined(num_processes: int, **changes: Any) -> list[Any]:
+    """A group, each process in a thread; `changes` are of the last one's configuration."""
+    address = f"127.0.0.1:{free_port('127.0.0.1')}"
+
+    def start(process: int) -> Several:
+        group = GroupConfig(num_processes=num_processes, process_id=process, coordinator=address)
+        config = replace(CONFIG, group=group, **(changes if process == num_processes - 1 else {}))
+        return WithoutDevices(config, lambda _: None)
+
+    return in_threads([lambda p=process: start(p) for process in range(num_processes)])
+
+
+@contextlib.contextmanager
+def group_of(num_processes: int):
+    groups = joined(num_processes)
+    yield groups
+    for group in groups:
+        group._link.close()
+    groups[0]._relay.close()
+
+
+def until(condition: Callable[[], Any], timeout_s: float = 30.0) -> Any:
+    deadline_s = time.monotonic() + timeout_s
+    while not (found := condition()):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+    return found
+
+
+def test_a_step_is_done_when_all_are_ready_and_a_save_when_nobody_writes():
+    with group_of(3) as groups:
+        assert not groups[0].may_update(True, False, 100)
+        assert not groups[1].may_update(True, True, 50)
+        assert not groups[2].may_update(False, False, 100)
+        assert not groups[0].may_update(True, False, 100)
+        assert all(in_threads([lambda g=g: until(lambda: g.may_update(True, False, 100)) for g in groups]))
+        assert [group.may_save() for group in groups] == [False] * 3
+        assert [group.num_common_saved for group in groups] == [50] * 3
+        assert all(in_threads([lambda g=g: until(lambda: g.may_update(True, False, 200)) for g in groups]))
+        assert [group.may_save() for group in groups] == [True] * 3
+        assert [group.num_common_saved for group in groups] == [200] * 3
+
+
+def test_a_signal_to_one_stops_all_before_the_same_step_also_those_that_are_not_ready():
+    stops = [StopRequest(), StopRequest()]
+    with group_of(2) as groups:
+        counts = [0, 0]
+
+        def run(i: int) -> None:
+            while not groups[i].stops(stops[i]):
+                ready = i == 1 or counts[0] < 5  # process 0 lacks records from then on
+                counts[i] += groups[i].may_update(ready, False, 0)
+                if counts[1] == 5:
+                    stops[1].signal = 15
+
+        in_threads([lambda i=i: run(i) for i in range(2)])
+    assert counts == [5, 5]
+    assert [stop.exit_code for stop in stops] == [143, 143]
+
+
+def test_all_go_on_from_the_newest_checkpoint_that_all_have():
+    have = [[100, 200, 300], [100, 200], [100, 200, 250]]
+
+    def read(steps: list[int], newest: int | None) -> Restored | None:
+        fits = [step for step in steps if newest is None or step <= newest]
+        return Restored(num_updates=fits[-1], arrays=None, host={}, damage=[]) if fits else None
+
+    with group_of(3) as groups:
+        works = [lambda g=g, s=s: g.restored(lambda n: read(s, n)) for g, s in zip(groups, have, strict=True)]
+        assert [found.num_updates for found in in_threads(works)] == [200, 200, 200]
+        works = [lambda g=g, s=s: g.restored(lambda n: read(s, n)) for g, s in zip(groups, [[1], [], [1]], strict=True)]
+        assert in_threads(works) == [None, None, None]
+
+
+def test_a_process_that_goes_is_known_at_once_and_one_that_is_done_may_go():
+    with group_of(3) as groups:
+        groups[1]._link.close()
+        for group in (groups[0], groups[2]):
+            with pytest.raises(GroupError, match=r"learner process 1 of 3 is gone, so the group ends; .*same commands"):
+                until(lambda g=group: g.may_update(True, False, 0))
+            with pytest.raises(GroupError, match="is gone"), group.blamed():
+                raise RuntimeError("Gloo all-reduce failed: connection reset by peer")
+    with group_of(2) as groups:
+        in_threads([lambda g=g: g._link.gather("done", None, 30, "to end") for g in groups])
+        groups[0]._link.close()
+        groups[0]._relay.close()
+        until(lambda: 0 in groups[1]._link._done)
+        time.sleep(0.2)
+        groups[1]._link.check()
+
+
+def test_a_silent_process_counts_as_gone(monkeypatch):
+    monkeypatch.setattr(link, "BEAT_PERIOD_S", 0.1)
+    monkeypatch.setattr(link, "SILENCE_TIMEOUT_S", 2.0)
+    with group_of(2) as groups:
+        groups[1]._link.send = lambda *_: None
+        with pytest.raises(GroupError, match=r"learner process 1 of 2 is silent for 2 s"):
+            groups[0]._link.wait_for_failure(30)
+
+
+def test_processes_that_differ_are_refused_on_both_sides_by_the_name_of_what_differs():
+    found = joined(2, learner=replace(CONFIG.learner, batch_size=64))
+    assert [type(error) for error in found] == [ConfigError, ConfigError]
+    assert {str(error) for error in found} == {
+        "group: learner.batch_size is 32 in learner process 0 and 64 in 1; want it the same"
+    }
+    assert not any(isinstance(error, Exception) for error in joined(2, name="another"))
+
+
+def test_two_processes_with_one_number_and_strangers_are_turned_away(monkeypatch):
+    monkeypatch.setattr(relay, "HELLO_TIMEOUT_S", 0.2)
+    address = "127.0.0.1", free_port("127.0.0.1")
+    the_relay = Relay(address, 2)
+    for said in (b"GET / HTTP/1.1\r\n\r\n", b'{"kind": "hello"}\n', b"[]\n", b"\xff\xfe\n", b""):
+        with socket.create_connection(address) as stranger:
+            stranger.sendall(said)
+            stranger.settimeout(30)
+            assert stranger.recv(1) == b""
+    first = threading.Thread(target=link.Link, args=(address, 0, 2, {}), daemon=True)
+    first.start()
+    until(lambda: the_relay._connections)
+    with pytest.raises(ConfigError, match=r"group\.process_id: process_id 0 is taken, or not one of 2; each learner"):
+        link.Link(address, 0, 2, {})
+    assert set(link.Link(address, 1, 2, {"of": 1}).hellos[1]) == {"of"}
+    first.join(30)
+    the_relay.close()
+
+
+def test_waits_for_the_others_are_bounded_and_say_for_whom(monkeypatch):
+    monkeypatch.setattr(link, "JOIN_TIMEOUT_S", 0.3)
+    address = "127.0.0.1", free_port("127.0.0.1")
+    with pytest.raises(
+        WaitTimeoutError, match=r"waited 0 s for learner process 0 at 127\.0\.0\.1:\d+ \(.*\); start it"
+    ):
+        link.Link(address, 1, 3, {})
+    the_relay = Relay(address, 3)
+    with pytest.raises(WaitTimeoutError, match=r"waited 0 s for learner processes 1, 2 to connect to 127\.0\.0\.1"):
+        link.Link(address, 0, 3, {})
+    the_relay.close()
+
+
+def test_a_forwarded_connection_outlives_the_other_end():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        near = socket.create_connection(("127.0.0.1", Forward(server.getsockname()[:2]).port))
+        far, _ = server.accept()
+        near.sendall(b"out")
+        far.sendall(b"in")
+        assert (far.recv(3), near.recv(2)) == (b"out", b"in")
+        far.close()
+        near.settimeout(0.3)
+        with pytest.raises(TimeoutError):
+            near.recv(1)
+        near.close()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({}, r"group\.coordinator: got None for 2 processes, want HOST:PORT"),
+        ({"coordinator": "here", "process_id": 0}, r"group\.coordinator: got 'here'"),
+        ({"coordinator": "here:1", "process_id": 2}, r"group\.process_id: got 2, want 0\.\.1"),
+        (
+            {"coordinator": "here:1"},
+            r"group\.process_id: got nothing for 2 processes, want 0\.\.1; without it SLURM_PROCID",
+        ),
+    ],
+)
+def test_a_group_that_is_not_whole_is_refused(values, message, monkeypatch):
+    monkeypatch.delenv("SLURM_PROCID", raising=False)
+    with pytest.raises(ConfigError, match=message):
+        GroupConfig(num_processes=2, **values)
+
+
+def test_slurm_says_which_process_this_is_and_each_has_a_directory_and_games_of_its_own(monkeypatch):
+    monkeypatch.setenv("SLURM_PROCID", "1")
+    config = replace(CONFIG, group=GroupConfig(num_processes=2, coordinator="here:1"))
+    assert config.group.own_id == 1
+    assert config.resolved_run_dir == CONFIG.resolved_run_dir / "process_1"
+    assert config.games_seed != CONFIG.games_seed == CONFIG.seed
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mode": "sync"}, r"mode: got sync with 2 learner processes, want async"),
+        ({"max_processor_s": 5.0}, r"max_processor_s: got 5\.0 with 2 learner processes, want none"),
+        (
+            {"checkpoint": CheckpointConfig(keep=1)},
+            r"checkpoint\.keep: got 1 with 2 learner processes, want at least 2",
+        ),
+    ],
+)
+def test_what_a_group_cannot_do_is_refused(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        replace(CONFIG, group=GroupConfig(num_processes=2, process_id=0, coordinator="here:1"), **changes)
+
+
+def test_a_fresh_start_of_a_group_is_refused(tmp_path, capsys):
+    group = "--group.num-processes 2 --group.process-id 0 --group.coordinator 127.0.0.1:1".split()
+    assert main(["--fresh", "--run-dir", str(tmp_path), *group]) == 2
+    assert capsys.readouterr().err == (
+        "error: --fresh: got it for a group of learner processes; give all another --run-dir\n"
+    )
