@@ -6,7 +6,7 @@ INTEROP := .venv-interop
 PEERS  := .venv-peers
 ARGS   ?=
 
-.PHONY: help install engine install-cuda train test test-fast test-slow test-isa test-browser test-interop learning-seeds pipeline lint format lock bench bench-peers bench-micro soak fuzz docs clean
+.PHONY: help install engine install-cuda train test test-fast test-slow test-isa test-browser test-interop learning-seeds pipeline lint format lock bench bench-peers bench-micro soak soak-hosts fuzz docs clean
 
 help:            ## show this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -95,6 +95,10 @@ $(PEERS)-dopamine/.installed: $(VENV)/.installed benchmarks/peers/requirements-d
 
 soak: install    ## the main job for an hour while its actors are killed; then the page and plot made of it
 	$(BIN)/python -m benchmarks.soak $(ARGS)
+	$(BIN)/python -m benchmarks.reliability
+
+soak-hosts: install ## a run on actor hosts for 20 minutes while these are killed; then the page made of it
+	$(BIN)/python -m benchmarks.hosts_soak $(ARGS)
 	$(BIN)/python -m benchmarks.reliability
 
 fuzz: install    ## damaged input for all that parses, a minute a target, coverage-guided; then the page made of it

@@ -8,13 +8,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from benchmarks import record
+from benchmarks import hosts_soak, record
 from benchmarks.report import between
 from benchmarks.soak import DIRECTORY, SCHEMA, kill_ratios, summary
 from gvz.core.errors import ConfigError
 
 PAGE = record.ROOT / "docs" / "RELIABILITY.md"
 RECORDS = (DIRECTORY / "soak.json", DIRECTORY / "fuzz.json")
+HOSTS_RECORD = DIRECTORY / "hosts_soak.json"
 PLOT = record.ROOT / "docs" / "images" / "reliability_soak.png"
 _GROWS = {
     "learner_bytes": "resident memory of the learner",
@@ -123,13 +124,15 @@ def draw(made: dict[str, Any], out: Path) -> None:
 
 
 def write_page(page: str, soak: dict[str, Any], fuzz: dict[str, Any]) -> str:
-    """The page with what the two records give between its markers.
+    """The page with what the two records, and that of the hosts' soak, give between its markers.
 
     Raises:
         ConfigError: a marker is missing.
     """
     command = "python -m benchmarks.reliability"
     page = between(page, PAGE, "soak", soak_table(soak), command)
+    hosts = read(HOSTS_RECORD) if HOSTS_RECORD.exists() else None
+    page = between(page, PAGE, "hosts_soak", hosts_soak.table(hosts), command)
     return between(page, PAGE, "fuzz", fuzz_table(fuzz), command)
 
 

@@ -30,6 +30,7 @@ GOALS = {
     10: ("vector", "Vector environment"),
     11: ("placement", "Placement"),
     12: ("gpu", "GPU"),
+    13: ("cluster", "Actor hosts"),
 }
 """number -> (benchmark, title); a benchmark may have figures and no goal"""
 RATES = ("decisions", "frames", "updates", "samples")

@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -62,16 +62,21 @@ class Soak:
 class Watched:
     """A run of the real command, its actors and its use of the machine."""
 
-    def __init__(self, directory: Path, flags: Sequence[str]):
+    def __init__(self, directory: Path, flags: Sequence[str], environment: Mapping[str, str]):
         self.directory = directory
         self._before = _shared("ViZDoom")
         words = ["--config", "rainbow_4task.py", "--run-dir", str(directory), "--log.period-updates", "5", *flags]
         self.command = [sys.executable, "-m", "gvz.launch", *words]
         self._output = (directory.parent / "output.log").open("w+b")
         self.process = subprocess.Popen(
-            self.command, stdout=self._output, stderr=self._output, cwd=record.ROOT, env=record.environment()
+            self.command, stdout=self._output, stderr=self._output, cwd=record.ROOT, env=environment
         )
         self._root = psutil.Process(self.process.pid)
+
+    def close(self) -> None:
+        """Ends what still runs."""
+        end_run(self.process)
+        self._output.close()
 
     def output(self) -> str:
         """The end of the command's output."""
@@ -140,7 +145,7 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
     started = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
     hardware, commit = machine.hardware(), record.describe_commit()
     with tempfile.TemporaryDirectory(prefix="gvz-soak-") as directory:
-        run = Watched(Path(directory) / "run", options.flags)
+        run = Watched(Path(directory) / "run", options.flags, record.environment())
         samples: list[dict[str, float]] = []
         kills: list[float] = []
         stretches: list[dict[str, Any]] = []
@@ -150,7 +155,7 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
             begin = time.time()
             for kind, seconds in _plan(options):
                 stretch = {"kind": kind, "begin_s": time.time() - begin}
-                for now in _ticks(seconds, options.sample_s):
+                for now in ticks(seconds, options.sample_s):
                     run.check()
                     samples.append({"time_s": round(time.time() - begin, 1), **run.sample()})
                     due = kind == "kills" and now >= options.kill_every_s * _killed_since(kills, stretch)
@@ -162,7 +167,7 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
             run.process.send_signal(signal.SIGTERM)
             code = run.process.wait(_STOP_TIMEOUT_S)
         finally:
-            end_run(run.process)
+            run.close()
         rows, problems = records.read(run.directory / "metrics.jsonl")
         faults, _ = records.read(run.directory / "faults.jsonl")
         for stretch in stretches:
@@ -171,7 +176,7 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
             "schema": SCHEMA,
             "date": started,
             "commit": commit,
-            "command": shlex.join(["python", "-m", "benchmarks.soak", *_words(options)]),
+            "command": shlex.join(["python", "-m", "benchmarks.soak", *words_of(options)]),
             "machine": hardware,
             "versions": machine.versions(),
             "settings": {**asdict(options), "out": None, "flags": list(options.flags)},
@@ -231,7 +236,7 @@ def _plan(options: Soak) -> Iterator[tuple[str, float]]:
     yield quiet
 
 
-def _ticks(seconds: float, period_s: float) -> Iterator[float]:
+def ticks(seconds: float, period_s: float) -> Iterator[float]:
     """Seconds since the first tick, one every `period_s`, for `seconds`."""
     start = time.monotonic()
     number = 0
@@ -262,10 +267,9 @@ def _count(kinds: Iterator[str]) -> dict[str, int]:
     return counts
 
 
-def _words(options: Soak) -> list[str]:
-    """The options without default values, as words of the command line."""
-    default = Soak()
-    words = []
+def words_of(options: Any) -> list[str]:
+    """The options of a soak, a dataclass, without default values, as words of the command line."""
+    default, words = type(options)(), list[str]()
     for name, value in asdict(options).items():
         if name not in ("out", "flags") and value != getattr(default, name):
             words += [f"--{name.replace('_', '-')}", f"{value:g}"]

@@ -9,44 +9,32 @@ import contextlib
 import secrets
 import threading
 import time
-from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gvz.cluster.backend import Backend, Call, HostError, Machine
+from gvz.cluster.backend import Backend, Call, HostError
 from gvz.cluster.config import ClusterConfig
 from gvz.cluster.hello import Hello, differences
+from gvz.cluster.inbox import Inbox
+from gvz.cluster.placement import MAX_FAILED_STARTS, Placement
 from gvz.cluster.supervised import Incarnation, SupervisedHost
 from gvz.cluster.wire import Batch, read_header, unpack
 from gvz.core.errors import ConfigError, TransportError, WorkerError
 from gvz.core.watchdog import AwakeClock
-from gvz.transport.messages import Fault, Message, ParamsHeader, StepBlock
+from gvz.transport.messages import Fault, ParamsHeader
 
 _WAIT_S = 0.02
 """longest wait for an answer before the credits are looked at again"""
+_LOOK_AGAIN_S = 1.0
+"""until a host that found no machine looks again"""
 _LONGEST_PAUSE_S = 1.0
 """most of a round that counts as a host's silence"""
-MAX_FAILED_STARTS = 3
-"""hosts in a row that did not come to play on a machine; then it is set aside"""
 _KEPT_VERSIONS = 1000
-
-
-@dataclass(kw_only=True, slots=True)
-class Inbox:
-    """What the dispatcher has for the learner's thread; both hold `changed` when they touch it."""
-
-    changed: threading.Condition = field(default_factory=threading.Condition)
-    batches: deque[tuple[SupervisedHost, StepBlock]] = field(default_factory=deque[tuple[SupervisedHost, StepBlock]])
-    """what the learner has not taken, in the order it came"""
-    messages: list[Message] = field(default_factory=list[Message])
-    failure: Exception | None = None
-    counts: Counter[str] = field(default_factory=Counter[str])
-    """received_bytes, dropped_records, cut_episodes, host_restarts"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -67,8 +55,7 @@ class Dispatcher:
         self._backend, self._hosts, self._config, self._ours = backend, hosts, config, ours
         self._run_id = secrets.token_hex(8)
         self._calls: dict[Call, _Asked] = {}
-        self._failed_on: Counter[str] = Counter()
-        self._set_aside: set[str] = set()
+        self._placement = Placement(backend, hosts, config)
         self._forced: set[str] = set()  # machines on which a host was ended by force
         self._clock = AwakeClock(_LONGEST_PAUSE_S)
         self._enough_s = 0.0  # when enough hosts played last
@@ -87,7 +74,7 @@ class Dispatcher:
         Raises:
             ConfigError: a machine differs from this one, or has no room; fewer than `min_hosts` hosts came to play.
         """
-        self._check_room()
+        self._placement.check_room()
         start_s = time.monotonic()
         while not all(host.is_playing or self._gave_up(host) for host in self._hosts):
             if time.monotonic() - start_s > timeout_s:
@@ -114,14 +101,18 @@ class Dispatcher:
     def end_hosts(self, grace_s: float) -> None:
         """Ends every host, those that do not end in time by force, and cleans the machines where that was done."""
         lives = [host.incarnation for host in self._hosts if host.incarnation is not None]
+        patience_s = 3 * grace_s
         with contextlib.suppress(HostError):
-            closing = {life.remote.close(2 * grace_s): life for life in lives if life.playing_s and grace_s > 0.0}
-            ended = [call for call in self._wait_for_all(list(closing), 3 * grace_s) if self._backend.result(call)]
-            for life in lives:
-                life.remote.kill()
+            closing = {
+                life.remote.close(2 * grace_s): life for life in lives if grace_s > 0.0 and life.playing_s is not None
+            }
+            ended = self._ended_well(list(closing), patience_s)
             self._forced |= {life.machine for call, life in closing.items() if call not in ended}
-            if grace_s > 0.0:
-                self._wait_for_all([self._backend.clean(machine) for machine in sorted(self._forced)], 3 * grace_s)
+        for life in lives:
+            life.remote.kill()
+        with contextlib.suppress(HostError):
+            machines = sorted(self._forced) if grace_s > 0.0 else []
+            self._ended_well([self._backend.clean(machine) for machine in machines], patience_s)
 
     def publish(self, params: ArrayLike, header: ParamsHeader) -> None:
         """Newest parameters; they go out with the next round that may send some."""
@@ -161,28 +152,45 @@ class Dispatcher:
     # ------------------------------------------------------------------------------------------- starting
 
     def _start(self, host: SupervisedHost) -> None:
-        if self._clock.now_s < host.start_at_s or (machine := self._choose(host)) is None:
+        now_s = self._clock.now_s
+        if now_s < host.start_at_s:
             return
+        host.start_at_s = now_s + _LOOK_AGAIN_S
         try:
-            remote = self._backend.start(machine.id, self._cpus(host))
-            number, host.num_lives = host.num_lives, host.num_lives + 1
-            now_s = self._clock.now_s
-            life = host.incarnation = Incarnation(
-                number=number,
-                machine=machine.id,
-                name=machine.name,
-                remote=remote,
-                first_episodes=list(host.lanes.next_episodes),
-                began_s=now_s,
-                heard_s=now_s,
-            )
-            self._call(host, life, remote.greet(host.pool), self._greeted)
+            if (machine := self._placement.choose(host)) is None:
+                self._say_no_room(host)
+                return
+            remote = self._backend.start(machine.id, self._placement.cores(host))
         except HostError as error:
-            host.start_at_s = self._clock.now_s + 1.0
-            self._last_failure = f"{machine.name}: {error}"
+            self._last_failure = str(error)
+            return
+        host.waits_for_room = False
+        number, host.num_lives = host.num_lives, host.num_lives + 1
+        life = host.incarnation = Incarnation(
+            number=number,
+            machine=machine.id,
+            name=machine.name,
+            remote=remote,
+            first_episodes=list(host.lanes.next_episodes),
+            heard_s=now_s,
+        )
+        self._call(host, life, remote.greet(host.pool), self._greeted)
+
+    def _say_no_room(self, host: SupervisedHost) -> None:
+        """Once, until there is some."""
+        if not host.waits_for_room:
+            host.waits_for_room = True
+            what = f"no node has room for {self._placement.cores(host)} cores"
+            if aside := len(self._placement.set_aside):
+                what += f" ({aside} set aside)"
+            else:
+                self._last_failure = what
+            self._say("host_start", f"host {host.index} waits: {what}")
 
     def _greeted(self, host: SupervisedHost, life: Incarnation, answer: Any) -> None:
         theirs = msgspec.msgpack.decode(answer, type=Hello)
+        if not self._greeting:  # files that were edited meanwhile: an actor restarted on one machine takes them, too
+            theirs = msgspec.structs.replace(theirs, code=self._ours.code)
         problem = theirs.refusal
         if differing := differences(self._ours, theirs):
             problem = f"{differing[0]}; install the same on every node"
@@ -200,34 +208,9 @@ class Dispatcher:
         del host, answer
         life.playing_s = life.heard_s = self._clock.now_s
 
-    def _choose(self, host: SupervisedHost) -> Machine | None:
-        """A machine with room: rather one without a host, not where this one ended last, not the learner's."""
-        taken = Counter(h.incarnation.machine for h in self._hosts if h.incarnation is not None)
-        need = self._cpus(host)
-        try:
-            machines = [m for m in self._backend.machines() if m.id not in self._set_aside]
-        except HostError as error:
-            self._last_failure = str(error)
-            return None
-        fitting = [m for m in machines if m.cpus >= need * (taken[m.id] + 1)]
-        return min(fitting, key=lambda m: (taken[m.id], m.id == host.avoid, m.has_learner, m.name), default=None)
-
-    def _check_room(self) -> None:
-        """Raises ConfigError: the machines have not the cores for `min_hosts` hosts."""
-        need, machines = self._cpus(self._hosts[0]), self._backend.machines()
-        if sum(m.cpus // need if need else 1 for m in machines) < self._config.min_hosts:
-            sizes = ", ".join(f"{m.name} {m.cpus}" for m in machines)
-            raise ConfigError(
-                f"cluster.hosts: got {len(self._hosts)} hosts of {need} cores each, but the cluster's nodes have "
-                f"{sizes}; lower actors.num_actors or cluster.cpus_per_host, or add nodes"
-            )
-
-    def _cpus(self, host: SupervisedHost) -> int:
-        cpus = self._config.cpus_per_host
-        return host.pool.num_actors if cpus is None else cpus
-
     def _gave_up(self, host: SupervisedHost) -> bool:
-        return host.incarnation is None and host.num_lives >= MAX_FAILED_STARTS
+        """The run begins without it."""
+        return host.incarnation is None and (host.waits_for_room or host.num_lives >= MAX_FAILED_STARTS)
 
     # ------------------------------------------------------------------------------------------- flow
 
@@ -272,7 +255,13 @@ class Dispatcher:
         if not self._calls:
             time.sleep(_WAIT_S)
             return
-        for call in self._backend.wait(list(self._calls), _WAIT_S):
+        try:
+            ended = self._backend.wait(list(self._calls), _WAIT_S)
+        except HostError as error:  # while this lasts, hosts are silent
+            self._last_failure = str(error)
+            time.sleep(_WAIT_S)
+            return
+        for call in ended:
             asked = self._calls.pop(call)
             host, life = asked.host, asked.life
             try:
@@ -341,9 +330,7 @@ class Dispatcher:
             f"host {host.index} on {life.name} {_first_line(what)}; {cut} episodes cut, replaced in {wait_s:.1f} s"
         )
         self._say(kind, message, what)
-        self._failed_on[life.machine] = 0 if life.was_stable(now_s) else self._failed_on[life.machine] + 1
-        if self._failed_on[life.machine] >= MAX_FAILED_STARTS:
-            self._set_aside.add(life.machine)
+        if self._placement.note_end(life.machine, was_stable=life.was_stable(now_s)):
             message = f"node {life.name} is set aside: {MAX_FAILED_STARTS} hosts in a row did not stay up there"
             self._say("node_set_aside", message)
 
@@ -382,13 +369,15 @@ class Dispatcher:
     ) -> None:
         self._calls[call] = _Asked(host=host, life=life, answer=answer)
 
-    def _wait_for_all(self, calls: Sequence[Call], timeout_s: float) -> list[Call]:
-        """Those that have ended in time."""
-        waiting, deadline_s = list(calls), time.monotonic() + timeout_s
+    def _ended_well(self, calls: Sequence[Call], timeout_s: float) -> list[Call]:
+        """Those that have ended in time and said something true."""
+        waiting, well, deadline_s = list(calls), list[Call](), time.monotonic() + timeout_s
         while waiting and time.monotonic() < deadline_s:
-            ended = self._backend.wait(waiting, _WAIT_S)
-            waiting = [call for call in waiting if call not in ended]
-        return [call for call in calls if call not in waiting]
+            for call in self._backend.wait(waiting, _WAIT_S):
+                waiting.remove(call)
+                with contextlib.suppress(HostError):
+                    well += [call] if self._backend.result(call) else []
+        return well
 
 
 def _first_line(text: str) -> str:

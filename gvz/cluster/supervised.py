@@ -29,8 +29,6 @@ class Incarnation:
     """of the machine"""
     remote: Remote
     first_episodes: list[int]
-    began_s: float
-    """when it was started"""
     heard_s: float
     """when it last answered, or was first asked"""
     playing_s: float | None = None
@@ -60,6 +58,7 @@ class SupervisedHost:
         waiting_batches: batches that have come and were not taken by the learner yet.
         assigned: tasks of lanes that are to be sent.
         avoid: the machine where its last life ended.
+        waits_for_room: no machine has the cores for its next life.
     """
 
     def __init__(self, index: int, pool: PoolConfig, lanes: LaneState, config: ClusterConfig):
@@ -67,7 +66,7 @@ class SupervisedHost:
         self.incarnation: Incarnation | None = None
         self.start_at_s, self.num_lives, self.waiting_batches = 0.0, 0, 0
         self.assigned: list[tuple[int, int]] = []
-        self.avoid = ""
+        self.avoid, self.waits_for_room = "", False
         self.params_age_s = 0.0
         self.actor_restarts, self.waited_for_space_s = 0, 0.0  # of earlier incarnations
         self._in_episode = np.zeros(len(pool.lanes), bool)
@@ -152,7 +151,10 @@ class SupervisedHost:
     def _check(self, batch: Batch) -> None:
         """What the learner would take for a damage of its own run."""
         lanes, tasks, steps = self.pool.lanes, len(self.pool.tasks), batch.block.steps
+        newest = 0 if self.incarnation is None else max(0, self.incarnation.params_version)
         if len(steps):
+            if (got := int(steps["params_version"].max())) > newest:
+                raise TransportError(f"got actions of parameters version {got}, but it was given {newest}")
             low, high = int(steps["lane"].min()), int(steps["lane"].max())
             if not (low in lanes and high in lanes and int(steps["task"].max()) < tasks):
                 raise TransportError(f"got records of lanes {low}..{high}, want {lanes.start}..{lanes.stop - 1}")

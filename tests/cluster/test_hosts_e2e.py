@@ -13,7 +13,9 @@ from typing import Any
 
 import psutil
 import pytest
+from rich.console import Console
 
+from benchmarks import hosts_soak
 from gvz.core import janitor, records
 from learner.checkpoint import checkpoint_steps
 from tests.cluster.conftest import RayCluster
@@ -152,6 +154,19 @@ def test_a_run_of_two_hosts_goes_on_on_one_machine(command: Command):
     )
     assert done.returncode == 0, done.stderr
     assert command.rows("starts.jsonl")[-1]["num_updates"] == 40
+
+
+@pytest.mark.slow
+def test_the_short_soak_loses_nothing_and_leaves_nothing(cluster: RayCluster):
+    flags = [*SMALL[SMALL.index("--env.frame-height") : SMALL.index("--log.period-updates")], "--cluster.batch-records"]
+    options = hosts_soak.HostsSoak(minutes=0.3, kill_every_s=8.0, hosts=2, sample_s=1.0, flags=(*flags, "64"))
+    made = hosts_soak.soak(options, cluster, Console(quiet=True))
+    assert len(made["kills"]) >= 1
+    assert made["host_restarts"] == len(made["kills"]) == made["faults"]["host_died"]
+    assert (made["repeated_episodes"], made["damaged_rows"], made["left_behind"]) == (0, 0, [])
+    assert made["exit_code"] == 128 + signal.SIGTERM
+    assert max(made["samples"]["engines"]) == 8
+    assert f"| hosts replaced, as the run counted | {len(made['kills'])} |" in hosts_soak.table(made)
 
 
 def test_bad_input_is_one_line_and_exit_2_before_anything_starts(tmp_path: Path):
