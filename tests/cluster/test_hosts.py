@@ -29,7 +29,7 @@ from gvz.core.errors import ConfigError, ResumeError, WorkerError
 from gvz.transport.messages import EpisodeStats, Fault, Message, ParamsHeader, Ready
 from tests.cluster.conftest import FAKE_GAMES, RayCluster
 
-pytestmark = pytest.mark.xdist_group("ray")
+pytestmark = [pytest.mark.e2e, pytest.mark.xdist_group("ray")]
 DEADLINE_S = 200.0
 ROOT = Path(__file__).parents[2]
 NUM_ACTORS = 4

@@ -90,6 +90,7 @@ def played_by_hosts() -> list[psutil.Process]:
     return [process for _, process in sorted(found, key=lambda pair: pair[0])]
 
 
+@pytest.mark.slow
 def test_a_run_survives_a_killed_host_a_stop_and_a_killed_learner(command: Command):
     learner = command.start("--learner.total-updates", "10000")
     try:
@@ -136,6 +137,7 @@ def test_a_run_survives_a_killed_host_a_stop_and_a_killed_learner(command: Comma
     assert [row["num_updates"] for row in command.rows("starts.jsonl")] == [0, stopped_at, resumed_at]
 
 
+@pytest.mark.slow
 def test_a_run_of_two_hosts_goes_on_on_one_machine(command: Command):
     """The lanes of a run are fixed; who plays them is not."""
     first = command.start("--learner.total-updates", "40")

@@ -10,6 +10,7 @@ pytestmark = [pytest.mark.e2e, pytest.mark.engine, pytest.mark.timeout(900), pyt
 TWO_DEVICES = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
 
 
+@pytest.mark.slow
 def test_a_run_on_two_devices_trains_and_goes_on_with_one(tmp_path):
     run = tmp_path / "run"
     flags = "--learner.total-updates 40 --learner.devices 2 --actors.inference device".split()

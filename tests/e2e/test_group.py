@@ -37,6 +37,7 @@ def same_parameters(run: Path, step: int) -> bool:
     return all(np.array_equal(one[name], other[name]) for name in one)
 
 
+@pytest.mark.slow
 def test_a_group_trains_ends_when_one_is_killed_and_the_same_commands_resume_it(tmp_path):
     run = tmp_path / "run"
     first, second = start(run)
