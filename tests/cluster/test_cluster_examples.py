@@ -32,6 +32,7 @@ def test_a_job_is_requeued_and_told_of_its_end_in_time(script):
 
 @pytest.mark.e2e
 @pytest.mark.engine
+@pytest.mark.slow
 def test_an_array_task_that_is_out_of_time_saves_its_run_and_goes_back_into_the_queue(tmp_path):
     queue = tmp_path / "bin"
     queue.mkdir()
