@@ -3,7 +3,6 @@
 pip install -r examples/requirements.txt; python examples/tianshou_dqn.py --epochs 20
 """
 
-import numpy as np
 import tyro
 from tianshou.algorithm.modelfree.dqn import DQN, DiscreteQLearningPolicy
 from tianshou.algorithm.optim import AdamOptimizerFactory
@@ -12,38 +11,12 @@ from tianshou.trainer import OffPolicyTrainerParams
 from torch import Tensor, as_tensor, nn
 
 import gvz
+from gvz.vector.adapters.tianshou import TianshouVectorEnv
 
 
-class Games:
-    """A gvz.make_vec as Tianshou's collectors use vector environments. Observations are stacks, u8[N, 4, 84, 84, 1]."""
-
-    is_async = False
-
-    def __init__(self, task: str, games: int):
-        self.envs = gvz.make_vec(task, games, batch_size=1, autoreset_mode="Disabled", grayscale=True)
-        self.env_num, self.action_space = games, [self.envs.single_action_space] * games
-        self.stacks = np.zeros((games, 4, *self.envs.single_observation_space.shape), np.uint8)
-
-    def __len__(self) -> int:
-        return self.env_num
-
-    def reset(self, env_id: np.ndarray | None = None, **_) -> tuple[np.ndarray, np.ndarray]:
-        games = np.arange(self.env_num) if env_id is None else np.asarray(env_id)
-        frames, _ = self.envs.reset(options={"reset_mask": np.isin(np.arange(self.env_num), games)})
-        self.stacks[games] = frames[games, None]
-        return self.stacks[games], np.array([{"env_id": game} for game in games])
-
-    def step(self, action: np.ndarray, id: np.ndarray) -> tuple[np.ndarray, ...]:
-        self.envs.send(np.asarray(action), id)
-        answers = {int(answer[-1]["env_id"][0]): answer for answer in (self.envs.recv() for _ in id)}
-        frames, rewards, terminated, truncated = (
-            np.concatenate([answers[game][part] for game in id]) for part in range(4)
-        )
-        self.stacks[id] = np.concatenate([self.stacks[id][:, 1:], frames[:, None]], axis=1)
-        return self.stacks[id], rewards, terminated, truncated, np.array([{"env_id": game} for game in id])
-
-    def close(self) -> None:
-        self.envs.close()
+def make_games(task: str, games: int) -> TianshouVectorEnv:
+    """Observations are stacks of 4 frames, u8[games, 4, 84, 84, 1]."""
+    return TianshouVectorEnv(gvz.make_vec(task, games, batch_size=1, autoreset_mode="Disabled", grayscale=True))
 
 
 class QNetwork(nn.Module):
@@ -60,7 +33,7 @@ class QNetwork(nn.Module):
 
 def main(task: str = "seek_and_kill/default", games: int = 2, epochs: int = 2, epoch_steps: int = 2_000):
     """Trains; plays test episodes between epochs."""
-    training, test = Games(task, games), Games(task, 1)
+    training, test = make_games(task, games), make_games(task, 1)
     space = training.action_space[0]
     policy = DiscreteQLearningPolicy(model=QNetwork(int(space.n)), action_space=space, eps_training=0.1)
     dqn = DQN(policy=policy, optim=AdamOptimizerFactory(lr=1e-4), n_step_return_horizon=3, target_update_freq=500)

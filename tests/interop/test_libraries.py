@@ -10,6 +10,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 EXAMPLES = Path(__file__).parent.parent.parent / "examples"
 
 
@@ -76,3 +78,20 @@ def test_environments_are_checked_by_stable_baselines3():
         env = gvz.make("dodge_projectiles/flames", grayscale=grayscale)
         check_env(env)
         env.close()
+
+
+@pytest.mark.parametrize(
+    ("library", "name", "want"),
+    [
+        ("stable_baselines3", "Sb3VecEnv", 'want autoreset_mode="SameStep"'),
+        ("tianshou", "TianshouVectorEnv", 'want batch_size=1 and autoreset_mode="Disabled"'),
+    ],
+)
+def test_games_made_in_a_way_that_a_library_cannot_use_are_refused(library, name, want):
+    import gvz
+
+    adapter = getattr(importlib.import_module(f"gvz.vector.adapters.{library}"), name)
+    envs = gvz.make_vec("dodge_projectiles/flames", 1)
+    with pytest.raises(ValueError, match=f"{name}: got .*'NextStep'.*{want}"):
+        adapter(envs)
+    envs.close()

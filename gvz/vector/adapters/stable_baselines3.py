@@ -1,0 +1,73 @@
+"""A `gvz.make_vec` as a VecEnv of Stable-Baselines3: `Sb3VecEnv(gvz.make_vec(task, 8, autoreset_mode="SameStep"))`."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env import VecEnv
+
+from gvz.core.errors import ConfigError
+from gvz.vector.env import DoomVectorEnv
+
+
+class Sb3VecEnv(VecEnv):
+    """Games in worker processes; an episode begins in the same step in which the last one ends.
+
+    Infos have `score` in every step, and at the end of an episode `terminal_observation` and `TimeLimit.truncated`.
+
+    Args:
+        envs: of `gvz.make_vec(..., autoreset_mode="SameStep")`; closed together with this object.
+
+    Raises:
+        ConfigError: another autoreset mode.
+    """
+
+    def __init__(self, envs: DoomVectorEnv):
+        mode = envs.metadata["autoreset_mode"]
+        if mode != AutoresetMode.SAME_STEP:
+            raise ConfigError(
+                f'Sb3VecEnv: got envs with autoreset_mode {mode.value!r}; want autoreset_mode="SameStep", because '
+                "Stable-Baselines3 expects an episode's first observation together with the end of the last one"
+            )
+        self.envs, self.render_mode = envs, envs.render_mode
+        super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
+
+    def reset(self) -> np.ndarray:
+        """First observations, u8[N, 84, 84, C], with the seeds of `seed()` if it was called before."""
+        observations, _ = self.envs.reset(seed=self._seeds)
+        self._reset_seeds()
+        return observations
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Sends the actions, i[N]."""
+        self.envs.send(actions)
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Observations u8[N, 84, 84, C], rewards f32[N], whether episodes are over bool[N], and N infos."""
+        observations, rewards, terminated, truncated, infos = self.envs.recv()
+        over = terminated | truncated
+        of_game: list[dict[str, Any]] = [{"score": score} for score in infos["score"].tolist()]
+        for i in over.nonzero()[0]:
+            of_game[i] |= {"terminal_observation": infos["final_obs"][i], "TimeLimit.truncated": bool(truncated[i])}
+        return observations, rewards.astype(np.float32), over, of_game
+
+    def close(self) -> None:
+        """Ends the games and their processes."""
+        self.envs.close()
+
+    def get_attr(self, attr_name: str, indices: int | Sequence[int] | None = None) -> list[Any]:
+        """The attribute of the vector environment, once for each game."""
+        return [getattr(self.envs, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: object, indices: int | Sequence[int] | None = None) -> None:
+        """Not possible: the games are in other processes."""
+        raise NotImplementedError("Sb3VecEnv: the games are in other processes; set it by an argument of gvz.make_vec")
+
+    def env_method(self, method_name: str, *args: Any, indices: int | Sequence[int] | None = None, **kwargs: Any):
+        """Not possible: the games are in other processes."""
+        raise NotImplementedError(f"Sb3VecEnv: the games are in other processes; {method_name!r} cannot be called")
+
+    def env_is_wrapped(self, wrapper_class: type, indices: int | Sequence[int] | None = None) -> list[bool]:
+        """False for each game: they have no wrappers."""
+        return [False for _ in self._get_indices(indices)]
