@@ -14,6 +14,8 @@ class ClusterConfig:
 
     address: str | None = None
     """HOST:PORT of the cluster's head; default: this machine plays, without a cluster"""
+    public: bool = False
+    """its nodes may have public addresses, because a firewall stands before them (docs/CLUSTER.md, Safety)"""
     hosts: int = 0
     """machines that play, each with actors.num_actors actors of actors.games_per_actor games; 0: this one alone"""
     min_hosts: int = 1

@@ -145,7 +145,7 @@ def cluster_pool(config: PoolConfig, cluster: ClusterConfig, state: dict[str, An
     session = contextlib.ExitStack()
     try:
         ours = signal.getsignal(signal.SIGTERM)
-        session.enter_context(connect(cluster.address))
+        session.enter_context(connect(cluster.address, public=cluster.public))
         signal.signal(signal.SIGTERM, ours)  # Ray's handler would end the learner without a checkpoint
         from gvz.cluster.ray_hosts import RayBackend
 

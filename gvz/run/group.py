@@ -7,7 +7,9 @@ and all stop before the same step.
 """
 
 import contextlib
+import ipaddress
 import signal
+import socket
 from collections.abc import Callable, Generator
 from typing import Any, Protocol
 
@@ -58,7 +60,7 @@ class Group(Protocol):
         ...
 
     def restored(self, read: Callable[[int | None], Restored | None]) -> Restored | None:
-        """The newest checkpoint that all have; `read` gives this process's newest of at most so many updates."""
+        """The newest checkpoint that all have. `read(limit)` gives this process's newest of at most `limit` updates."""
         ...
 
     def blamed(self) -> contextlib.AbstractContextManager[None]:
@@ -101,11 +103,12 @@ class Several:
         """Waits for the other processes, and makes their devices known to each other. Before any other use of jax.
 
         Raises:
-            ConfigError: the processes differ in their configuration or their versions. WaitTimeoutError: some do not
-            come.
+            ConfigError: the coordinator is public or unknown, or the processes differ in their configuration or their
+            versions. WaitTimeoutError: some do not come.
         """
         group = config.group
         host, port = group.address
+        _require_private(host)
         self._process, self._num_processes = group.own_id, group.num_processes
         say(f"learner process {self._process} of {self._num_processes}: waiting for the others at {host}:{port}")
         self._relay = None
@@ -213,6 +216,19 @@ def join(config: RunConfig, say: Callable[[str], None]) -> Group:
         ConfigError, WaitTimeoutError: as `Several`.
     """
     return Alone() if config.group.num_processes == 1 else Several(config, say)
+
+
+def _require_private(host: str) -> None:
+    """Raises ConfigError for a host that the whole Internet can reach: nobody who connects is asked for a token."""
+    try:
+        ip = str(socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0])
+    except OSError as error:
+        raise ConfigError(f"group.coordinator: no machine has the name {host!r} ({error.strerror or error})") from error
+    if ipaddress.ip_address(ip).is_global:
+        raise ConfigError(
+            f"group.coordinator: {ip} is a public address, and the group asks nobody who connects for a token; want an "
+            "address of a private network"
+        )
 
 
 def _settings(config: RunConfig) -> dict[str, str]:

@@ -245,6 +245,19 @@ def test_what_a_group_cannot_do_is_refused(changes, message):
         replace(CONFIG, group=GroupConfig(num_processes=2, process_id=0, coordinator="here:1"), **changes)
 
 
+@pytest.mark.parametrize(
+    ("host", "message"),
+    [
+        ("8.8.8.8", r"8\.8\.8\.8 is a public address, and the group asks nobody"),
+        ("no.such.host.invalid", "no machine has"),
+    ],
+)
+def test_a_coordinator_that_is_public_or_unknown_is_refused_before_anything_listens(host, message):
+    group = GroupConfig(num_processes=2, process_id=0, coordinator=f"{host}:1")
+    with pytest.raises(ConfigError, match=rf"group\.coordinator: {message}"):
+        WithoutDevices(replace(CONFIG, group=group), lambda _: None)
+
+
 def test_a_fresh_start_of_a_group_is_refused(tmp_path, capsys):
     group = "--group.num-processes 2 --group.process-id 0 --group.coordinator 127.0.0.1:1".split()
     assert main(["--fresh", "--run-dir", str(tmp_path), *group]) == 2
