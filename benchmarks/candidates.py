@@ -57,7 +57,7 @@ class Candidates:
     def goals(
         self, number: int, group: str, values: Mapping[str, Sequence[float]], wanted: Mapping[str, float]
     ) -> list[Row]:
-        """A goal for each other group that was measured: at least so many times as fast as it."""
+        """A goal for each other group that was measured: its name -> how many times as fast `group` is to be."""
         ours = self._best(group, values)
         return [
             goal(number, f"{group} against {other}", ratios(ours, self._best(other, values)), at_least=bound, unit="x")

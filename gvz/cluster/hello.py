@@ -46,7 +46,7 @@ def hello(config: PoolConfig) -> Hello:
 
 
 def differences(ours: Hello, theirs: Hello) -> list[str]:
-    """`what: got, want` for everything in which a host differs from the learner's machine."""
+    """How a host differs from the learner's machine: a line `what: got, want` for each thing."""
     found: list[str] = []
     for kind, want, got in (("", ours.versions, theirs.versions), ("maps of ", ours.maps, theirs.maps)):
         found += _differing(kind, want, got)

@@ -24,9 +24,9 @@ NODES_PERIOD_S = 2.0
 NODES_TIMEOUT_S = 600.0
 """how long to wait for a node that a job fits on, when all those are gone"""
 HEAD_TIMEOUT_S = 20.0
-"""a head that takes no connection for so long is gone"""
+"""a head that takes no connection for this time is gone"""
 SILENT_TIMEOUT_S = 60.0
-"""a node that answers nothing for so long is lost: Ray never reports a machine that was only stopped"""
+"""a node that answers nothing for this time is lost: Ray never reports a machine that was only stopped"""
 KILL_TIMEOUT_S = 10.0
 JOB_SHM_BYTES = 4 * ENGINE_SHM_BYTES
 """in /dev/shm, for the games of the smallest job; every job looks itself whether its own fit"""
@@ -67,7 +67,7 @@ def open_places(
         results: the results directory, absolute; made if it is not there.
         cores: of a job.
         gpus: likewise, while it trains; None: one if a node has any.
-        limit: at most so many jobs at once; None: as many as fit.
+        limit: most jobs at once; None: as many as fit.
         public: allow nodes with public addresses.
 
     Raises:

@@ -19,7 +19,7 @@ class Doctor:
     shared: Path | None = None
     """check this directory instead, for several machines that work in it: locks, renames, fsync"""
     hold: float | None = None
-    """hold a lock in the shared directory for so many seconds, for this command on another machine to see"""
+    """seconds to hold a lock in the shared directory; give the command on another machine meanwhile"""
     json: bool = False
     """one JSON object a line instead of a table"""
 

@@ -83,7 +83,7 @@ def gpus() -> tuple[str, ...]:
 
 
 def make_slots(jobs: int | None, cores: Sequence[int], devices: Sequence[str]) -> tuple[Slot, ...]:
-    """Shares of these cores and GPUs for so many jobs at once; None: one a GPU, or without one a pair of cores.
+    """Shares of these cores and GPUs for a number of jobs at once; None: one a GPU, or without one a pair of cores.
 
     Raises:
         ConfigError: fewer than one job.
@@ -104,5 +104,5 @@ def make_slots(jobs: int | None, cores: Sequence[int], devices: Sequence[str]) -
 
 
 def memory_share(jobs: float) -> dict[str, str]:
-    """What tells JAX its part of a GPU's memory when so many jobs use the GPU together."""
+    """The environment variable that tells JAX its part of a GPU's memory, where several jobs use the GPU."""
     return {"XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.9 / jobs:.3f}"} if jobs > 1 else {}

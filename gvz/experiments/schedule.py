@@ -24,7 +24,7 @@ LOCKED_TIMEOUT_S = 60.0
 LOST_TIMEOUT_S = 300.0
 """likewise when a machine was lost: a file server takes up to minutes to give back the locks of a dead machine"""
 MAX_LOSSES = 3
-"""a job that takes so many machines along, one after the other, without any progress, has failed"""
+"""a job that loses this number of machines, one after the other, without any progress, has failed"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -16,7 +16,8 @@ import msgspec
 import numpy as np
 import psutil
 import pytest
-from fake_env import Checker, config, export_act
+from fake_env import config, export_act
+from watched_pool import Run
 
 from actors.config import ActorsConfig
 from actors.pool import PoolConfig
@@ -26,7 +27,7 @@ from gvz.cluster.config import ClusterConfig
 from gvz.cluster.pool import ClusterPool, cluster_pool
 from gvz.core import janitor
 from gvz.core.errors import ConfigError, ResumeError, WorkerError
-from gvz.transport.messages import EpisodeStats, Fault, Message, ParamsHeader, Ready
+from gvz.transport.messages import EpisodeStats, Fault, ParamsHeader, Ready
 from tests.cluster.conftest import FAKE_GAMES, RayCluster
 
 pytestmark = [pytest.mark.e2e, pytest.mark.xdist_group("ray")]
@@ -63,24 +64,10 @@ def backend_of(nodes: RayCluster) -> Iterator[Callable[[], Any]]:
         ray.shutdown()
 
 
-class Played:
-    """A pool of hosts in a test: drained, polled, every record checked."""
+class Played(Run):
+    """A pool of hosts in a test."""
 
-    def __init__(self, pool: ClusterPool, pool_config: PoolConfig):
-        self.pool = pool
-        self.checker = Checker(pool_config)
-        self.messages: list[Message] = []
-
-    def until(self, done: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + DEADLINE_S
-        while not done():
-            assert time.monotonic() < deadline, self.messages
-            self.checker.add(self.pool.drain(100, wait_s=0.01))
-            self.messages += self.pool.poll()
-
-    def play(self, num_records: int) -> None:
-        wanted = self.checker.num_records + num_records
-        self.until(lambda: self.checker.num_records >= wanted)
+    pool: ClusterPool
 
     def until_all_ready(self, num_actors: int = NUM_ACTORS) -> None:
         self.until(lambda: self.pool.statistics().actors_ready == num_actors)
@@ -97,9 +84,6 @@ class Played:
 
     def more(self, name: str) -> float:
         return self.pool.statistics().more[f"cluster/{name}"]
-
-    def faults(self) -> list[Fault]:
-        return [m for m in self.messages if isinstance(m, Fault)]
 
     def node_of(self, host: int) -> str:
         life = self.pool._hosts[host].incarnation

@@ -119,7 +119,7 @@ update_one = jax.jit(replay.update_priorities, static_argnums=0)
 
 
 def varied(placed: Placed, one: Placed) -> None:
-    """Gives both the same priorities, other ones for every slot that was drawn."""
+    """Gives both the same new priorities, for the slots that were drawn."""
     for seed in range(6):
         _, info = placed.draw(jax.random.key(seed), 1.0)
         td_errors = np.random.default_rng(seed).exponential(3.0, len(info.slots)).astype(np.float32)
