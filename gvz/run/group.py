@@ -111,24 +111,32 @@ class Several:
         _require_private(host)
         self._process, self._num_processes = group.own_id, group.num_processes
         say(f"learner process {self._process} of {self._num_processes}: waiting for the others at {host}:{port}")
-        self._relay = None
         hello: dict[str, Any] = {"config": _settings(config), "versions": machine.versions(_MUST_AGREE)}
-        if self._process == 0:
-            try:
-                self._relay, hello["port"] = Relay((host, port), self._num_processes), free_port(host)
-            except OSError as error:
-                raise ConfigError(
-                    f"group.coordinator: process 0 cannot listen at {host}:{port} ({error.strerror}); want an address "
-                    "of this machine and a free port"
-                ) from error
-        self._link = Link((host, port), self._process, self._num_processes, hello)
-        if (different := _difference(self._link.hellos)) is not None:
-            with contextlib.suppress(GvzError):
-                self._link.gather("seen", None, FAILURE_WAIT_S, "to see that they differ")
-            raise ConfigError(different)
-        self._join_jax(host, self._link.hellos[0]["port"])
+        with contextlib.ExitStack() as opened:
+            if self._process == 0:
+                hello["port"] = self._listen(host, port, opened)
+            self._link = Link((host, port), self._process, self._num_processes, hello)
+            opened.callback(self._link.close)
+            if (different := _difference(self._link.hellos)) is not None:
+                with contextlib.suppress(GvzError):
+                    self._link.gather("seen", None, FAILURE_WAIT_S, "to see that they differ")
+                raise ConfigError(different)
+            self._join_jax(host, self._link.hellos[0]["port"])
+            self._opened = opened.pop_all()
         self._round, self._proposed, self._stopped, self._told, self._may_save = 0, False, False, False, True
         self.num_common_saved: int | None = 0
+
+    def _listen(self, host: str, port: int, opened: contextlib.ExitStack) -> int:
+        """Starts the relay: a free port for JAX."""
+        try:
+            relay = Relay((host, port), self._num_processes)
+            opened.callback(relay.close)
+            return free_port(host)
+        except OSError as error:
+            raise ConfigError(
+                f"group.coordinator: process 0 cannot listen at {host}:{port} ({error.strerror}); want an address "
+                "of this machine and a free port"
+            ) from error
 
     def _join_jax(self, host: str, port: int) -> None:
         near = f"{host}:{port}" if self._process == 0 else f"127.0.0.1:{Forward((host, port)).port}"
@@ -204,9 +212,7 @@ class Several:
     def leave(self) -> None:
         self._link.gather("done", None, ANSWER_TIMEOUT_S, "to write its last checkpoint")
         jax.distributed.shutdown()
-        self._link.close()
-        if self._relay is not None:
-            self._relay.close()
+        self._opened.close()
 
 
 def join(config: RunConfig, say: Callable[[str], None]) -> Group:

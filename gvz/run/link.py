@@ -46,8 +46,12 @@ class Link:
         self.send("hello", hello)
         for work in (self._read, self._watch):
             threading.Thread(target=work, name="group", daemon=True).start()
-        self.hellos = self._wait_for(("hello", 0), JOIN_TIMEOUT_S, f"to connect to {address[0]}:{address[1]}")
-        """what each process said of itself"""
+        try:
+            self.hellos = self._wait_for(("hello", 0), JOIN_TIMEOUT_S, f"to connect to {address[0]}:{address[1]}")
+            """what each process said of itself"""
+        except BaseException:
+            self.close()
+            raise
 
     def send(self, kind: str, value: Any = None, number: int = 0) -> None:
         """A message to all processes, this one included."""
@@ -91,6 +95,7 @@ class Link:
         self.check()
 
     def close(self) -> None:
+        """Leaves the group: this process is watched no more."""
         self._closed = True
         close(self._socket)
 
