@@ -281,18 +281,20 @@ class Dispatcher:
 
     def _take(self, host: SupervisedHost, life: Incarnation, answer: Any) -> None:
         life.asked.popleft()
-        batch = unpack(answer, host.pool.record_dtype, host.pool.frame_shape, self._config.batch_records)
+        came = unpack(answer, host.pool.record_dtype, host.pool.frame_shape, self._config.batch_records)
         with self.inbox.changed:
-            host.take(batch, self._run_id)
-            self.inbox.messages += batch.messages
-            if len(batch):
-                self.inbox.batches.append((host, batch.block))
-                host.waiting_batches += 1
-                host.params_age_s = self._params_age_s(batch)
-                self.inbox.counts.update(received_bytes=len(answer))
+            batches = host.in_order(came, self._run_id)
+            for batch in batches:
+                host.take(batch)
+                self.inbox.messages += batch.messages
+                if len(batch):
+                    self.inbox.batches.append((host, batch.block))
+                    host.waiting_batches += 1
+                    host.params_age_s = self._params_age_s(batch)
+            self.inbox.counts.update(received_bytes=len(answer))
             self.inbox.changed.notify_all()
-        if batch.header.failure:
-            self._discard(host, "host_failed", batch.header.failure)
+        if batches and (failure := batches[-1].header.failure):
+            self._discard(host, "host_failed", failure)
 
     def _params_age_s(self, batch: Batch) -> float:
         """Mean time since the publication of the parameters that chose the actions; 0 if that is too long ago."""

@@ -36,6 +36,8 @@ class Incarnation:
     asked: deque[Call] = field(default_factory=deque[Call])
     """calls for batches that are under way, the oldest first"""
     next_batch: int = 0
+    early: dict[int, Batch] = field(default_factory=dict[int, Batch])
+    """number -> batch that came before one with a lower number"""
     params_version: int = -1
     """newest parameters that it was given"""
     taking_params: bool = False
@@ -79,7 +81,8 @@ class SupervisedHost:
     @property
     def free_credits(self) -> int:
         """Batches that may be asked for now."""
-        asked = 0 if self.incarnation is None else len(self.incarnation.asked)
+        life = self.incarnation
+        asked = 0 if life is None else len(life.asked) + len(life.early)
         return self._config.credits - asked - self.waiting_batches
 
     def spec(self, run_id: str, incarnation: int) -> HostSpec:
@@ -99,18 +102,33 @@ class SupervisedHost:
         self.lanes.tasks[self.pool.lanes.index(lane)] = task
         self.assigned.append((lane, task))
 
-    def take(self, batch: Batch, run_id: str) -> None:
-        """Keeps track of episodes and batches.
+    def in_order(self, batch: Batch, run_id: str) -> list[Batch]:
+        """The batches that are to be taken now, the oldest first; answers of calls under way can overtake each other.
 
         Raises:
-            TransportError: it is not the next batch of this incarnation, or not of this host's games.
+            TransportError: it is not of this incarnation, or one before it is lost.
         """
         life, header = self.incarnation, batch.header
         assert life is not None
         got = (header.run_id, header.host, header.incarnation, header.number)
         want = (run_id, self.index, life.number, life.next_batch)
-        if got != want:
+        ahead = header.number - life.next_batch
+        if got[:3] != want[:3] or not 0 <= ahead < self._config.credits or (ahead and not life.asked):
             raise TransportError(f"got batch {got} (run, host, incarnation, number), want {want}; a batch was lost")
+        life.early[header.number] = batch
+        found: list[Batch] = []
+        while (number := life.next_batch + len(found)) in life.early:
+            found.append(life.early.pop(number))
+        return found
+
+    def take(self, batch: Batch) -> None:
+        """Keeps track of episodes and batches.
+
+        Raises:
+            TransportError: it is not of this host's games.
+        """
+        life, header = self.incarnation, batch.header
+        assert life is not None
         self._check(batch)
         life.next_batch += 1
         life.newest = header

@@ -280,6 +280,28 @@ def test_a_lost_batch_costs_the_incarnation(play):
     assert played.checker.num_cuts == played.more("cut_episodes")
 
 
+def test_answers_that_overtake_each_other_are_taken_in_order(play, monkeypatch: pytest.MonkeyPatch):
+    from gvz.cluster.ray_hosts import RayBackend
+
+    wait, num_reversed = RayBackend.wait, 0
+
+    def reversed_wait(backend: Any, calls: Any, timeout_s: float) -> Any:
+        nonlocal num_reversed
+        time.sleep(0.1)  # so that several have come
+        found = wait(backend, calls, timeout_s)[::-1]
+        num_reversed += len(found) > 2
+        return found
+
+    played = play({"length": 20}, credits=4)
+    played.until_all_ready()
+    with monkeypatch.context() as patch:
+        patch.setattr(RayBackend, "wait", reversed_wait)
+        played.until(lambda: num_reversed >= 5)
+        played.play(1000)
+    assert played.faults() == []
+    assert played.checker.num_cuts == 0
+
+
 def test_what_comes_too_late_is_dropped_and_counted(play, monkeypatch: pytest.MonkeyPatch):
     from gvz.cluster.ray_hosts import RayRemote
 
