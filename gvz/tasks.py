@@ -21,7 +21,7 @@ GATE_LEVEL = 2
 @cache
 def all_scenarios() -> dict[str, Scenario]:
     """The scenarios of every suite by id: the modules of gvz.scenarios that have a SCENARIO."""
-    found = {n: m.SCENARIO for n, m in discover("gvz.scenarios").items() if hasattr(m, "SCENARIO")}
+    found = {name: module.SCENARIO for name, module in discover("gvz.scenarios", "SCENARIO").items()}
     assert all(name == scenario.id for name, scenario in found.items()), "a scenario's id is its file name"
     return found
 

@@ -81,6 +81,7 @@ def test_imports_point_down(module: str, file: Path):
         ("import gvz", ("jax", "vizdoom", "cv2")),
         ("import gvz.launch", ("jax", "vizdoom", "orbax", "flax")),
         ("import gvz.env, gvz.tasks", ("jax", "flax", "orbax", "tyro")),
+        ("import gvz.tasks; gvz.tasks.all_scenarios()", ("numpy", "cv2", "jax")),
         ("import gvz.cli, gvz.run.train, gvz.experiments.schedule", ("ray", "gvz.cluster.wire")),
     ],
 )

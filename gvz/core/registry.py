@@ -1,10 +1,12 @@
 """Discovery by file name: the modules of a package are its registry."""
 
 import pkgutil
+import re
 import sys
 from functools import cache
 from importlib import import_module
 from importlib.machinery import SourceFileLoader
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,8 +14,10 @@ from typing import Any
 from gvz.core.errors import ConfigError, nearest
 
 
-def discover(package: str) -> dict[str, ModuleType]:
+def discover(package: str, constant: str | None = None) -> dict[str, ModuleType]:
     """Imports every module directly inside `package`, a dotted name such as "gvz.scenarios".
+
+    With `constant`, only those that have a line `constant = ...`: the others may import what `--help` can do without.
 
     Adding a scenario or an agent is adding a file; no list of names is kept by hand. A module that registers
     something says so by a constant that the caller looks for (`SCENARIO`, ...).
@@ -28,6 +32,8 @@ def discover(package: str) -> dict[str, ModuleType]:
     if not hasattr(parent, "__path__"):
         raise ValueError(f"discover: {package!r} is a module, want a package")
     names = sorted(info.name for info in pkgutil.iter_modules(parent.__path__) if not info.ispkg)
+    if constant is not None:
+        names = [name for name in names if _sets(f"{package}.{name}", constant)]
     return {name: import_module(f"{package}.{name}") for name in names}
 
 
@@ -53,13 +59,20 @@ def find(package: str, constant: str, name: str, field: str) -> Any:
         if not hasattr(module, constant):
             raise ConfigError(f"{field}: {file} does not set {constant}, want a line `{constant} = ...` at its end")
         return getattr(module, constant)
-    found = {n: getattr(m, constant) for n, m in discover(package).items() if hasattr(m, constant)}
+    found = {n: getattr(m, constant) for n, m in discover(package, constant).items()}
     if name not in found:
         raise ConfigError(
             f"{field}: got {name!r}{nearest(name, found)}, want one of {', '.join(found)}, or the path of a file, "
             "./mine.py"
         )
     return found[name]
+
+
+def _sets(module: str, constant: str) -> bool:
+    spec = find_spec(module)
+    assert spec is not None
+    assert spec.origin is not None
+    return re.search(rf"^{constant}\b.*=", Path(spec.origin).read_text(), re.MULTILINE) is not None
 
 
 @cache

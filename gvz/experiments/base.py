@@ -311,7 +311,7 @@ def experiments() -> dict[str, Experiment]:
     Raises:
         ConfigError: one names a config that is not there, or has a variant that its config refuses.
     """
-    found = {n: m.EXPERIMENT for n, m in discover("gvz.experiments").items() if hasattr(m, "EXPERIMENT")}
+    found = {name: module.EXPERIMENT for name, module in discover("gvz.experiments", "EXPERIMENT").items()}
     assert all(name == experiment.name for name, experiment in found.items()), "an experiment's name is its file's"
     for experiment in found.values():
         for config in map(load_config, experiment.configs):

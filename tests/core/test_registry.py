@@ -33,6 +33,12 @@ def test_a_new_file_is_found_without_being_listed_anywhere(package: Path):
     assert "mole" in discover("found_by_name")
 
 
+def test_with_a_constant_only_modules_that_set_it_are_imported(package: Path):
+    (package / "fox.py").write_text('TITLE: str = "a fox"\n')
+    (package / "heavy.py").write_text("import nothing_of_that_name  # TITLE = \n\n\ndef f():\n    TITLE = 1\n")
+    assert list(discover("found_by_name", "TITLE")) == ["fox"]
+
+
 def test_a_module_that_cannot_be_imported_is_not_skipped(package: Path):
     (package / "broken.py").write_text("import nothing_of_that_name\n")
     with pytest.raises(ImportError, match="nothing_of_that_name"):
