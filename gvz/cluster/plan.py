@@ -34,7 +34,7 @@ class Costs:
 
 
 RECORDED = Costs(
-    decision_s=(600.7 + 2382.0) * 1e-6,  # engines and Python, 4 games an actor, full network
+    decision_s=(479.8 + 1221.0) * 1e-6,  # engines and Python, 8 games an actor, full network
     pack_s=61e-6,
     unpack_s=47e-6,
     ingest_s=22e-6,

@@ -102,7 +102,7 @@ def test_what_cannot_be_is_refused(flags, name, got, capsys):
 def test_the_time_of_a_decision_is_that_of_the_committed_record():
     record = json.loads((ROOT / "results" / "performance" / "acting.json").read_text())
     rows = {row["name"]: row["median"] for row in record["rows"] if row["kind"] == "measured"}
-    begin = "processor time a decision, actor pool, full network, 4 games an actor: "
+    begin = "processor time a decision, actor pool, full network, 8 games an actor, noise of each decision: "
     assert RECORDED.decision_s * 1e6 == pytest.approx(rows[begin + "engines"] + rows[begin + "Python"])
 
 
