@@ -5,6 +5,7 @@ BIN    := $(VENV)/bin
 INTEROP := .venv-interop
 PEERS  := .venv-peers
 ARGS   ?=
+ISAS   ?= AVX2 SSE4_2
 
 .PHONY: help install engine install-cuda train test test-fast test-slow test-isa test-browser test-interop learning-seeds pipeline lint format lock bench bench-peers bench-micro soak soak-hosts fuzz docs clean
 
@@ -38,8 +39,8 @@ test-fast: install ## unit tests that start no engine
 test-slow: install ## learning and fault tests that take minutes each
 	$(BIN)/python -m pytest -m slow --timeout 1800 $(ARGS)
 
-test-isa: install ## tests of learning and of the learner's numbers, as older processors compute them
-	for isa in AVX2 SSE4_2; do \
+test-isa: install ## tests of learning and of the learner's numbers, as older processors compute them (ISAS=...)
+	for isa in $(ISAS); do \
 	  XLA_FLAGS=--xla_cpu_max_isa=$$isa $(BIN)/python -m pytest -m "isa and not slow" -n 2 --dist loadgroup $(ARGS) || exit 1; \
 	done
 
@@ -75,7 +76,7 @@ format: install  ## apply formatting and safe fixes
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-bench: install   ## throughput beside limits and peers, half an hour on 2 quiet cores; then the page made of it
+bench: install   ## throughput beside limits and peers, 50 minutes on 2 quiet cores; then the page made of it
 	$(BIN)/python -m benchmarks all --out results/performance $(ARGS)
 	$(BIN)/python -m benchmarks.report
 

@@ -92,8 +92,9 @@ class RayCluster:
         return json.loads(line)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def cluster() -> Iterator[RayCluster]:
+    """Of all tests together, in one worker; a test that ends a node adds one."""
     made = RayCluster(3, num_cores=1)
     yield made
     made.close()

@@ -4,6 +4,7 @@ Prints {"address": ...}. `add` starts a node; `kill PID` ends the node whose ray
 runs on it, at once, as a power cut would. Each is answered by {"nodes": N}. The end of the input ends the cluster.
 """
 
+import contextlib
 import json
 import sys
 from typing import Any
@@ -25,7 +26,8 @@ def main(num_nodes: int, num_cores: int) -> None:
                 (node,) = [node for node in nodes if raylet(node) == int(pid[0])]
                 killed = psutil.Process(raylet(node))
                 for process in [killed, *killed.children(recursive=True)]:
-                    process.kill()
+                    with contextlib.suppress(psutil.NoSuchProcess):  # it has ended because of one before it
+                        process.kill()
                 nodes.remove(node)
                 cluster.remove_node(node, allow_graceful=False)
             else:

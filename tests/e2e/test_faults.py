@@ -165,6 +165,7 @@ def test_a_run_goes_through_every_fault_of_its_actors_and_engines_and_loses_noth
         assert abs(row["actors/env_steps"] - 300 - 4 * row["num_updates"]) <= 256 + 64
 
 
+@pytest.mark.slow
 def test_a_spent_budget_ends_the_run_with_a_checkpoint_and_the_stack_of_the_stuck_actor(tmp_path):
     run = tmp_path / "run"
     flags = "--learner.total-updates 1000000 --actors.heartbeat-timeout-s 5 --actors.max-restarts 1".split()
@@ -232,7 +233,10 @@ def test_a_launcher_killed_while_it_starts_leaves_nothing(tmp_path, moment):
     assert janitor.dead_instances() == []
 
 
-def check_stalls(tmp_path: Path, pause_s: float) -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize("pause_s", [10.0, 30.0])
+def test_stalls_lose_nothing_and_restart_nobody(tmp_path, pause_s):
+    """The learner stops for a while, one actor is a hundred times slower than the other, one game never ends."""
     run = tmp_path / "run"
     rules = {"default": {"sleep_s": 0.3}, "fast_enemies": {"endless": True}}
     flags = "--learner.total-updates 500 --replay.capacity 12000".split()
@@ -255,16 +259,6 @@ def check_stalls(tmp_path: Path, pause_s: float) -> None:
     assert fault["message"].startswith(warning)
     assert f"warning: {warning}" in err
     assert check_streams(run, num_lanes=4, num_tasks=4).unrecorded == [0, 0, 0, 0]
-
-
-def test_stalls_lose_nothing_and_restart_nobody(tmp_path):
-    """The learner stops for 10 s, one actor is a hundred times slower than the other, one game never ends."""
-    check_stalls(tmp_path, 10.0)
-
-
-@pytest.mark.slow
-def test_stalls_of_half_a_minute_lose_nothing_and_restart_nobody(tmp_path):
-    check_stalls(tmp_path, 30.0)
 
 
 def test_a_checkpoint_that_cannot_be_written_is_reported_tried_again_and_at_last_an_error(tmp_path):

@@ -25,6 +25,7 @@ def without(flags: list[str], name: str) -> list[str]:
 
 @pytest.mark.e2e
 @pytest.mark.engine
+@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_actors_are_killed_and_replaced_and_nothing_is_left(tmp_path):
     times = "--minutes 0.4 --kill-every-s 8 --stretches 1 --undisturbed-minutes 0.1 --sample-s 1".split()
