@@ -6,6 +6,7 @@ INTEROP := .venv-interop
 PEERS  := .venv-peers
 ARGS   ?=
 ISAS   ?= AVX2 SSE4_2
+EXPERIMENTS ?= training_difficulty training_set_size algorithm_comparison rainbow_evaluation
 
 .PHONY: help install engine install-cuda train test test-fast test-slow test-isa test-browser test-interop learning-seeds pipeline lint format lock bench bench-peers bench-micro soak soak-hosts fuzz docs clean
 
@@ -50,8 +51,8 @@ learning-seeds: install ## ten seeds of every test of learning under three instr
 	    --timeout 1800 -q $(ARGS) || exit 1; \
 	done
 
-pipeline: install ## all four experiments at a thousandth of their size, and their report, in runs/pipeline
-	$(BIN)/gvz experiment run training_difficulty training_set_size algorithm_comparison rainbow_evaluation \
+pipeline: install ## the thesis's experiments at a thousandth of their size, and their report, in runs/pipeline
+	$(BIN)/gvz experiment run $(EXPERIMENTS) \
 	  --results runs/pipeline --scale 0.001 --jobs 2
 	$(BIN)/gvz report runs/pipeline --out runs/pipeline/report
 

@@ -115,6 +115,7 @@ def test_a_gate_s_runs_end_by_their_processor_time_and_its_report_has_both_table
     assert "Not trained to the end" not in page
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_what_is_being_trained_and_leaves_nothing_running(tmp_path):
     runner = begin(tmp_path)
     try:

@@ -191,6 +191,7 @@ def test_a_run_that_acts_on_the_learners_device_goes_on_after_a_kill_and_after_a
     assert "rings and parameter queue" in err
 
 
+@pytest.mark.slow
 def test_a_synchronous_run_cut_twice_equals_one_that_was_not(tmp_path):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     flags = ("--mode", "sync", "--learner.total-updates", "120")
