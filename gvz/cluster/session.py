@@ -2,7 +2,6 @@
 
 import contextlib
 import importlib.util
-import ipaddress
 import json
 import logging
 import os
@@ -20,6 +19,7 @@ from typing import Any
 import psutil
 
 from gvz.cluster.nodes import Node, check_nodes, survey
+from gvz.core.addresses import require_private, resolve
 from gvz.core.errors import ConfigError
 
 ANSWER_TIMEOUT_S = 10.0
@@ -29,6 +29,10 @@ PROBE_TIMEOUT_S = 60.0
 NAMESPACE = "gvizdoom"
 _OURS = {"RAY_AUTH_MODE": "token", "RAY_USAGE_STATS_ENABLED": "0"}
 """environment of this process, set before it imports Ray, which reads it once"""
+_PRIVATE = (
+    "start Ray on a private network (--node-ip-address=10...), or allow it if a firewall stands before it "
+    "(docs/CLUSTER.md, Safety): whoever reaches Ray can run code"
+)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -61,9 +65,9 @@ def connect(address: str, *, shm_bytes: int = 0, public: bool = False, alike: bo
     host, port = parse_address(address)
     if importlib.util.find_spec("ray") is None:
         raise ConfigError(f"cluster {address}: Ray is not installed; pip install 'gvizdoom[cluster]'")
-    ip = _resolve(address, host, port)
+    ip = resolve(host, f"cluster {address}")
     if not public:
-        require_private(ip, f"cluster {address}")
+        require_private(ip, f"cluster {address}", _PRIVATE)
     require_token(os.environ)
     _require_answer(address, ip, port)
     os.environ.update(_OURS)
@@ -79,7 +83,7 @@ def connect(address: str, *, shm_bytes: int = 0, public: bool = False, alike: bo
     try:
         nodes = survey()
         for node in () if public else nodes:
-            require_private(node.ip, f"cluster {address}: node {node.name}")
+            require_private(node.ip, f"cluster {address}: node {node.name}", _PRIVATE)
         if alike:
             check_nodes(nodes, shm_bytes=shm_bytes)
         yield Session(address=where, nodes=nodes)
@@ -105,15 +109,6 @@ def parse_address(address: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def require_private(ip: str, where: str) -> None:
-    """Raises ConfigError for an address that the whole Internet can reach: whoever reaches Ray can run code."""
-    if ipaddress.ip_address(ip).is_global:
-        raise ConfigError(
-            f"{where}: {ip} is a public address; start Ray on a private network (--node-ip-address=10...), "
-            "or allow it if a firewall stands before it (docs/CLUSTER.md, Safety)"
-        )
-
-
 def require_token(environment: Mapping[str, str]) -> None:
     """Raises ConfigError if Ray would not use a token, or finds none."""
     if (mode := environment.get("RAY_AUTH_MODE", "token").lower()) != "token":
@@ -130,13 +125,6 @@ def require_token(environment: Mapping[str, str]) -> None:
 def token_file(environment: Mapping[str, str]) -> Path:
     """Where Ray looks for the token if RAY_AUTH_TOKEN is not set."""
     return Path(environment.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token")
-
-
-def _resolve(address: str, host: str, port: int) -> str:
-    try:
-        return str(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][4][0])
-    except OSError as error:
-        raise ConfigError(f"cluster {address}: no machine has the name {host!r} ({error.strerror or error})") from error
 
 
 def _require_answer(address: str, ip: str, port: int) -> None:

@@ -17,7 +17,8 @@ from gvz.core.errors import ConfigError, nearest
 def discover(package: str, constant: str | None = None) -> dict[str, ModuleType]:
     """Imports every module directly inside `package`, a dotted name such as "gvz.scenarios".
 
-    With `constant`, only those that have a line `constant = ...`: the others may import what `--help` can do without.
+    With `constant`, only modules with a line `constant = ...` are imported: the other ones take time that `--help`
+    does not have (numpy, OpenCV).
 
     Adding a scenario or an agent is adding a file; no list of names is kept by hand. A module that registers
     something says so by a constant that the caller looks for (`SCENARIO`, ...).
@@ -72,7 +73,7 @@ def _sets(module: str, constant: str) -> bool:
     spec = find_spec(module)
     assert spec is not None
     assert spec.origin is not None
-    return re.search(rf"^{constant}\b.*=", Path(spec.origin).read_text(), re.MULTILINE) is not None
+    return re.search(rf"^{constant}\b.*=", Path(spec.origin).read_text(encoding="utf-8"), re.MULTILINE) is not None
 
 
 @cache

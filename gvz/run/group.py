@@ -7,14 +7,13 @@ and all stop before the same step.
 """
 
 import contextlib
-import ipaddress
 import signal
-import socket
 from collections.abc import Callable, Generator
 from typing import Any, Protocol
 
 import jax
 
+from gvz.core.addresses import require_private, resolve
 from gvz.core.env_config import leaves
 from gvz.core.errors import ConfigError, GvzError
 from gvz.core.stop import StopRequest
@@ -33,6 +32,7 @@ FAILURE_WAIT_S = 5.0
 _OWN = ("group.process_id", "run_dir", "name", "max_processor_s", "log.", "actors.")
 """fields that may differ between processes"""
 _MUST_AGREE = ("python", "gvizdoom", "jax", "jaxlib")
+_PRIVATE = "the group asks nobody who connects for a token; want an address of a private network"
 
 
 class Group(Protocol):
@@ -108,7 +108,7 @@ class Several:
         """
         group = config.group
         host, port = group.address
-        _require_private(host)
+        require_private(resolve(host, "group.coordinator"), "group.coordinator", _PRIVATE)
         self._process, self._num_processes = group.own_id, group.num_processes
         say(f"learner process {self._process} of {self._num_processes}: waiting for the others at {host}:{port}")
         hello: dict[str, Any] = {"config": _settings(config), "versions": machine.versions(_MUST_AGREE)}
@@ -127,7 +127,7 @@ class Several:
         self.num_common_saved: int | None = 0
 
     def _listen(self, host: str, port: int, opened: contextlib.ExitStack) -> int:
-        """Starts the relay: a free port for JAX."""
+        """Starts the relay, which ends with `opened`; returns a free port for JAX's coordinator."""
         try:
             relay = Relay((host, port), self._num_processes)
             opened.callback(relay.close)
@@ -222,19 +222,6 @@ def join(config: RunConfig, say: Callable[[str], None]) -> Group:
         ConfigError, WaitTimeoutError: as `Several`.
     """
     return Alone() if config.group.num_processes == 1 else Several(config, say)
-
-
-def _require_private(host: str) -> None:
-    """Raises ConfigError for a host that the whole Internet can reach: nobody who connects is asked for a token."""
-    try:
-        ip = str(socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0])
-    except OSError as error:
-        raise ConfigError(f"group.coordinator: no machine has the name {host!r} ({error.strerror or error})") from error
-    if ipaddress.ip_address(ip).is_global:
-        raise ConfigError(
-            f"group.coordinator: {ip} is a public address, and the group asks nobody who connects for a token; want an "
-            "address of a private network"
-        )
 
 
 def _settings(config: RunConfig) -> dict[str, str]:

@@ -46,9 +46,10 @@ class Link:
         self.send("hello", hello)
         for work in (self._read, self._watch):
             threading.Thread(target=work, name="group", daemon=True).start()
+        self.hellos: list[dict[str, Any]]
+        """what each process said of itself"""
         try:
             self.hellos = self._wait_for(("hello", 0), JOIN_TIMEOUT_S, f"to connect to {address[0]}:{address[1]}")
-            """what each process said of itself"""
         except BaseException:
             self.close()
             raise

@@ -9,6 +9,7 @@ import pytest
 
 from gvz.cluster import session
 from gvz.cluster.nodes import Node, check_nodes, describe
+from gvz.core import addresses
 from gvz.core.errors import ConfigError, ResourceError
 from tests.cluster.conftest import RayCluster
 
@@ -79,7 +80,7 @@ def test_a_public_address_is_refused_before_anything_is_sent_there():
 
 @pytest.mark.parametrize("ip", ["127.0.0.1", "10.1.2.3", "192.168.0.7", "172.20.0.2", "100.64.1.1", "fd00::1"])
 def test_private_addresses_are_allowed(ip):
-    session.require_private(ip, "here")
+    addresses.require_private(ip, "here", "")
 
 
 @pytest.mark.usefixtures("token")

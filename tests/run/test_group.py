@@ -77,11 +77,9 @@ def until(condition: Callable[[], Any], timeout_s: float = 30.0) -> Any:
     return found
 
 
-def watched() -> bool:
-    """Whether a link of this process is open after a while: such a link ends the process when its group ends."""
-    with contextlib.suppress(AssertionError):
-        until(lambda: not [thread for thread in threading.enumerate() if thread.name == "group"], 10.0)
-    return any(thread.name == "group" for thread in threading.enumerate())
+def until_no_link_is_open() -> None:
+    """A link that stays open ends its process some time after its group has ended."""
+    until(lambda: not any(thread.name == "group" for thread in threading.enumerate()))
 
 
 def test_a_step_is_done_when_all_are_ready_and_a_save_when_nobody_writes():
@@ -160,7 +158,7 @@ def test_processes_that_differ_are_refused_on_both_sides_by_the_name_of_what_dif
     assert {str(error) for error in found} == {
         "group: learner.batch_size is 32 in learner process 0 and 64 in 1; want it the same"
     }
-    assert not watched(), "who is refused leaves nothing that would end this process"
+    until_no_link_is_open()
     for group in joined(2, name="another"):
         group._opened.close()
 
@@ -198,7 +196,7 @@ def test_waits_for_the_others_are_bounded_and_say_for_whom(monkeypatch):
     the_relay = Relay(address, 3)
     with pytest.raises(WaitTimeoutError, match=r"waited 0 s for learner processes 1, 2 to connect to 127\.0\.0\.1"):
         link.Link(address, 0, 3, {})
-    assert not watched()
+    until_no_link_is_open()
     the_relay.close()
 
 
@@ -261,7 +259,7 @@ def test_what_a_group_cannot_do_is_refused(changes, message):
 @pytest.mark.parametrize(
     ("host", "message"),
     [
-        ("8.8.8.8", r"8\.8\.8\.8 is a public address, and the group asks nobody"),
+        ("8.8.8.8", r"8\.8\.8\.8 is a public address; the group asks nobody"),
         ("no.such.host.invalid", "no machine has"),
     ],
 )

@@ -1,1 +1,1 @@
-"""`gvz.make_vec` as other libraries want a vector environment: one module a library, imported by whoever has it."""
+"""`gvz.make_vec` in the form that other libraries want: one module for each library, which must be installed."""

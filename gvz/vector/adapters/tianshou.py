@@ -16,8 +16,8 @@ from gvz.vector.env import DoomVectorEnv
 class TianshouVectorEnv:
     """Games in worker processes. Observations are stacks of the last frames, u8[N, num_stack, 84, 84, C], newest last.
 
-    Tianshou resets the games whose episodes are over itself, and steps any set of them: hence the two arguments of
-    `gvz.make_vec`.
+    Tianshou itself resets the games whose episodes are over, and it steps any set of games. So `gvz.make_vec` needs the
+    two arguments below.
 
     Args:
         envs: of `gvz.make_vec(..., batch_size=1, autoreset_mode="Disabled")`; closed together with this object.

@@ -1,0 +1,24 @@
+"""What is asked of an address before anything listens or connects there."""
+
+import ipaddress
+import socket
+
+from gvz.core.errors import ConfigError
+
+
+def resolve(host: str, where: str) -> str:
+    """The IP address of a host.
+
+    Raises:
+        ConfigError: no machine has this name; the message begins with `where`.
+    """
+    try:
+        return str(socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0])
+    except OSError as error:
+        raise ConfigError(f"{where}: no machine has the name {host!r} ({error.strerror or error})") from error
+
+
+def require_private(ip: str, where: str, advice: str) -> None:
+    """Raises ConfigError for an address that the whole Internet can reach; `advice` ends the message."""
+    if ipaddress.ip_address(ip).is_global:
+        raise ConfigError(f"{where}: {ip} is a public address; {advice}")
