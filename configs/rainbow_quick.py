@@ -2,7 +2,7 @@
 
 Against `rainbow_4task`: grey frames of 48x84, two small convolutions, 128 hidden units, a higher learning rate, 16
 decisions for each gradient step instead of 4, importance weights with an exponent of 0.4 throughout, a moving average
-of the parameters for evaluation, and a replay, warm-up and target period that fit 17,000 gradient steps.
+of the parameters for evaluation, and a replay, warm-up and target period that fit 15,000 gradient steps.
 """
 
 from gvz.core.env_config import EnvConfig
@@ -18,7 +18,7 @@ CONFIG = RunConfig(
     agent=RainbowConfig(conv_channels=(16, 32), conv_kernels=(8, 4), conv_strides=(4, 2), hidden_units=128),
     replay=ReplayConfig(capacity=50_000, importance_sampling_exponent_end=0.4),
     learner=LearnerConfig(
-        total_updates=17_000,
+        total_updates=15_000,
         env_steps_per_update=16.0,
         warmup_steps=2_000,
         learning_rate=5e-4,
