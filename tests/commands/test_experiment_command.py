@@ -48,8 +48,8 @@ def test_list_names_every_experiment_with_its_question(capsys):
     for experiment in experiments().values():
         assert f"{experiment.name}: {experiment.question}" in out
         assert f"{len(experiment.runs())} runs of {experiment.budget}" in out
-    assert "16 runs of 600 seconds of processor time, at most 60,000 gradient steps" in out
-    assert "rainbow_quick+decisions_4, rainbow_quick+decisions_8" in out
+    assert "12 runs of 1,200 seconds of processor time, at most 60,000 gradient steps" in out
+    assert "rainbow_4task+decisions_4, rainbow_4task+decisions_16" in out
     assert main(["experiment", "list", "--json"]) == 0
     rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert {row["name"]: row["runs"] for row in rows} == {e.name: len(e.runs()) for e in experiments().values()}
@@ -79,19 +79,19 @@ def test_plan_prints_runs_steps_episodes_and_hours_and_counts_shared_runs_once(r
 
 
 def test_a_gate_s_hours_follow_from_its_processor_time_and_its_variants_have_rates_of_their_own(results, capsys):
-    fast = results / "runs" / "rainbow_quick+decisions_8" / "dodge_projectiles" / "train4" / "seed_1111"
+    fast = results / "runs" / "rainbow_4task+decisions_16" / "dodge_projectiles" / "train4" / "seed_1111"
     write(fast / "starts.jsonl", {"cpu": cpu_model(), "cores": CORES})
     write(fast / "metrics.jsonl", {"num_updates": 1, "learner/updates_per_s": 7.0})
     assert main(["experiment", "plan", "gate_reuse", "--jobs", "1", "--results", str(results)]) == 0
     out = capsys.readouterr().out
-    assert "rainbow_quick+decisions_8: 7.00 updates/s" in out
-    assert "rainbow_quick+decisions_4: - updates/s" in out
+    assert "rainbow_4task+decisions_16: 7.00 updates/s" in out
+    assert "rainbow_4task+decisions_4: - updates/s" in out
     assert main(["experiment", "plan", "gate_reuse", "--jobs", "1", "--results", str(results), "--json"]) == 0
     rows = {row["run"]: row for row in map(json.loads, capsys.readouterr().out.splitlines())}
-    assert len(rows) == 16
-    row = rows["rainbow_quick+decisions_32/defend_the_center/train4/seed_2222"]
-    assert row["training_hours"] == pytest.approx(600 / CORES / 3600)
-    assert (row["updates"], row["env_steps"], row["episodes"]) == (60_000, 2_000 + 32 * 60_000, (3 + 4) * 20)
+    assert len(rows) == 12
+    row = rows["rainbow_4task+decisions_64/defend_the_center/train4/seed_2222"]
+    assert row["training_hours"] == pytest.approx(1_200 / CORES / 3600)
+    assert (row["updates"], row["env_steps"], row["episodes"]) == (60_000, 10_000 + 64 * 60_000, (3 + 4) * 20)
 
 
 def test_status_tells_done_failed_and_waiting_apart(tmp_path, capsys):

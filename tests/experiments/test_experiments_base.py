@@ -151,7 +151,7 @@ def test_a_gate_is_evaluated_on_the_gate_tasks_and_on_those_of_training_and_its_
     gates = tuple(task.id for task in named_tasks(run.scenario, split="gate"))
     assert gate.evaluation_tasks(run) == (*gates, *run.tasks)
     assert gate.table_tasks(run) == gates
-    assert len(gate.runs()) == 2 * 4 * 2
+    assert len(gate.runs()) == 2 * 3 * 2
     test = {task.id for task in named_tasks(split="test")}
     assert not test & {task for run in gate.runs() for task in gate.evaluation_tasks(run)}
 

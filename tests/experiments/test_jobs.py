@@ -82,10 +82,10 @@ def test_a_run_with_a_limit_of_processor_time_counts_seconds_and_keeps_its_confi
     directory.mkdir(parents=True)
     (directory / "metrics.jsonl").write_text('{"num_updates": 900, "run/processor_s": 61.5}\n')
     outlook = job.outlook()
-    assert outlook.text == "900 updates in 62/600 processor seconds, 0/2 episodes"
+    assert outlook.text == "900 updates in 62/1,200 processor seconds, 0/2 episodes"
     assert outlook.next is not None
-    assert (outlook.next.total, outlook.next.unit, job.done_count("train")) == (600, "processor seconds", 61)
-    assert parse(training_flags(run, 1)).run.checkpoint == load_config("rainbow_quick").checkpoint
+    assert (outlook.next.total, outlook.next.unit, job.done_count("train")) == (1_200, "processor seconds", 61)
+    assert parse(training_flags(run, 1)).run.checkpoint == load_config("rainbow_4task").checkpoint
 
 
 def test_a_player_plays_into_its_own_file(tmp_path):

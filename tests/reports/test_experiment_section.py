@@ -81,16 +81,16 @@ def test_a_gate_has_a_table_over_its_gate_tasks_and_one_over_the_tasks_of_traini
     results = read_results([tmp_path])
     (asked,) = results.asked
     gate, training = result_table(results, asked), result_table(results, asked, trained=True)
-    names = tuple(f"rainbow_quick+decisions_{n}" for n in (4, 8, 16, 32))
+    names = tuple(f"rainbow_4task+decisions_{n}" for n in (4, 16, 64))
     assert gate.columns == training.columns == ("scenario", "numbers", *names)
     assert [[cell.estimate.value for cell in row[2:] if cell.estimate] for row in gate.rows] == [
-        [5.5, 9.5, 17.5, 33.5]  # mean of seeds 0 and 3
+        [5.5, 17.5, 65.5]  # mean of seeds 0 and 3
     ] * 3
-    assert [cell.estimate.value for cell in training.rows[0][2:] if cell.estimate] == [55.5, 59.5, 67.5, 83.5]
+    assert [cell.estimate.value for cell in training.rows[0][2:] if cell.estimate] == [55.5, 67.5, 115.5]
     assert "on the gate tasks" in gate.caption
     assert "on the tasks of training" in training.caption
     section = experiment_section(results, asked, tmp_path)
-    assert "120 seconds of processor time, at most 12,000 gradient steps" in section.blocks[0].text[1]
+    assert "240 seconds of processor time, at most 12,000 gradient steps" in section.blocks[0].text[1]
     assert section.blocks[1].text == ("Runs that end by their processor time are evaluated once: there are no curves.",)
     assert all(run.ended for run in results.runs), "the records have 240 seconds"
     assert {run.processor_s for run in results.runs} == {240.0}
