@@ -10,7 +10,7 @@ Raileanu et al. 2021 (DrAC) compare the kinds in Procgen.
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import reduce
+from functools import partial, reduce
 from itertools import product
 from operator import add
 
@@ -65,7 +65,10 @@ def augment(
     strengths = jnp.where(clean, 0.0, strength)
     stacks = frames.reshape(batch, height, width, depth // channels, channels)
     for name, key_of_it in zip(names, keys, strict=True):
-        stacks = AUGMENTATIONS[name](key_of_it, stacks, strengths)
+        # XLA compiles a branch by itself. Without branches it fused random_conv with what follows and computed its sums
+        # again for every use: random_conv, contrast and gamma took 39 ms together, and take 1.5 (48x84 grey, as below).
+        change = partial(AUGMENTATIONS[name], key_of_it)
+        stacks = jax.lax.cond(jnp.any(strengths > 0), change, lambda unchanged, _: unchanged, stacks, strengths)
     return stacks.reshape(frames.shape)
 
 
