@@ -3,6 +3,8 @@
 from gvz.experiments.base import Experiment
 
 STRONG = ("random_conv", "contrast", "gamma", "shift")
+AUGMENTED = {"agent.augmentations": STRONG, "agent.augmentation_strength": 0.5}
+POOLED = {"agent.encoder": "height_pool"}
 
 EXPERIMENT = Experiment(
     name="gate_sight",
@@ -12,10 +14,11 @@ EXPERIMENT = Experiment(
     configs=("rainbow_quick",),
     variants={
         "plain": {},
-        "augmented": {"agent.augmentations": STRONG, "agent.augmentation_strength": 0.5},
-        "layer_norm": {"agent.encoder": "layer_norm"},
-        "height_pool": {"agent.encoder": "height_pool"},
+        "augmented": AUGMENTED,
+        "height_pool": POOLED,
+        "height_pool_augmented": POOLED | AUGMENTED,
         "memory": {"agent.past_actions": 16, "agent.game_variables": True, "agent.hidden_input_share": 0.2},
+        "layer_norm": {"agent.encoder": "layer_norm"},
     },
     scenarios=("dodge_projectiles", "health_gathering"),
     trainings=("train8",),
