@@ -1,8 +1,8 @@
 """What each encoder costs: gradient steps of 32 and decisions of eight games, on grey frames of 48x84.
 
 The agent is that of `rainbow_quick` with the thesis's sizes of convolutions, which `nature`, `layer_norm` and the
-pooling encoders take; `small`, `impala` and `impoola` have sizes of their own. A gradient step draws, learns and writes
-priorities; a decision is the network's part of it, for eight games in one call. There is no goal.
+pooling encoders take; `small` and all forms of IMPALA have sizes of their own. A gradient step draws, learns and
+writes priorities; a decision is the network's part of it, for eight games in one call. There is no goal.
 """
 
 import dataclasses

@@ -1,7 +1,8 @@
-"""`rainbow_general` for a machine with a GPU: frames of 84x84, IMPALA's encoder, batches of 256 transitions.
+"""`rainbow_general` for a machine with a GPU: frames of 84x84, a larger encoder, batches of 256 transitions.
 
-The GPU chooses the actions, too. Its memory holds the replay, 3.5 GB. A gradient step comes with 64 decisions: a
-decision is drawn four times, and twice in `rainbow_general`. Nobody has measured this configuration yet.
+The encoder is IMPALA's, pooled over the height. The GPU chooses the actions, too. Its memory holds the replay, 3.5 GB.
+A gradient step comes with 64 decisions: a decision is drawn four times, and twice in `rainbow_general`. Nobody has
+measured this configuration yet.
 """
 
 import dataclasses
@@ -17,7 +18,9 @@ CONFIG = dataclasses.replace(
     name="rainbow_general_gpu",
     env=dataclasses.replace(GENERAL.env, frame_height=84, frame_width=84),
     actors=ActorsConfig(inference="device"),
-    agent=dataclasses.replace(GENERAL.agent, encoder="impala", hidden_units=512, activation_dtype="bfloat16"),
+    agent=dataclasses.replace(
+        GENERAL.agent, encoder="impala_height_pool", hidden_units=512, activation_dtype="bfloat16"
+    ),
     replay=dataclasses.replace(_REPLAY, capacity=500_000),
     learner=dataclasses.replace(
         _LEARNER,

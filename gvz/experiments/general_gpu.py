@@ -14,6 +14,7 @@ EXPERIMENT = dataclasses.replace(
     max_processor_s=None,
     notes=(
         GENERAL.notes[0],
-        "Differs from the thesis: grey frames, IMPALA's encoder, batches of 256, 64 decisions for each gradient step.",
+        "Differs from the thesis: grey frames, IMPALA's encoder pooled over the height, batches of 256, 64 decisions "
+        "for each gradient step.",
     ),
 )
