@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gvz.evaluation.statistics import Estimate, bootstrap
+from gvz.evaluation.statistics import bootstrap, bootstrap_runs
 from gvz.reports.experiment_section import comparison_table, result_table
 from gvz.reports.results import read_results
 from gvz.tasks import named_tasks, scenarios
@@ -14,21 +14,24 @@ from gvz.tasks import named_tasks, scenarios
 ROOT = Path(__file__).parent.parent
 
 
-def evaluation(name: str) -> tuple[Estimate, list[int]]:
-    with gzip.open(ROOT / "results" / "rainbow_quick" / name, "rt") as file:
-        rows = [json.loads(line) for line in file]
-    return bootstrap([np.array([row["score"] for row in rows])]), sorted(row["seed"] for row in rows)
+def test_the_quick_runs_are_better_than_chance_on_the_same_episodes():
+    folder = ROOT / "results" / "rainbow_quick"
 
+    def episodes(file: Path) -> tuple[np.ndarray, list[int]]:
+        rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+        return np.array([row["score"] for row in rows]), sorted(row["seed"] for row in rows)
 
-def test_the_quick_run_is_better_than_chance_on_the_same_episodes():
-    trained, trained_seeds = evaluation("evaluation.jsonl.gz")
-    chance, chance_seeds = evaluation("evaluation_random.jsonl.gz")
-    assert len(trained_seeds) == 100
-    assert trained_seeds == chance_seeds
-    assert chance.high < trained.low
-    readme = (ROOT / "README.md").read_text()
-    assert f"| random | {chance} |" in readme
-    assert f"| rainbow_quick, 17,000 updates | {trained} |" in readme
+    chance, seeds = episodes(folder / "evaluation_random.jsonl.gz")
+    runs = [episodes(folder / f"seed_{seed}" / "evaluation.jsonl.gz") for seed in (1111, 2222, 3333)]
+    assert len(seeds) == 100
+    assert all(of_run == seeds for _, of_run in runs)
+    trained = bootstrap_runs([[[scores] for scores, _ in runs]], redraw=["runs"])
+    assert bootstrap([chance]).high < trained.low
+    readme, page = (ROOT / "README.md").read_text(), (folder / "README.md").read_text()
+    assert f"| random | {bootstrap([chance])} |" in readme
+    assert f"| rainbow_quick, 15,000 updates | {trained} |" in readme
+    for seed, (scores, _) in zip((1111, 2222, 3333), runs, strict=True):
+        assert f"| {seed} | {bootstrap([scores])} | {bootstrap([100 * scores / 1100])} |" in page
 
 
 def test_the_quick_comparison_says_what_its_records_give():
