@@ -95,9 +95,11 @@ def test_the_joint_run_says_what_its_records_give():
 def test_the_findings_say_what_the_gates_records_give():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     results = read_results([ROOT / "results" / "gates"])
-    world, reward = results.asked
+    world, reward, sight = results.asked
     for trained, title in ((False, "gate tasks"), (True, "training tasks")):
         for scenario, _, *cells in result_table(results, world, trained=trained).rows[:-1]:
+            assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
+        for scenario, _, *cells in result_table(results, sight, trained=trained).rows[:-1]:
             assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
         _, _, *cells = result_table(results, reward, trained=trained).rows[0]
         assert f"| {title} | {' | '.join(cell.text for cell in cells)} |" in page
@@ -106,6 +108,9 @@ def test_the_findings_say_what_the_gates_records_give():
         assert compared.text == "8 tasks against 4 tasks"
         assert value in page
         assert interval in page
+    pooled = {row[0].text: row[2].text for row in comparison_table(results, sight).rows[:3]}
+    assert list(pooled) == ["Dodge Projectiles", "Health Gathering", "Defend the Center"]
+    assert all(gain in page for gain in pooled.values())
 
 
 def test_the_readme_says_how_fast_the_records_are():
