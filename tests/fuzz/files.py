@@ -29,6 +29,7 @@ from gvz.run.rundir import RECORD_FILES, RunDir
 from tests.fuzz.target import Target
 
 RESULTS = Path(__file__).parents[2] / "results"
+QUICK = RESULTS / "rainbow_quick" / "seed_1111"
 JSON_WORDS = [
     b"NaN",
     b"Infinity",
@@ -47,11 +48,11 @@ JSON_WORDS += [b"[" * 2000, b'{"a":' * 2000, b'"schema": 2', b", ", b": ", b"\n"
 
 def _examples(name: str, num_lines: int = 3) -> bytes:
     """The first lines of a committed record file."""
-    with gzip.open(RESULTS / "rainbow_quick" / f"{name}.jsonl.gz", "rb") as stream:
+    with gzip.open(QUICK / f"{name}.jsonl.gz", "rb") as stream:
         return b"".join(itertools.islice(stream, num_lines))
 
 
-CONFIG_JSON = (RESULTS / "rainbow_quick" / "config.json").read_bytes()
+CONFIG_JSON = (QUICK / "config.json").read_bytes()
 PLAN_JSON = (RESULTS / "quick_comparison" / "plan.json").read_bytes()
 
 
@@ -129,7 +130,7 @@ def evaluation_records(directory: Path) -> Target:
         assert len(rows_of(player_spec, rows)) <= len(rows)
         return True
 
-    seeds = [_examples("evaluation"), _examples("evaluation_random"), _examples("evaluation")[:-9]]
+    seeds = [_examples("evaluation"), _examples("../evaluation_random"), _examples("evaluation")[:-9]]
     keys = [json.dumps(name).encode() + b": " for name in (*REQUIRED, *OPTIONAL, "reward_components")]
     return Target(run=run, seeds=seeds, words=[*JSON_WORDS, *keys])
 
