@@ -1,11 +1,10 @@
 """A gate: whether Seek and Kill's reward for walking keeps agents from fighting, at equal processor time."""
 
-from gvz.experiments.base import Experiment
+from gvz.experiments.gate import Gate
 
-EXPERIMENT = Experiment(
+EXPERIMENT = Gate(
     name="gate_reward",
     title="Gate: the reward for walking in Seek and Kill",
-    source="docs/EXPERIMENTS.md, Gates",
     question="At equal processor time, does a smaller reward for walking help in Seek and Kill?",
     configs=("rainbow_quick",),
     variants={
@@ -14,14 +13,6 @@ EXPERIMENT = Experiment(
     },
     scenarios=("seek_and_kill",),
     trainings=("train8",),
-    seeds=(1111, 2222),
-    total_updates=60_000,
-    max_processor_s=400.0,
-    num_checkpoints=1,
-    episodes=20,
-    evaluate_on="gate",
-    table_checkpoints=1,
-    columns="config",
     notes=(
         "An agent that walks straight on gets some 0.2 a decision for it, as much as for a kill in five decisions. "
         "Scores are the protocol's, whatever an agent was rewarded for.",
