@@ -44,7 +44,9 @@ def experiment_section(results: Results, asked: PlannedExperiment, out: Path) ->
         tables.append(comparison_table(results, asked))
     text = (f"**{experiment.question}** Source: {experiment.source}.", budget, *experiment.notes)
     if experiment.max_processor_s is not None:
-        curves = Block(text=("Runs that end by their processor time are evaluated once: there are no curves.",))
+        curves = Block(
+            text=("Such runs are evaluated once. Curves of their training are in the sections of the scenarios.",)
+        )
     elif figures := _figures(results, asked, out):
         curves = Block(heading="Curves", figures=tuple(figures))
     else:

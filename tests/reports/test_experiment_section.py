@@ -91,7 +91,9 @@ def test_a_gate_has_a_table_over_its_gate_tasks_and_one_over_the_tasks_of_traini
     assert "on the tasks of training" in training.caption
     section = experiment_section(results, asked, tmp_path)
     assert "240 seconds of processor time, at most 12,000 gradient steps" in section.blocks[0].text[1]
-    assert section.blocks[1].text == ("Runs that end by their processor time are evaluated once: there are no curves.",)
+    assert section.blocks[1].text == (
+        "Such runs are evaluated once. Curves of their training are in the sections of the scenarios.",
+    )
     assert all(run.ended for run in results.runs), "the records have 240 seconds"
     assert {run.processor_s for run in results.runs} == {240.0}
 
