@@ -16,6 +16,7 @@ from matplotlib.figure import Figure as Picture
 from matplotlib.rcsetup import cycler
 from matplotlib.ticker import FuncFormatter
 
+from gvz.evaluation.statistics import Estimate
 from gvz.reports.curves import Curve
 from gvz.reports.document import Figure
 from gvz.scenarios.base import Task
@@ -75,6 +76,29 @@ def draw_curves(
             axes.axhline(value, color=GREY, linestyle=("--", ":", "-.")[number % 3], linewidth=1, label=name)
         axes.set_ylim(0, None)
         axes.xaxis.set_major_formatter(FuncFormatter(_short_number))
+        _legend(picture, axes)
+        return _written(picture, out, id, caption)
+
+
+def draw_levels(
+    out: Path, id: str, title: str, levels: Sequence[int], values: Mapping[str, Sequence[Estimate]], caption: str
+) -> Figure:
+    """A line over the levels for each agent, with its intervals.
+
+    Args:
+        out, id, title, caption: as of `draw_curves`.
+        levels: of tasks, rising.
+        values: agent -> an estimate for each level, percent of the upper bound.
+    """
+    with mpl.rc_context(STYLE):
+        picture, axes = _panel(title, "level", "score, % of the bound")
+        for number, (agent, found) in enumerate(values.items()):
+            low, high = ([getattr(estimate, end) for estimate in found] for end in ("low", "high"))
+            means = [estimate.value for estimate in found]
+            axes.plot(levels, means, marker="o", markersize=3, color=f"C{number}", label=agent)
+            axes.fill_between(levels, low, high, color=f"C{number}", alpha=0.15, linewidth=0)
+        axes.set_xticks(levels)
+        axes.set_ylim(0, None)
         _legend(picture, axes)
         return _written(picture, out, id, caption)
 

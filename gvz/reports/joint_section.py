@@ -1,14 +1,18 @@
-"""The section over all scenarios: one number for each agent that was evaluated in several of them."""
+"""The section over all scenarios: how agents that were evaluated in several of them do in the mean."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from gvz.evaluation.statistics import mean_over_scenarios
-from gvz.reports.document import Block, Section, Table, words
+from gvz.reports.document import Block, Cell, Figure, Section, Table, words
+from gvz.reports.draw import draw_levels
 from gvz.reports.results import Results
 from gvz.reports.scenario_section import agents_of
-from gvz.reports.scores import agent_scores, estimate, estimate_groups
-from gvz.tasks import named_tasks, scenario_named, scenarios
+from gvz.reports.scores import Scores, agent_scores, estimate, estimate_groups
+from gvz.tasks import LEVELS, named_tasks, scenario_named, scenarios
 
 
-def joint_sections(results: Results) -> list[Section]:
+def joint_sections(results: Results, out: Path) -> list[Section]:
     """The section, if an agent has the test tasks of two scenarios or more."""
     episodes = results.episodes.drop_nulls("level")
     test = {name: [task.id for task in named_tasks(name, split="test")] for name in scenarios()}
@@ -17,16 +21,16 @@ def joint_sections(results: Results) -> list[Section]:
         agent: [name for name, tasks in test.items() if one.complete_seeds(tasks)] for agent, one in scores.items()
     }
     shown = [name for name in test if any(name in names for names in played.values())]
-    agents = [agent for agent, names in played.items() if len(names) > 1]
-    if not agents:
+    scores = {agent: one for agent, one in scores.items() if len(played[agent]) > 1}
+    if not scores:
         return []
     rows = [
         (
             words(agent),
-            *(estimate(scores[agent], test[name]) for name in shown),
-            estimate_groups([(scores[agent], test[name]) for name in shown], mean_over_scenarios),
+            *(estimate(one, test[name]) for name in shown),
+            estimate_groups([(one, test[name]) for name in shown], mean_over_scenarios),
         )
-        for agent in agents
+        for agent, one in scores.items()
     ]
     table = Table(
         id="joint",
@@ -35,4 +39,30 @@ def joint_sections(results: Results) -> list[Section]:
         rows=tuple(rows),
         notes=("- : not evaluated on all test tasks of all these scenarios.",),
     )
-    return [Section(id="joint", title="All scenarios", blocks=(Block(tables=(table,)),))]
+    by_level = {agent: _by_level(one, shown) for agent, one in scores.items()}
+    whole = {agent: cells for agent, cells in by_level.items() if all(cell.estimate for cell in cells)}
+    tables = (table, _level_table(by_level)) if whole else (table,)
+    figures = (_level_figure(whole, out),) if whole else ()
+    return [Section(id="joint", title="All scenarios", blocks=(Block(tables=tables, figures=figures),))]
+
+
+def _by_level(scores: Scores, shown: Sequence[str]) -> list[Cell]:
+    """The mean over the scenarios of all named tasks of each level."""
+    levels = ([(scores, [task.id for task in named_tasks(name, level=level)]) for name in shown] for level in LEVELS)
+    return [estimate_groups(groups, mean_over_scenarios) for groups in levels]
+
+
+def _level_table(by_level: Mapping[str, Sequence[Cell]]) -> Table:
+    return Table(
+        id="joint_levels",
+        caption="All named tasks by level, percent of the upper bound: mean over the scenarios.",
+        columns=("agent", *(f"level {level}" for level in LEVELS)),
+        rows=tuple((words(agent), *cells) for agent, cells in by_level.items()),
+        notes=("- : not evaluated on all named tasks of this level.",),
+    )
+
+
+def _level_figure(by_level: Mapping[str, Sequence[Cell]], out: Path) -> Figure:
+    values = {agent: [cell.estimate for cell in cells if cell.estimate] for agent, cells in by_level.items()}
+    caption = "All scenarios: all named tasks by level, mean over the scenarios with 95% interval."
+    return draw_levels(out, "joint_levels", "all scenarios", LEVELS, values, caption)

@@ -49,7 +49,7 @@ def make_report(paths: Sequence[Path], out: Path, title: str | None = None) -> t
     except OSError as error:
         raise ConfigError(f"--out: {out} cannot be written: {error.strerror}") from error
     sections = [experiment_section(results, asked, out) for asked in results.asked]
-    sections += [*joint_sections(results), *scenario_sections(results, out), *run_sections(results, out)]
+    sections += [*joint_sections(results, out), *scenario_sections(results, out), *run_sections(results, out)]
     if results.problems:
         text = ("What could not be read or is not there. Everything else was.", *results.problems)
         sections.append(Section(id="problems", title="Problems", blocks=(Block(text=text),)))
