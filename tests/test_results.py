@@ -8,6 +8,7 @@ import numpy as np
 
 from gvz.evaluation.statistics import bootstrap, bootstrap_runs
 from gvz.reports.experiment_section import comparison_table, result_table
+from gvz.reports.joint_section import joint_sections
 from gvz.reports.results import read_results
 from gvz.tasks import named_tasks, scenarios
 
@@ -90,6 +91,21 @@ def test_the_joint_run_says_what_its_records_give():
     report = (folder / "report" / "report.md").read_text()
     assert "P_norm, 43.6 [42.8, 44.4]" in readme
     assert "| rainbow_all | 47.7 [46.8, 48.8] | 41.4 [40.2, 42.7] |" in report
+
+
+def test_the_general_agents_are_above_the_floor_and_their_page_says_what_their_records_give(tmp_path):
+    folder = ROOT / "results" / "general_short"
+    page, results = (folder / "README.md").read_text(), read_results([folder])
+    (asked,) = results.asked
+    *_, ours, _ = rows = result_table(results, asked).rows
+    for title, _, score in rows:
+        (line,) = [line for line in page.splitlines() if line.startswith(f"| {title.text} |")]
+        assert score.text in line
+    assert ours[2].estimate is not None
+    assert ours[2].estimate.low > 41.84, "the thesis's best mean over the scenarios"
+    (section,) = joint_sections(results, tmp_path)
+    for row in section.blocks[0].tables[1].rows:
+        assert f"| {' | '.join(cell.text for cell in row)} |" in page
 
 
 def test_the_findings_say_what_the_gates_records_give():
