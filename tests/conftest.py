@@ -45,6 +45,13 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     seeds.parametrize(metafunc)
 
 
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Tests of floats that depend on the processor compile as users do, the others in a third of that time."""
+    import jax
+
+    jax.config.update("jax_disable_most_optimizations", "isa" not in item.keywords)
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     if terminalreporter.config.getoption("--learning-seeds"):
         seeds.summarize(terminalreporter)
