@@ -1,7 +1,8 @@
 """Rainbow for tasks that it has not seen, on two CPU cores: settings that gates have chosen so far (docs/FINDINGS.md).
 
-Against `rainbow_quick`: the eight training tasks of a scenario, a replay twice as large, a tenth of Seek and Kill's
-reward for walking, and at most 500,000 gradient steps. Stop it when you like, or set `--max-processor-s`.
+Against `rainbow_quick`: the eight training tasks of a scenario, a replay twice as large, and at most 500,000 gradient
+steps; in Seek and Kill a tenth of the reward for walking, and shots that cost nothing. Stop it when you like, or set
+`--max-processor-s`.
 """
 
 import dataclasses
@@ -15,7 +16,9 @@ CONFIG = dataclasses.replace(
     QUICK,
     name="rainbow_general",
     training_set=8,
-    env=dataclasses.replace(QUICK.env, reward_weights=(("seek_and_kill.moved", 0.0005),)),
+    env=dataclasses.replace(
+        QUICK.env, reward_weights=(("seek_and_kill.ammo_spent", 0.0), ("seek_and_kill.moved", 0.0005))
+    ),
     replay=dataclasses.replace(_REPLAY, capacity=100_000),
     learner=dataclasses.replace(_LEARNER, total_updates=500_000),
     checkpoint=CheckpointConfig(period_updates=10_000),
