@@ -93,7 +93,7 @@ def test_the_joint_run_says_what_its_records_give():
     assert "| rainbow_all | 47.7 [46.8, 48.8] | 41.4 [40.2, 42.7] |" in report
 
 
-def test_the_general_agents_are_above_the_floor_and_their_page_says_what_their_records_give(tmp_path):
+def test_the_page_of_the_general_agents_says_what_their_records_give(tmp_path):
     folder = ROOT / "results" / "general_short"
     page, results = (folder / "README.md").read_text(), read_results([folder])
     (asked,) = results.asked
@@ -101,9 +101,8 @@ def test_the_general_agents_are_above_the_floor_and_their_page_says_what_their_r
     for title, _, score in rows:
         (line,) = [line for line in page.splitlines() if line.startswith(f"| {title.text} |")]
         assert score.text in line
-    assert ours[2].estimate is not None
-    assert ours[2].estimate.low > 41.84, "the thesis's best mean over the scenarios"
     (section,) = joint_sections(results, tmp_path)
+    assert section.blocks[0].tables[0].rows[0][-1].text == ours[2].text
     for row in section.blocks[0].tables[1].rows:
         assert f"| {' | '.join(cell.text for cell in row)} |" in page
 
@@ -111,14 +110,15 @@ def test_the_general_agents_are_above_the_floor_and_their_page_says_what_their_r
 def test_the_findings_say_what_the_gates_records_give():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     results = read_results([ROOT / "results" / "gates"])
-    world, reward, sight = results.asked
+    world, reward, sight, ammo = results.asked
     for trained, title in ((False, "gate tasks"), (True, "training tasks")):
         for scenario, _, *cells in result_table(results, world, trained=trained).rows[:-1]:
             assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
         for scenario, _, *cells in result_table(results, sight, trained=trained).rows[:-1]:
             assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
-        _, _, *cells = result_table(results, reward, trained=trained).rows[0]
-        assert f"| {title} | {' | '.join(cell.text for cell in cells)} |" in page
+        for gate in (reward, ammo):
+            _, _, *cells = result_table(results, gate, trained=trained).rows[0]
+            assert f"| {title} | {' | '.join(cell.text for cell in cells)} |" in page
     for _, compared, gain, _ in comparison_table(results, world).rows[:2]:
         value, _, interval = gain.text.partition(" ")
         assert compared.text == "8 tasks against 4 tasks"

@@ -16,22 +16,26 @@ def joint_sections(results: Results, out: Path) -> list[Section]:
     """The section, if an agent has the test tasks of two scenarios or more."""
     episodes = results.episodes.drop_nulls("level")
     test = {name: [task.id for task in named_tasks(name, split="test")] for name in scenarios()}
-    scores = {agent: agent_scores(episodes, agent) for agent in agents_of(episodes)}
+    # a seed may stand for another run in each scenario
+    scores = {
+        agent: {name: agent_scores(episodes.filter(scenario=name), agent) for name in test}
+        for agent in agents_of(episodes)
+    }
     played = {
-        agent: [name for name, tasks in test.items() if one.complete_seeds(tasks)] for agent, one in scores.items()
+        agent: [name for name, tasks in test.items() if by_scenario[name].complete_seeds(tasks)]
+        for agent, by_scenario in scores.items()
     }
     shown = [name for name in test if any(name in names for names in played.values())]
-    scores = {agent: one for agent, one in scores.items() if len(played[agent]) > 1}
+    scores = {agent: [by_scenario[name] for name in shown] for agent, by_scenario in scores.items()}
+    scores = {agent: of_shown for agent, of_shown in scores.items() if len(played[agent]) > 1}
     if not scores:
         return []
-    rows = [
-        (
-            words(agent),
-            *(estimate(one, test[name]) for name in shown),
-            estimate_groups([(one, test[name]) for name in shown], mean_over_scenarios),
+    rows = []
+    for agent, of_shown in scores.items():
+        groups = list(zip(of_shown, (test[name] for name in shown), strict=True))
+        rows.append(
+            (words(agent), *(estimate(*group) for group in groups), estimate_groups(groups, mean_over_scenarios))
         )
-        for agent, one in scores.items()
-    ]
     table = Table(
         id="joint",
         caption="Test tasks of each scenario, percent of the upper bound, and the mean over scenarios (P_norm).",
@@ -46,10 +50,13 @@ def joint_sections(results: Results, out: Path) -> list[Section]:
     return [Section(id="joint", title="All scenarios", blocks=(Block(tables=tables, figures=figures),))]
 
 
-def _by_level(scores: Scores, shown: Sequence[str]) -> list[Cell]:
-    """The mean over the scenarios of all named tasks of each level."""
-    levels = ([(scores, [task.id for task in named_tasks(name, level=level)]) for name in shown] for level in LEVELS)
-    return [estimate_groups(groups, mean_over_scenarios) for groups in levels]
+def _by_level(scores: Sequence[Scores], shown: Sequence[str]) -> list[Cell]:
+    """The mean over the scenarios of all named tasks of each level; `scores` are those in each scenario."""
+    cells = []
+    for level in LEVELS:
+        tasks = ([task.id for task in named_tasks(name, level=level)] for name in shown)
+        cells.append(estimate_groups(list(zip(scores, tasks, strict=True)), mean_over_scenarios))
+    return cells
 
 
 def _level_table(by_level: Mapping[str, Sequence[Cell]]) -> Table:
