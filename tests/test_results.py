@@ -103,6 +103,8 @@ def test_the_page_of_the_general_agents_says_what_their_records_give(tmp_path):
         assert score.text in line
     (section,) = joint_sections(results, tmp_path)
     assert section.blocks[0].tables[0].rows[0][-1].text == ours[2].text
+    assert ours[2].estimate is not None
+    assert ours[2].estimate.low > 41.84, "the thesis's best mean over the scenarios"
     for row in section.blocks[0].tables[1].rows:
         assert f"| {' | '.join(cell.text for cell in row)} |" in page
 
