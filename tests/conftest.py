@@ -46,7 +46,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Tests of floats that depend on the processor compile as users do, the others in a third of that time."""
+    """Compiles programs as users have them in tests marked isa; in others with little optimization, which is quick."""
     import jax
 
     jax.config.update("jax_disable_most_optimizations", "isa" not in item.keywords)

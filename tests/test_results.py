@@ -97,7 +97,8 @@ def test_the_page_of_the_general_agents_says_what_their_records_give(tmp_path):
     folder = ROOT / "results" / "general_short"
     page, results = (folder / "README.md").read_text(), read_results([folder])
     (asked,) = results.asked
-    *_, ours, _ = rows = result_table(results, asked).rows
+    rows = result_table(results, asked).rows
+    ours = rows[-2]  # the mean over the scenarios; the thesis's is below it
     for title, _, score in rows:
         (line,) = [line for line in page.splitlines() if line.startswith(f"| {title.text} |")]
         assert score.text in line

@@ -14,7 +14,7 @@ EXPERIMENT = Gate(
     scenarios=("seek_and_kill",),
     trainings=("train8",),
     notes=(
-        "By the thesis a shot costs 0.1 and a kill gives 1; LevDoom's shots are free. One of the first two runs of "
-        "general_short stopped shooting. Scores are the protocol's, whatever an agent was rewarded for.",
+        "By the thesis a shot costs 0.1 and a kill gives 1; LevDoom's shots are free. Scores are the protocol's, "
+        "whatever an agent was rewarded for.",
     ),
 )

@@ -16,7 +16,6 @@ def joint_sections(results: Results, out: Path) -> list[Section]:
     """The section, if an agent has the test tasks of two scenarios or more."""
     episodes = results.episodes.drop_nulls("level")
     test = {name: [task.id for task in named_tasks(name, split="test")] for name in scenarios()}
-    # a seed may stand for another run in each scenario
     scores = {
         agent: {name: agent_scores(episodes.filter(scenario=name), agent) for name in test}
         for agent in agents_of(episodes)
@@ -26,13 +25,12 @@ def joint_sections(results: Results, out: Path) -> list[Section]:
         for agent, by_scenario in scores.items()
     }
     shown = [name for name in test if any(name in names for names in played.values())]
-    scores = {agent: [by_scenario[name] for name in shown] for agent, by_scenario in scores.items()}
-    scores = {agent: of_shown for agent, of_shown in scores.items() if len(played[agent]) > 1}
-    if not scores:
+    agents = [agent for agent, names in played.items() if len(names) > 1]
+    if not agents:
         return []
     rows = []
-    for agent, of_shown in scores.items():
-        groups = list(zip(of_shown, (test[name] for name in shown), strict=True))
+    for agent in agents:
+        groups = [(scores[agent][name], test[name]) for name in shown]
         rows.append(
             (words(agent), *(estimate(*group) for group in groups), estimate_groups(groups, mean_over_scenarios))
         )
@@ -43,20 +41,20 @@ def joint_sections(results: Results, out: Path) -> list[Section]:
         rows=tuple(rows),
         notes=("- : not evaluated on all test tasks of all these scenarios.",),
     )
-    by_level = {agent: _by_level(one, shown) for agent, one in scores.items()}
+    by_level = {agent: _by_level(scores[agent], shown) for agent in agents}
     whole = {agent: cells for agent, cells in by_level.items() if all(cell.estimate for cell in cells)}
     tables = (table, _level_table(by_level)) if whole else (table,)
     figures = (_level_figure(whole, out),) if whole else ()
     return [Section(id="joint", title="All scenarios", blocks=(Block(tables=tables, figures=figures),))]
 
 
-def _by_level(scores: Sequence[Scores], shown: Sequence[str]) -> list[Cell]:
-    """The mean over the scenarios of all named tasks of each level; `scores` are those in each scenario."""
-    cells = []
-    for level in LEVELS:
-        tasks = ([task.id for task in named_tasks(name, level=level)] for name in shown)
-        cells.append(estimate_groups(list(zip(scores, tasks, strict=True)), mean_over_scenarios))
-    return cells
+def _by_level(scores: Mapping[str, Scores], shown: Sequence[str]) -> list[Cell]:
+    """For each level, the mean over the scenarios of all its named tasks."""
+
+    def groups(level: int) -> list[tuple[Scores, list[str]]]:
+        return [(scores[name], [task.id for task in named_tasks(name, level=level)]) for name in shown]
+
+    return [estimate_groups(groups(level), mean_over_scenarios) for level in LEVELS]
 
 
 def _level_table(by_level: Mapping[str, Sequence[Cell]]) -> Table:

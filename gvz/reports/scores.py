@@ -53,7 +53,10 @@ def pick(episodes: pl.DataFrame, *, column: str = "normalized_score") -> dict[Se
 
 
 def agent_scores(episodes: pl.DataFrame, agent: str, *, column: str = "normalized_score") -> Scores:
-    """An agent's final scores, or another column of its rows: of the last quarter of its evaluated checkpoints."""
+    """An agent's final scores, or another column of its rows: of the last quarter of its evaluated checkpoints.
+
+    The episodes are of one scenario. There, more runs than seeds are agents of single tasks.
+    """
     rows = episodes.filter(pl.col("final"), agent=agent)
     runs = pick(rows, column=column)
     one_task_each = rows.group_by("run_dir").agg(pl.col("trained_on").list.len().max()).drop_nulls()
