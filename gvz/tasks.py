@@ -2,18 +2,22 @@
 
 import itertools
 import re
+from collections.abc import Container
 from functools import cache
 from typing import Literal, get_args
 
 from gvz.core.errors import TaskError, nearest
 from gvz.core.registry import discover
-from gvz.scenarios.base import MAX_LEVEL, Scenario, Split, Suite, Task
+from gvz.scenarios.base import MAX_LEVEL, Scenario, Suite, Task
 from gvz.scenarios.map_set import names_map_set, parse_map_set
 
 LEVELS = range(MAX_LEVEL + 1)
 """levels of tasks, the easiest first"""
-TaskSet = Literal[Split, "gate"]
-"""a training or test set, or the gate set: the named tasks of GATE_LEVEL that are in none of these"""
+TrainingSet = Literal["train1", "train4", "train8", "pairs"]
+"""tasks to train on; pairs: the eight of train8, and each two of their attributes that go together and are no named
+task"""
+TaskSet = Literal[TrainingSet, "test", "gate"]
+"""a training set, the test set, or the gate set: the named tasks of GATE_LEVEL that are in neither"""
 GATE_LEVEL = 2
 """of the tasks on which choices about training are made, so that the test tasks stay unseen (docs/EXPERIMENTS.md)"""
 
@@ -91,10 +95,12 @@ def named_tasks(
 ) -> tuple[Task, ...]:
     """The named tasks of a suite or scenario: scenarios in alphabetical order, tasks in the order of their file.
 
+    The set `pairs` is the one that has tasks without a name in the benchmark, too.
+
     Args:
         scenario: only tasks of this scenario, whatever its suite.
         level: only tasks of this level, 0..4.
-        split: only tasks of this training or test set, or of the gate set.
+        split: only tasks of this set.
         suite: whose scenarios, if none is named.
 
     Raises:
@@ -119,11 +125,15 @@ def attribute_tasks(scenario: str) -> tuple[Task, ...]:
     """
     one = scenario_named(scenario)
     names = [attribute.name for attribute in one.attributes]
-    pairs = [
-        (a.name, b.name) for a, b in itertools.combinations(one.attributes, 2) if not set(a.groups) & set(b.groups)
-    ]
     alone = [Task(one, (name,), severities=((name, severity),)) for name in names for severity in (0.5, 1.0)]
-    return (Task(one), *alone, *(Task(one, pair) for pair in pairs))
+    return (Task(one), *alone, *_pairs(one, names))
+
+
+def _pairs(scenario: Scenario, names: Container[str]) -> list[Task]:
+    """Each two of these attributes that are of different groups, in the order of the scenario's file."""
+    chosen = [attribute for attribute in scenario.attributes if attribute.name in names]
+    pairs = itertools.combinations(chosen, 2)
+    return [Task(scenario, (a.name, b.name)) for a, b in pairs if not set(a.groups) & set(b.groups)]
 
 
 def _names(scenario: Scenario, split: TaskSet | None) -> tuple[str, ...]:
@@ -133,4 +143,7 @@ def _names(scenario: Scenario, split: TaskSet | None) -> tuple[str, ...]:
     if split == "gate":
         used = {name for names in scenario.splits.values() for name in names}
         return tuple(name for name in scenario.tasks if name not in used)
+    if split == "pairs":
+        eight, named = scenario.splits["train8"], named_tasks(scenario.id)
+        return (*eight, *(task.name for task in _pairs(scenario, eight) if task not in named))
     return scenario.splits[split]

@@ -221,6 +221,29 @@ def test_training_sets_grow_and_share_nothing_with_the_test_set():
         assert test == {parse_task(f"{scenario}/{name}") for name in TEST_SETS[scenario].split(", ")}
 
 
+def test_the_pairs_of_the_eight_training_tasks_are_all_that_have_no_name():
+    *eight, first = (task.name for task in named_tasks("dodge_projectiles", split="pairs")[:9])
+    assert eight == "default city flames flaming_skulls mancubus barons cacodemons resized_agent".split()
+    names = {task.name for task in named_tasks("dodge_projectiles", split="pairs")} - set(eight)
+    assert first in names
+    # flames and city are both the map's theme, and mancubus, barons and cacodemons are all the enemy
+    assert names == set(
+        "city+flaming_skulls city+mancubus barons+city cacodemons+city flames+flaming_skulls flames+mancubus "
+        "barons+flames flames+resized_agent flaming_skulls+mancubus cacodemons+flaming_skulls "
+        "flaming_skulls+resized_agent barons+resized_agent cacodemons+resized_agent".split()
+    )
+
+
+@pytest.mark.parametrize("scenario", all_scenarios())
+def test_pairs_bring_no_new_attribute_and_no_task_that_others_are_scored_on(scenario):
+    eight, pairs = (named_tasks(scenario, split=split) for split in ("train8", "pairs"))
+    added = set(pairs) - set(eight)
+    assert pairs[:8] == eight
+    assert {name for task in added for name in task.attributes} <= {task.name for task in eight}
+    assert {task.level for task in added} == {2}
+    assert not added & set(named_tasks(scenario))
+
+
 def test_the_gate_set_is_of_level_2_and_in_no_other_set():
     sizes = {"defend_the_center": 3, "health_gathering": 4, "seek_and_kill": 3, "dodge_projectiles": 3}
     assert {scenario: len(named_tasks(scenario, split="gate")) for scenario in scenarios()} == sizes
@@ -285,7 +308,7 @@ def test_what_is_no_task_is_refused_with_what_is_possible(text: str, message: st
 def test_unknown_selections_of_named_tasks_are_refused():
     with pytest.raises(TaskError, match=r"level: got 5, want 0\.\.4"):
         named_tasks(level=5)
-    with pytest.raises(TaskError, match="split: got 'train2', want one of train1, train4, train8, test, gate"):
+    with pytest.raises(TaskError, match="split: got 'train2', want one of train1, train4, train8, pairs, test"):
         named_tasks(split="train2")
     with pytest.raises(TaskError, match="unknown scenario 'seek'"):
         named_tasks("seek")

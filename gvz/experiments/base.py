@@ -17,9 +17,17 @@ from gvz.evaluation.simple import SIMPLE_PLAYERS
 from gvz.experiments.settings import with_settings
 from gvz.run.config import RunConfig
 from gvz.run.config_files import load_config
-from gvz.scenarios.base import Split
 from gvz.scenarios.map_set import PROCEDURAL, VARIED, names_map_set
-from gvz.tasks import LEVELS, Task, attribute_tasks, named_tasks, parse_task, scenario_named, scenarios
+from gvz.tasks import (
+    LEVELS,
+    Task,
+    TrainingSet,
+    attribute_tasks,
+    named_tasks,
+    parse_task,
+    scenario_named,
+    scenarios,
+)
 
 EACH_TASK = "each"
 """as a training: every named task of the scenario, alone"""
@@ -52,7 +60,7 @@ class TrainingRun:
     """file in configs/"""
     scenario: str
     training: str
-    """train1, train4, train8, or the name of the one task trained on"""
+    """train1, train4, train8, pairs, or the name of the one task trained on"""
     tasks: tuple[str, ...]
     """ids of the tasks trained on"""
     seed: int
@@ -111,8 +119,8 @@ class Experiment:
     scenarios: tuple[str, ...] = ()
     """default: those that numbers were published of, or else all"""
     trainings: tuple[str, ...]
-    """train1, train4, train8: a training set; varied-100, procedural-train-100: such a
-    task; each: every named task alone"""
+    """train1, train4, train8, pairs: a training set; varied-100, procedural-train-100: such a task; each: every named
+    task alone"""
     seeds: tuple[int, ...] = (1111, 2222, 3333)
     total_updates: int = 200_000
     """gradient steps of a run"""
@@ -162,10 +170,10 @@ class Experiment:
             )
         for training in self.trainings:
             known = training == EACH_TASK or names_map_set(training)
-            if not known and (training not in get_args(Split) or training == "test"):
+            if not known and training not in get_args(TrainingSet):
                 yield (
-                    f"trainings: got {training!r}, want train1, train4, train8, {VARIED}, {VARIED}-<number of maps>, "
-                    f"{PROCEDURAL}-<split>-<number of maps> or {EACH_TASK}"
+                    f"trainings: got {training!r}, want {', '.join(get_args(TrainingSet))}, {VARIED}, "
+                    f"{VARIED}-<number of maps>, {PROCEDURAL}-<split>-<number of maps> or {EACH_TASK}"
                 )
         for name, settings in self.variants.items():
             if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
@@ -281,7 +289,7 @@ class Experiment:
             elif names_map_set(training):
                 sets[training] = (parse_task(f"{scenario}/{training}").id,)
             else:
-                split: Split = training  # pyright: ignore[reportAssignmentType]  # checked in __post_init__
+                split: TrainingSet = training  # pyright: ignore[reportAssignmentType]  # checked in __post_init__
                 sets[training] = tuple(task.id for task in named_tasks(scenario, split=split))
         return sets
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import polars as pl
 
@@ -18,15 +18,16 @@ from gvz.evaluation.dataset import collect_evaluations, fits
 from gvz.experiments.base import Experiment
 from gvz.experiments.inventory import PROCESSOR_S
 from gvz.experiments.plan import read_plan
-from gvz.reports.document import count
-from gvz.scenarios.base import Split
-from gvz.tasks import all_scenarios, named_tasks
+from gvz.tasks import TrainingSet, all_scenarios, named_tasks
 
 EACH = "each task alone"
 """training of agents each of which was trained on one task"""
 
-TRAINING_SETS: dict[Split, str] = {
-    split: count(int(split.removeprefix("train")), "task") for split in get_args(Split) if split != "test"
+TRAINING_SETS: dict[TrainingSet, str] = {
+    "train1": "1 task",
+    "train4": "4 tasks",
+    "train8": "8 tasks",
+    "pairs": "8 tasks and pairs",
 }
 """what to call a training set: "4 tasks" for train4"""
 
@@ -196,7 +197,7 @@ def _run_id(directory: Path, results: Path) -> str:
 
 
 @cache
-def _task_ids(scenario: str, split: Split) -> set[str]:
+def _task_ids(scenario: str, split: TrainingSet) -> set[str]:
     return {task.id for task in named_tasks(scenario, split=split)} if scenario in all_scenarios() else set()
 
 

@@ -14,9 +14,8 @@ from gvz.core.env_config import EnvConfig, leaves
 from gvz.core.errors import ConfigError
 from gvz.run.curriculum_config import CurriculumConfig, check_curriculum
 from gvz.run.group_config import GroupConfig
-from gvz.scenarios.base import Split
 from gvz.task_table import TaskTable, task_table
-from gvz.tasks import named_tasks
+from gvz.tasks import TrainingSet, named_tasks
 from learner.agents.configs.rainbow import RainbowConfig
 from learner.config import (
     AgentConfig,
@@ -29,7 +28,7 @@ from learner.config import (
 
 MIN_CLUSTER_SLOTS = 128
 """step records that a game has room for in the replay of a run with actor hosts"""
-_SPLITS: dict[int, Split] = {1: "train1", 4: "train4", 8: "train8"}
+_SPLITS: dict[int | str, TrainingSet] = {1: "train1", 4: "train4", 8: "train8", "pairs": "pairs"}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -71,8 +70,9 @@ class RunConfig:
     """names the run directory"""
     scenario: str = "defend_the_center"
     """scenario whose training set is played (unless tasks are named)"""
-    training_set: Literal[1, 4, 8] = 4
-    """tasks in the training set: 1 is the default task, 4 and 8 add tasks of level 1"""
+    training_set: Literal[1, 4, 8, "pairs"] = 4
+    """tasks in the training set: 1 is the default task, 4 and 8 add tasks of level 1, pairs adds to 8 each two of
+    their attributes that go together and are no named task"""
     tasks: tuple[str, ...] | None = None
     """ids of the tasks to train on, instead of a training set; of several scenarios with env.action_set unified_v1"""
     seed: int = 1111
