@@ -20,8 +20,22 @@ Observation = np.ndarray | dict[str, np.ndarray]
 # (at worst 3.0) and 7.0 (4.5). So linear makes walls coarser and enemies stronger, and no enemy is lost.
 _INTERPOLATIONS = {"linear": cv2.INTER_LINEAR, "area": cv2.INTER_AREA}
 
-CLASS_STEP = np.uint8(25)
-"""grey levels between two classes in frames of classes"""
+CLASS_GREYS = {
+    "wall": 0,
+    "plane": 20,
+    "weapon": 40,
+    "scenery": 60,
+    "effect": 80,
+    "other": 110,
+    "poison": 140,
+    "enemy": 170,
+    "key": 200,
+    "kit": 225,
+    "projectile": 250,
+}
+"""grey levels in frames of classes: what an agent acts on is bright, what is around it dark, and
+two of a kind that an agent must tell apart (poison and kits, enemies and missiles) are far from each other"""
+_GREYS = np.array([CLASS_GREYS[name] for name in LABEL_CLASSES], np.uint8)
 
 _CLASS_OF_NAME = {
     "Poison": "poison",  # a class of our own, derived from Health as kits are
@@ -56,15 +70,14 @@ def observation_space(config: EnvConfig) -> spaces.Space[Any]:
 
 def observe_screen(screen: np.ndarray, config: EnvConfig) -> np.ndarray:
     """Rendered u8[H W 3] -> u8[frame_height frame_width C]; a new array with each call."""
-    size = (config.frame_width, config.frame_height)
-    frame = cv2.resize(screen, size, interpolation=_INTERPOLATIONS[config.interpolation])
+    frame = _resized(screen, config)
     return cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)[:, :, None] if config.grayscale else frame
 
 
 def observe_classes(state: "GameState", config: EnvConfig) -> np.ndarray:
-    """What each pixel shows: u8[frame_height frame_width 1], CLASS_STEP times the number of its class; a new array."""
+    """What each pixel shows, as CLASS_GREYS: u8[frame_height frame_width 1], resized as the screen is; a new array."""
     assert state.labels_buffer is not None
-    return CLASS_STEP * _class_numbers(state)[_values(state.labels_buffer, config)]
+    return _resized(_GREYS[_class_numbers(state)][state.labels_buffer], config)[:, :, None]
 
 
 def observe_buffers(state: "GameState", config: EnvConfig) -> dict[str, np.ndarray]:
@@ -80,6 +93,11 @@ def observe_buffers(state: "GameState", config: EnvConfig) -> dict[str, np.ndarr
     if state.automap_buffer is not None:
         found["automap"] = observe_screen(state.automap_buffer, config)
     return found
+
+
+def _resized(picture: np.ndarray, config: EnvConfig) -> np.ndarray:
+    size = (config.frame_width, config.frame_height)
+    return cv2.resize(picture, size, interpolation=_INTERPOLATIONS[config.interpolation])
 
 
 def _values(pixels: np.ndarray, config: EnvConfig) -> np.ndarray:

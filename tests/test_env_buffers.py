@@ -7,6 +7,7 @@ import pytest
 from gvz import LABEL_CLASSES
 from gvz.core.errors import ConfigError
 from gvz.env import DoomEnv
+from gvz.observation import CLASS_GREYS
 
 pytestmark = pytest.mark.engine
 
@@ -105,17 +106,21 @@ def test_the_automap_is_whole_and_stands_still_and_buffers_change_no_screen():
 
 def test_frames_of_classes_are_the_labels_as_grey_levels():
     task = "defend_the_center/gore"
-    classes, labels = DoomEnv(task, frames="classes"), DoomEnv(task, buffers=("labels",), grayscale=True)
-    assert classes.observation_space.shape == (84, 84, 1)
+    whole = {"frame_width": 160, "frame_height": 120, "render_width": 160, "render_height": 120}
+    classes, labels = DoomEnv(task, frames="classes", **whole), DoomEnv(task, buffers=("labels",), **whole)
+    small = DoomEnv(task, frames="classes", **whole | {"frame_width": 84, "frame_height": 84})
+    assert small.observation_space.shape == (84, 84, 1)
+    greys = np.array([CLASS_GREYS[name] for name in LABEL_CLASSES])
     seen = set()
-    for env in (classes, labels):
+    for env in (classes, labels, small):
         env.reset(options={"episode_seed": 4})
     for action in (1, 1, 0, 2, 2) * 4:
         frame, expected = classes.step(action)[0], labels.step(action)[0]["labels"]
-        np.testing.assert_array_equal(frame, 25 * expected)
+        np.testing.assert_array_equal(frame, greys[expected])
+        np.testing.assert_array_equal(small.step(action)[0][:, :, 0], cv2.resize(frame, (84, 84)))
         seen |= set(np.unique(frame))
-    assert {0, 25, 50, 75} <= seen, "wall, plane, weapon, enemy"
-    for env in (classes, labels):
+    assert {0, 20, 40, 60, 170} <= seen, "wall, plane, weapon, scenery, enemy"
+    for env in (classes, labels, small):
         env.close()
     with pytest.raises(ConfigError, match=r"env\.buffers: got depth with env\.frames classes, want none"):
         DoomEnv(task, frames="classes", buffers=("depth",))

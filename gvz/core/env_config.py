@@ -21,7 +21,7 @@ LABEL_CLASSES = (
 """What a pixel of the buffer `labels` shows, by number: 0 walls and the HUD; 1 floors and ceilings; 2 the agent's
 own weapon; 3 living enemies; 4 missiles and fire; 5 what heals; 6 vials of poison; 7 decorations, lights and
 corpses; 8 puffs, smoke and blood; 9 anything else: portals, ammunition, barrels; 10 keys. A number never changes its
-meaning. Frames of classes have no room for more numbers (observation.py, CLASS_STEP)."""
+meaning."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -41,7 +41,7 @@ class EnvConfig:
     grayscale: bool = False
     """one luminance channel instead of RGB"""
     frames: Literal["screen", "classes"] = "screen"
-    """classes: instead of the screen, a grey picture of what each pixel shows (LABEL_CLASSES, 25 grey levels apart)"""
+    """classes: instead of the screen, a grey picture of what each pixel shows (LABEL_CLASSES)"""
     frame_skip: int = 4
     """game tics an action is held; one decision = frame_skip frames"""
     render_width: int = 256

@@ -16,7 +16,7 @@ EXPERIMENT = dataclasses.replace(
     players=(),
     published={},
     notes=(
-        "A pixel has one of 11 grey levels: wall, floor, enemy, projectile and so on (EnvConfig.frames). What these "
+        "A pixel has one of 11 grey levels: wall, floor, enemy, projectile and so on (CLASS_GREYS). What these "
         "runs have more than those of general_short is what sight costs there.",
     ),
 )

@@ -10,7 +10,7 @@ from gvz.env import DoomEnv
 from gvz.evaluation.play import play_episode
 from gvz.evaluation.players import CLASSES
 from gvz.evaluation.simple import player_env
-from gvz.observation import CLASS_STEP, label_class
+from gvz.observation import CLASS_GREYS, label_class
 from gvz.scenarios.base import Task
 from gvz.scenarios.compiler import map_source
 from gvz.scenarios.looks import _walls, open_places
@@ -137,7 +137,8 @@ def test_a_script_that_sees_leaves_often_and_a_blind_sweep_hardly_ever():
 def test_keys_are_a_class_and_portals_are_the_only_other_thing():
     assert label_class("Key", "BlueCard") == "key"
     assert label_class("Internal", "Portal") == "other"
-    assert int(CLASS_STEP) * (len(LABEL_CLASSES) - 1) <= 255, "frames of classes are uint8"
+    assert CLASS_GREYS.keys() == set(LABEL_CLASSES)
+    assert len(set(CLASS_GREYS.values())) == len(LABEL_CLASSES)
 
 
 def test_no_goals_is_a_score_of_0_and_more_than_the_bound_is_the_bound():
