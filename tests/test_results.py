@@ -113,13 +113,13 @@ def test_the_page_of_the_general_agents_says_what_their_records_give(tmp_path):
 def test_the_findings_say_what_the_gates_records_give():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     results = read_results([ROOT / "results" / "gates"])
-    world, reward, sight, ammo = results.asked
+    world, reward, sight, ammo, defend, colour = results.asked
     for trained, title in ((False, "gate tasks"), (True, "training tasks")):
         for scenario, _, *cells in result_table(results, world, trained=trained).rows[:-1]:
             assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
         for scenario, _, *cells in result_table(results, sight, trained=trained).rows[:-1]:
             assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
-        for gate in (reward, ammo):
+        for gate in (reward, ammo, defend, colour):
             _, _, *cells = result_table(results, gate, trained=trained).rows[0]
             assert f"| {title} | {' | '.join(cell.text for cell in cells)} |" in page
     for _, compared, gain, _ in comparison_table(results, world).rows[:2]:

@@ -1,16 +1,15 @@
-"""A gate: do agents defend the center better if a shot costs nothing, or on frames with colour?"""
+"""A gate: do agents defend the center better if a shot costs nothing?"""
 
 from gvz.experiments.gate import Gate
 
 EXPERIMENT = Gate(
     name="gate_defend",
-    title="Gate: the price of a shot, and colour, in Defend the Center",
-    question="Do agents defend the center better if a shot costs nothing, or on frames with colour?",
+    title="Gate: the price of a shot in Defend the Center",
+    question="Do agents defend the center better if a shot costs nothing?",
     configs=("rainbow_quick",),
     variants={
-        "plain": {},  # named, so that gate_sight and this gate share their runs
+        "shots_cost": {},
         "shots_free": {"env.reward_weights": [["defend_the_center.ammo_spent", 0.0]]},
-        "colour": {"env.grayscale": False},
     },
     scenarios=("defend_the_center",),
     trainings=("train8",),
