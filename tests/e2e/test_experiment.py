@@ -87,13 +87,13 @@ def test_a_killed_job_sinks_no_other_goes_on_when_run_again_and_every_episode_is
 
 def test_a_gate_s_runs_end_by_their_processor_time_and_its_report_has_both_tables(tmp_path):
     results = tmp_path / "results"
-    flags = ("run", "gate_reward", "--results", str(results), "--scale", "0.001", "--jobs", "2")
+    flags = ("run", "gate_defend", "--results", str(results), "--scale", "0.001", "--jobs", "2")
     done = subprocess.run(command(*flags), capture_output=True, text=True, check=False, timeout=1200)
     assert done.returncode == 0, done.stderr
     plan = read_plan(results)
     assert plan is not None
     runs = plan.runs()
-    names = ["rainbow_quick+thesis", "rainbow_quick+tenth"]
+    names = ["rainbow_quick+shots_cost", "rainbow_quick+shots_free"]
     assert [run.agent for run in runs] == names
     for run in runs:
         directory = progress.run_directory(results, run)
