@@ -33,8 +33,8 @@ CLASS_GREYS = {
     "kit": 225,
     "projectile": 250,
 }
-"""grey levels in frames of classes: what an agent acts on is bright, what is around it dark, and
-two of a kind that an agent must tell apart (poison and kits, enemies and missiles) are far from each other"""
+"""grey levels in frames of classes: what an agent acts on is bright and what is around it dark; what it must tell apart
+(poison and kits, enemies and missiles) is far from each other"""
 _GREYS = np.array([CLASS_GREYS[name] for name in LABEL_CLASSES], np.uint8)
 
 _CLASS_OF_NAME = {
