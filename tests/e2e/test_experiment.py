@@ -85,7 +85,6 @@ def test_a_killed_job_sinks_no_other_goes_on_when_run_again_and_every_episode_is
         assert experiment.title in page
 
 
-@pytest.mark.slow  # a minute and a half; runs that end by their processor time have quicker tests in tests/run
 def test_a_gate_s_runs_end_by_their_processor_time_and_its_report_has_both_tables(tmp_path):
     results = tmp_path / "results"
     flags = ("run", "gate_defend", "--results", str(results), "--scale", "0.001", "--jobs", "2")
