@@ -170,6 +170,8 @@ class ActorLoop:
             steps["vector"] = self._obs.arrays["vector"]
         if self._spec.num_extras:
             steps["extras"] = extras
+        if self._spec.num_sights:
+            steps["sight"] = [np.ravel(list(game.info["sight"].values())) for game in games]
         for frame, game in zip(frames, games, strict=True):
             frame[...] = game.frame
         self._ring.commit()

@@ -8,16 +8,15 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, UInt8
 
 from actors.preprocess import push_frame
 from gvz.core.cache import cache_directory
-from gvz.core.env_config import LABEL_CLASSES, EnvConfig
+from gvz.core.env_config import EnvConfig
 from gvz.env import DoomEnv
 from gvz.evaluation.play import play_episode
 from gvz.evaluation.players import ScriptedPlayer
 from gvz.evaluation.simple import player_env
-from gvz.observation import Observation
+from gvz.observation import Observation, in_sight
 from gvz.scenarios.compiler import compile_task
 from gvz.tasks import Task
 
@@ -27,8 +26,6 @@ THINGS = ("enemy", "projectile", "kit", "poison")
 """classes of the labels buffer that the probe looks for"""
 NUM_COLUMNS = 8
 """of a frame, of about equal width; in each of them things are looked for"""
-MIN_PIXELS = 2
-"""of a thing in a column that count as in sight"""
 KEPT_PERIOD = 4
 """one of this number of decisions is kept: the next frames look almost the same"""
 MIN_EPISODES = 2
@@ -88,7 +85,11 @@ class Recorder:
     def act(self) -> int:
         action = self._script.act()
         if self._num_decisions % KEPT_PERIOD == 0 and len(self.kept) < self._max_frames:
-            row = {"stacks": self._stack, "actions": np.array(action), "seen": in_sight(self._labels, NUM_COLUMNS)}
+            row = {
+                "stacks": self._stack,
+                "actions": np.array(action),
+                "seen": in_sight(self._labels, THINGS, NUM_COLUMNS),
+            }
             self.kept.append({name: value[None].copy() for name, value in row.items()})
         self._num_decisions += 1
         return action
@@ -98,11 +99,3 @@ class Recorder:
         self._script.observe(observation, info)
         push_frame(self._stack, observation["screen"])
         self._labels = observation["labels"]
-
-
-def in_sight(labels: UInt8[np.ndarray, "H W 1"], num_columns: int) -> Bool[np.ndarray, "T K"]:
-    """Whether each of THINGS has MIN_PIXELS pixels in each column."""
-    starts = [columns[0] for columns in np.array_split(np.arange(labels.shape[1]), num_columns)]
-    classes = np.array([LABEL_CLASSES.index(thing) for thing in THINGS])
-    pixels = (labels[None, :, :, 0] == classes[:, None, None]).sum(axis=1)  # [T, W]
-    return np.add.reduceat(pixels, starts, axis=1) >= MIN_PIXELS

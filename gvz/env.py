@@ -16,7 +16,14 @@ from gvz.core.env_config import EnvConfig, typed
 from gvz.core.errors import ConfigError, EngineError
 from gvz.engine.engine import Engine, EngineConfig, check_config
 from gvz.engine.probe import ensure_loads
-from gvz.observation import Observation, observation_space, observe_buffers, observe_classes, observe_screen
+from gvz.observation import (
+    Observation,
+    observation_space,
+    observe_buffers,
+    observe_classes,
+    observe_screen,
+    observe_sight,
+)
 from gvz.scenarios.base import BOOKKEEPING, Task
 from gvz.scenarios.compiler import compile_task, task_content
 from gvz.tasks import parse_task
@@ -52,7 +59,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
       upper_bound, reward_components, variables (those that the agent may see), kills (the engine's count, including
       enemies that enemies killed), player_kills (enemies that the agent killed), episode_frames, episode_seed,
       engine_crash (in `reset`: the engine had died and was replaced); in the last step also solved_episode (a survival
-      scenario's time-out was reached).
+      scenario's time-out was reached). With `config.sight` also sight: each of SIGHT_CLASSES -> whether it is in sight
+      in each column of the frame, from left to right.
     - Seeds: `reset(seed=n)` seeds the sequence of episodes. Each episode has its own seed, `info["episode_seed"]`, and
       `reset(options={"episode_seed": m})` replays that episode alone. It also chooses the map, where maps are drawn.
     """
@@ -118,7 +126,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             height=config.render_height,
             render_weapon=scenario.render_weapon,
             depth="depth" in config.buffers,
-            labels="labels" in config.buffers or config.frames == "classes",
+            labels="labels" in config.buffers or config.frames == "classes" or config.sight,
             automap="automap" in config.buffers,
             start_tic=_WEAPON_UP_TIC if scenario.render_weapon else 1,
         )
@@ -177,10 +185,11 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         self._playing = True
         if self.render_mode == "human":
             self._show(tics=0)
+        observation = self._observe(engine)
         info = self._info(dict.fromkeys(self._rewarder.weights, 0.0), False, False)
         if crash is not None:
             info |= {"engine_crash": True, "engine_error": str(crash)}
-        return self._observe(engine), info
+        return observation, info
 
     def step(self, action: int | np.integer | np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Holds the action's buttons for `frame_skip` tics, or for the rest until the time-out.
@@ -212,9 +221,9 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             self._crashes = 0
         if self.render_mode == "human":
             self._show(tics)
-        components = self._rewarder.step(self._variables, terminated)
+        observation, components = self._observe(engine), self._rewarder.step(self._variables, terminated)
         info = self._info(components, terminated, truncated)
-        return self._observe(engine), sum(components.values()), terminated, truncated, info
+        return observation, sum(components.values()), terminated, truncated, info
 
     def action_masks(self) -> np.ndarray:
         """bool[A]: the actions that the task allows. (sb3-contrib's algorithms with masks ask for it by this name.)"""
@@ -278,7 +287,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         self._frames = engine.tic() - self._start_tic
 
     def _observe(self, engine: Engine) -> Observation:
-        if self.config.buffers or self.config.frames == "classes":
+        if self._engine_config.labels or self.config.buffers:
             self._state = engine.state() or self._state
         if self.config.frames == "classes":
             assert self._state is not None
@@ -318,7 +327,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         score = float(self._frames)
         if (counted := _COUNTED.get(scenario.metric)) is not None:  # KILLCOUNT also has what enemies kill
             score = min(variables[counted], self._upper_bound)
-        info = {
+        info: dict[str, Any] = {
             "task": self.task.id,
             "score": score,
             "normalized_score": 100.0 * score / self._upper_bound,
@@ -331,6 +340,9 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             "episode_seed": self._episode_seed,
             "engine_crash": False,
         }
+        if self.config.sight:
+            assert self._state is not None
+            info["sight"] = observe_sight(self._state, self.config)
         if terminated or truncated:
             info["solved_episode"] = scenario.metric == "frames_alive" and self._frames >= self._timeout_frames
         return info

@@ -1,12 +1,13 @@
 """From the engine's rendered screen to the agent's observation: sizes, colours, buffers."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from gymnasium import spaces
 
-from gvz.core.env_config import LABEL_CLASSES, EnvConfig
+from gvz.core.env_config import LABEL_CLASSES, SIGHT_CLASSES, SIGHT_COLUMNS, EnvConfig
 
 if TYPE_CHECKING:
     from gvz.engine.engine import GameState
@@ -36,6 +37,9 @@ CLASS_GREYS = {
 """grey levels in frames of classes: what an agent acts on is bright and what is around it dark; what it must tell apart
 (poison and kits, enemies and missiles) is far from each other"""
 _GREYS = np.array([CLASS_GREYS[name] for name in LABEL_CLASSES], np.uint8)
+
+_SIGHT_PIXELS = 2
+"""of a thing in a column of the frame that count as in sight"""
 
 _CLASS_OF_NAME = {
     "Poison": "poison",  # a class of our own, derived from Health as kits are
@@ -93,6 +97,21 @@ def observe_buffers(state: "GameState", config: EnvConfig) -> dict[str, np.ndarr
     if state.automap_buffer is not None:
         found["automap"] = observe_screen(state.automap_buffer, config)
     return found
+
+
+def observe_sight(state: "GameState", config: EnvConfig) -> dict[str, list[bool]]:
+    """Each of SIGHT_CLASSES -> whether it is in sight in each column of the frame, from left to right."""
+    assert state.labels_buffer is not None
+    seen = in_sight(_class_numbers(state)[_values(state.labels_buffer, config)], SIGHT_CLASSES, SIGHT_COLUMNS)
+    return dict(zip(SIGHT_CLASSES, seen.tolist(), strict=True))
+
+
+def in_sight(labels: np.ndarray, classes: Sequence[str], num_columns: int) -> np.ndarray:
+    """Whether two pixels or more of a column are of each class: labels u8[H W 1] -> bool[classes columns]."""
+    starts = [columns[0] for columns in np.array_split(np.arange(labels.shape[1]), num_columns)]
+    numbers = np.array([LABEL_CLASSES.index(name) for name in classes])
+    pixels = (labels[None, :, :, 0] == numbers[:, None, None]).sum(axis=1)  # [classes, W]
+    return np.add.reduceat(pixels, starts, axis=1) >= _SIGHT_PIXELS
 
 
 def _resized(picture: np.ndarray, config: EnvConfig) -> np.ndarray:

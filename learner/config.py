@@ -89,6 +89,11 @@ class AgentConfig:
         if min(*self.conv_channels, *self.conv_kernels, *self.conv_strides) < 1:
             raise ConfigError("agent.conv_channels, conv_kernels, conv_strides: want integers of at least 1")
 
+    @property
+    def learns_sight(self) -> bool:
+        """Transitions are to have what was in sight (`EnvConfig.sight`), for a loss of the agent."""
+        return False
+
     def epsilon(self, env_steps: int) -> float:
         """Probability of a uniformly random action after this number of decisions since warm-up."""
         return 0.0

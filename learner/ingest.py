@@ -38,7 +38,7 @@ class Ingest:
         """Packs `block_size` records at a time, or as many as the replay takes at once if those are fewer."""
         self._spec = spec
         self._block_size = min(block_size, spec.max_block) if isinstance(spec, ReplaySpec) else block_size
-        self._dtype = step_dtype(spec.num_variables, spec.num_extras)
+        self._dtype = step_dtype(spec.num_variables, spec.num_extras, spec.num_sights)
         self._in_episode = [False] * spec.num_lanes
         self._env_steps = 0
         self._ages: Counter[int] = Counter()
@@ -189,5 +189,6 @@ def _step_arrays(steps: np.ndarray, frames: np.ndarray, num_valid: np.ndarray) -
         truncated=steps["truncated"] != 0,
         vector=steps["vector"] if steps["vector"].size else None,
         extras=steps["extras"] if steps["extras"].size else None,
+        sight=steps["sight"] if steps["sight"].size else None,
         num_valid=num_valid,
     )

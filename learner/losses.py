@@ -8,7 +8,8 @@ gamma^n, and 0 where the episode terminated inside the window.
 import chex
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+import optax
+from jaxtyping import Array, Float, Int, UInt8
 
 
 def q_learning_td(
@@ -50,6 +51,21 @@ def huber(td: Float[Array, "*batch"], delta: float = 1.0) -> Float[Array, "*batc
     """
     inside = jnp.clip(td, -delta, delta)
     return inside * (td - 0.5 * inside)
+
+
+def sight(logits: Float[Array, "B C"], seen: UInt8[Array, "B C"], num_classes: int) -> Float[Array, "B"]:
+    """Cross-entropy of what is in sight, in nats: the sum over classes of the mean over columns.
+
+    Args:
+        logits: of each flag.
+        seen: the flags, 0 or 1, by class and column.
+        num_classes: classes of things.
+
+    Source: Lample and Chaplot 2017, section 4.2 (game features). Differs: there a flag says whether a thing is anywhere
+        in sight; here each column of the frame has one.
+    """
+    chex.assert_equal_shape([logits, seen])
+    return num_classes * optax.sigmoid_binary_cross_entropy(logits, seen).mean(axis=1)
 
 
 def take_action(values: Float[Array, "B A *rest"], actions: Int[Array, "B"]) -> Float[Array, "B *rest"]:

@@ -150,6 +150,8 @@ class QNetwork(nn.Module):
         dueling: a stream each for the value and the advantages.
         noisy_sigma: initial sigma of noisy layers; None for layers without noise.
         layer_norm: hidden layers are normalized before their rectifier.
+        num_sights: outputs of a dense layer on the features of the frames, which say what is in sight. They are the
+            variable `sight` / `logits` [B, C], for those who ask for it. 0: there is no such layer.
     """
 
     config: AgentConfig
@@ -159,12 +161,15 @@ class QNetwork(nn.Module):
     dueling: bool = False
     noisy_sigma: float | None = None
     layer_norm: bool = False
+    num_sights: int = 0
 
     @nn.compact
     def __call__(self, obs: Observation, noise: dict[str, Float[Array, "B _"]] | None = None) -> Float[Array, "B A N"]:
         """Applies the network: by its means, or by each row's own noise, see `draw_noise`."""
         config, dtype = self.config, jnp.dtype(self.config.activation_dtype)
         x = make_encoder(config.encoder)(obs.frames.astype(dtype) / 255, config)
+        if self.num_sights:
+            self.sow("sight", "logits", nn.Dense(self.num_sights, dtype=dtype, name="sight")(x).astype(jnp.float32))
         parts = [obs.vector.astype(dtype) / 100] if obs.vector.shape[1] else []
         if K := obs.actions.shape[1]:
             parts.append(jax.nn.one_hot(obs.actions, self.num_actions, dtype=dtype).reshape(-1, K * self.num_actions))

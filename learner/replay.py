@@ -16,7 +16,7 @@ from typing import no_type_check
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 
 from gvz.core.errors import ConfigError
 from learner import store, sum_tree
@@ -92,6 +92,8 @@ class Transitions:
     r_t: Float[Array, "B"]
     discount_t: Float[Array, "B"]
     obs_t: Observation
+    sight_tm1: UInt8[Array, "B C"] | None = None
+    """what was in sight when the action was chosen: flags by class and column; None if it is not recorded"""
 
     @property
     def task(self) -> Int[Array, "B"]:
@@ -325,4 +327,5 @@ def _transitions(spec: ReplaySpec, state: ReplayState, anchors: Int[Array, "B"])
         r_t=jnp.sum(jnp.where(within, powers[None, :n] * store.rewards(spec, records, window), 0.0), axis=1),
         discount_t=powers[length] * ~records.terminated[end],
         obs_t=store.observations(spec, records, end),
+        sight_tm1=None if records.sight is None else records.sight[anchors],
     )

@@ -43,6 +43,8 @@ class StoreSpec:
     """game variables of an observation, V"""
     num_extras: int = 0
     """numbers that the policy records with an action, E"""
+    num_sights: int = 0
+    """flags of what is in sight, C; 0 if they are not recorded"""
     action_masks: tuple[tuple[bool, ...], ...] | None = None
     """[num_tasks][num_actions]: the actions that each task allows; None for all"""
     reward_scales: tuple[float, ...] | None = None
@@ -84,6 +86,7 @@ class StepArrays:
     num_valid: Int[Array | np.ndarray, ""]
     vector: Float[Array | np.ndarray, "N V"] | None = None
     extras: Float[Array | np.ndarray, "N E"] | None = None
+    sight: UInt8[Array | np.ndarray, "N C"] | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -104,6 +107,8 @@ class Store:
     """the episode ended by the rules here: nothing to bootstrap from"""
     vector: Float[Array, "K V"]
     extras: Float[Array, "K E"]
+    sight: UInt8[Array, "K C"] | None = None
+    """None if it is not recorded"""
     heads: Int[Array, "lanes"]
     """where in its circle each lane writes next, 0..lane_capacity-1 (a running count would overflow)"""
 
@@ -131,6 +136,7 @@ def init(spec: StoreSpec) -> Store:
         terminated=jnp.zeros(K, bool),
         vector=jnp.zeros((K, spec.num_variables), jnp.float32),
         extras=jnp.zeros((K, spec.num_extras), jnp.float32),
+        sight=jnp.zeros((K, spec.num_sights), jnp.uint8) if spec.num_sights else None,
         heads=jnp.zeros(spec.num_lanes, jnp.int32),
     )
 
@@ -164,6 +170,7 @@ def write(spec: StoreSpec, store: Store, block: StepArrays) -> tuple[Store, Writ
         terminated=store.terminated.at[slot].set(block.terminated, mode="drop"),
         vector=store.vector if block.vector is None else store.vector.at[slot].set(block.vector, mode="drop"),
         extras=store.extras if block.extras is None else store.extras.at[slot].set(block.extras, mode="drop"),
+        sight=None if store.sight is None else store.sight.at[slot].set(block.sight, mode="drop"),
         heads=store.heads.at[lane].add(1, mode="drop") % spec.lane_capacity,
     )
     return written, Written(slot, is_last, cut)

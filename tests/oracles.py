@@ -27,6 +27,7 @@ class Record:
     params_version: int = 0
     vector: tuple[float, ...] = ()
     extras: tuple[float, ...] = ()
+    sight: tuple[int, ...] = ()
     past_actions: tuple[int, ...] = ()
     """oldest first"""
 
@@ -148,6 +149,7 @@ def play(rng: np.random.Generator, spec: ReplaySpec, lane: int, *, mean_steps: f
                 truncated=is_last and end in ("truncated", "both"),
                 vector=tuple(np.float32(rng.normal(size=spec.num_variables)).tolist()),
                 extras=tuple(np.float32(rng.normal(size=spec.num_extras)).tolist()),
+                sight=tuple(rng.integers(0, 2, spec.num_sights).tolist()),
                 past_actions=tuple(past),
             )
             past = [*past, action][1:] if past else past
@@ -164,6 +166,8 @@ def check_batch(batch: Transitions, want: list[Expected]) -> None:
         np.testing.assert_array_equal(observed.vector, np.float32([record.vector for record in records]))
         np.testing.assert_array_equal(observed.actions, np.array([record.past_actions for record in records], int))
         np.testing.assert_array_equal(observed.task, [record.task for record in records])
+    if batch.sight_tm1 is not None:
+        np.testing.assert_array_equal(batch.sight_tm1, [one.record_tm1.sight for one in want])
     np.testing.assert_array_equal(batch.a_tm1, [one.record_tm1.action for one in want])
     np.testing.assert_array_equal(batch.discount_t, np.float32([one.discount_t for one in want]))
     np.testing.assert_allclose(batch.r_t, [one.r_t for one in want], rtol=1e-5, atol=1e-6)
@@ -171,7 +175,7 @@ def check_batch(batch: Transitions, want: list[Expected]) -> None:
 
 def step_block(records: list[Record], *, sequence: int = 0) -> StepBlock:
     """The records as a ring would hand them over."""
-    steps = np.zeros(len(records), step_dtype(len(records[0].vector), len(records[0].extras)))
+    steps = np.zeros(len(records), step_dtype(len(records[0].vector), len(records[0].extras), len(records[0].sight)))
     for name in steps.dtype.names or ():
         if name not in ("sequence", "pad"):
             steps[name] = [getattr(record, name) for record in records]

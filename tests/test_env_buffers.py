@@ -1,10 +1,14 @@
 """What an environment shows beside the screen: buffers, classes of things, the whole map."""
 
+import itertools
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
 
 from gvz import LABEL_CLASSES
+from gvz.core.env_config import SIGHT_CLASSES, SIGHT_COLUMNS
 from gvz.core.errors import ConfigError
 from gvz.env import DoomEnv
 from gvz.observation import CLASS_GREYS
@@ -124,3 +128,25 @@ def test_frames_of_classes_are_the_labels_as_grey_levels():
         env.close()
     with pytest.raises(ConfigError, match=r"env\.buffers: got depth with env\.frames classes, want none"):
         DoomEnv(task, frames="classes", buffers=("depth",))
+
+
+@pytest.mark.parametrize("shown", [{}, {"buffers": ("labels",)}, {"frames": "classes"}])
+def test_sight_says_which_columns_of_the_frame_have_what(shown: dict[str, Any]):
+    """Against ViZDoom's own labels of a frame of the rendered size, counted pixel by pixel."""
+    size = {"frame_width": 160, "frame_height": 120, "render_width": 160, "render_height": 120}
+    env = DoomEnv("seek_and_kill/mixed_enemies+obstacles+shadows", sight=True, **size, **shown)
+    _, info = env.reset(seed=3)
+    bounds = np.cumsum([0] + [14] * 4 + [13] * 8)  # 160 pixels in 12 columns
+    found = dict.fromkeys(SIGHT_CLASSES, 0)
+    for _ in range(60):
+        assert list(info["sight"]) == list(SIGHT_CLASSES)
+        for name, flags in info["sight"].items():
+            values = [one.value for one in env._state.labels if CLASSES.get(one.object_name) == name]
+            pixels = np.isin(env._state.labels_buffer, values)
+            assert flags == [bool(pixels[:, a:b].sum() >= 2) for a, b in itertools.pairwise(bounds)]
+            assert len(flags) == SIGHT_COLUMNS
+            found[name] += sum(flags)
+        *_, info = env.step(1)
+    assert found["enemy"] > 0
+    assert found["kit"] == found["poison"] == 0
+    env.close()

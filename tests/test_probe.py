@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks import probe, probe_frames
 from gvz.core.env_config import LABEL_CLASSES
+from gvz.observation import in_sight
 from gvz.tasks import named_tasks
 
 
@@ -16,14 +17,14 @@ def test_a_thing_is_in_sight_in_the_columns_that_have_two_of_its_pixels():
     labels[3, 4, 0] = LABEL_CLASSES.index("kit")  # one pixel alone
     labels[1, 8:10, 0] = LABEL_CLASSES.index("poison")
     labels[1, 5:7, 0] = LABEL_CLASSES.index("scenery")
-    seen = dict(zip(probe_frames.THINGS, probe_frames.in_sight(labels, 5).tolist(), strict=True))
+    seen = dict(zip(probe_frames.THINGS, in_sight(labels, probe_frames.THINGS, 5).tolist(), strict=True))
     assert seen == {
         "enemy": [True, False, False, False, False],
         "projectile": [False] * 5,
         "kit": [False] * 5,
         "poison": [False, False, False, False, True],
     }
-    assert probe_frames.in_sight(labels, 3)[0].tolist() == [True, False, False], "columns need not be of one width"
+    assert in_sight(labels, ["enemy"], 3)[0].tolist() == [True, False, False], "columns need not be of one width"
 
 
 def test_scores_of_a_thing_by_hand():

@@ -22,6 +22,10 @@ LABEL_CLASSES = (
 own weapon; 3 living enemies; 4 missiles and fire; 5 what heals; 6 vials of poison; 7 decorations, lights and
 corpses; 8 puffs, smoke and blood; 9 anything else: portals, ammunition, barrels; 10 keys. A number never changes its
 meaning."""
+SIGHT_CLASSES = ("enemy", "projectile", "kit", "poison", "key")
+"""the classes that an agent acts on"""
+SIGHT_COLUMNS = 12
+"""of a frame, of about equal width; in each of them things are looked for"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -57,6 +61,8 @@ class EnvConfig:
     """how the rendered screen is shrunk; linear is ten times cheaper and loses no enemy (see observation.py)"""
     buffers: tuple[Buffer, ...] = ()
     """more than the screen: observations become a dict of `screen` and these"""
+    sight: bool = False
+    """`info` has `sight`: which of SIGHT_CLASSES are in sight in each of SIGHT_COLUMNS columns of the frame"""
     reward_weights: tuple[tuple[str, float], ...] = ()
     """reward components and their weights, in place of the profile's: kill 2 death 0; seek_and_kill.moved 0 is of one
     scenario alone"""

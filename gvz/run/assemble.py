@@ -14,6 +14,7 @@ from actors.inline import InlinePool
 from actors.placement import actor_cores, in_words
 from actors.pool import Pool, PoolConfig
 from actors.process_pool import ProcessPool
+from gvz.core.env_config import SIGHT_CLASSES, SIGHT_COLUMNS
 from gvz.core.errors import ConfigError
 from gvz.run.config import RunConfig, off_policy
 from gvz.run.footprint import Footprint
@@ -75,6 +76,7 @@ def run_agent(config: RunConfig) -> Agent:
             v_max=v_max,
             num_variables=len(table.variables) if observed.game_variables else 0,
             num_past_actions=observed.past_actions,
+            num_sights=len(SIGHT_CLASSES) * SIGHT_COLUMNS if observed.learns_sight else 0,
             masked=table.action_masks is not None,
         ),
     )
@@ -102,12 +104,13 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
         games_per_actor=config.games_per_actor,
         seed=config.games_seed,
         env_entry_point=ENV_ENTRY_POINT,
-        env_config=dataclasses.asdict(config.env),
+        env_config=dataclasses.asdict(config.env) | {"sight": config.env.sight or config.agent.learns_sight},
         frame_shape=config.env.frame_shape,
         stack_size=config.agent.stack_size,
         past_actions=spec.num_past_actions,
         variables=table.variables if config.agent.game_variables else (),
         num_extras=extras.shape[1],
+        num_sights=spec.num_sights,
         action_masks=table.action_masks,
         num_actions=spec.num_actions,
         **_acting(config, agent),
@@ -210,6 +213,7 @@ def _store_sizes(config: RunConfig, pool: PoolConfig) -> dict[str, Any]:
         "num_past_actions": pool.past_actions,
         "num_variables": len(pool.variables),
         "num_extras": pool.num_extras,
+        "num_sights": pool.num_sights,
         "action_masks": pool.action_masks,
         "reward_scales": config.table.reward_scales,
     }

@@ -19,16 +19,17 @@ import numpy as np
 
 from gvz.core.errors import TransportError
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 """Increased by one when the meaning or layout of anything in this file changes."""
 
 
-def step_dtype(num_variables: int = 0, num_extras: int = 0) -> np.dtype:
-    """A step record without its frame: 48 bytes, and 4 for each number. Frames are in an array beside it.
+def step_dtype(num_variables: int = 0, num_extras: int = 0, num_sights: int = 0) -> np.dtype:
+    """A step record without its frame: 48 bytes, 4 for each number and 1 for each flag. Frames are beside it.
 
     Args:
         num_variables: game variables that the agent observes, V.
         num_extras: numbers that the policy records with an action, E.
+        num_sights: flags of what is in sight.
     """
     numbers = num_variables + num_extras
     return np.dtype(
@@ -43,9 +44,10 @@ def step_dtype(num_variables: int = 0, num_extras: int = 0) -> np.dtype:
             ("first", "u1"),  # o_t is the first of its episode
             ("terminated", "u1"),  # o_t is the last: the episode ended by the rules (discount 0)
             ("truncated", "u1"),  # o_t is the last: time-out or crash; the discount stays
-            ("pad", "u1", (9 + 4 * (numbers % 2),)),  # every number is aligned, so that a store is atomic
+            ("pad", "u1", (9 + (-4 * numbers - num_sights) % 8,)),  # numbers are aligned, so that a store is atomic
             ("vector", "<f4", (num_variables,)),  # game variables that came with o_t
             ("extras", "<f4", (num_extras,)),  # what the policy says of a_t
+            ("sight", "u1", (num_sights,)),  # what is in sight in o_t, by class and column
         ]
     )
 
@@ -159,6 +161,8 @@ class Play(_Message, frozen=True, kw_only=True):
     """game variables of an observation"""
     num_extras: Count = 0
     """numbers that the policy records with an action"""
+    num_sights: Count = 0
+    """flags of what is in sight; 0 if the environment gives none"""
     action_masks: tuple[tuple[bool, ...], ...] | None = None
     """[task][action]: the actions that each task allows; None for all"""
     num_actions: Count
@@ -177,7 +181,7 @@ class Play(_Message, frozen=True, kw_only=True):
     @property
     def record_dtype(self) -> np.dtype:
         """The dtype of a step record."""
-        return step_dtype(len(self.variables), self.num_extras)
+        return step_dtype(len(self.variables), self.num_extras, self.num_sights)
 
 
 class ActorSpec(Play, frozen=True, kw_only=True, tag="actor_spec"):

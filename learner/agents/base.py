@@ -38,6 +38,8 @@ class AgentSpec:
     """game variables of an observation, V"""
     num_past_actions: int = 0
     """actions of an observation, K"""
+    num_sights: int = 0
+    """flags of what is in sight that transitions have, C"""
     masked: bool = False
     """observations have masks of actions"""
 
@@ -264,8 +266,15 @@ class NetworkAgent(ABC):
         """What the network answers. `noise` is each row's own."""
         return jnp.asarray(self.network().apply(params, obs, noise))
 
+    def outputs_and_sight(
+        self, params: Params, obs: Observation
+    ) -> tuple[Float[Array, "B A N"], Float[Array, "B C"] | None]:
+        """What the network answers, and its logits of what is in sight, if it has them."""
+        outputs, variables = self.network().apply(params, obs, mutable=["sight"])
+        return jnp.asarray(outputs), jnp.asarray(variables["sight"]["logits"][0]) if self.spec.num_sights else None
+
     def init(self, key: PRNGKeyArray) -> Params:
-        return self.network().init(key, self.spec.zeros())
+        return {"params": self.network().init(key, self.spec.zeros())["params"]}
 
     def epsilon(self, env_steps: int) -> float:
         return self.config.epsilon(env_steps)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from gvz.core.env_config import SIGHT_CLASSES
 from gvz.core.errors import ConfigError
 from learner import losses
 from learner.agents.base import AgentLoss, Evaluation, NetworkAgent, Params, allowed_values, epsilon_greedy
@@ -57,6 +58,7 @@ class Rainbow(NetworkAgent):
             first_outputs=first,
             dueling=config.dueling,
             noisy_sigma=None if config.noisy == "off" else config.noisy_sigma,
+            num_sights=self.spec.num_sights,
         )
 
     def q_values(self, logits: Float[Array, "B A N"]) -> Float[Array, "B A"]:
@@ -112,7 +114,7 @@ class Rainbow(NetworkAgent):
         online = add_noise(online_params, key_online, self.config.noisy)
         target = add_noise(target_params, key_target, self.config.noisy)
         key_view = jax.random.fold_in(key, 3)
-        logits_tm1 = self.outputs(online, training_view(config, key_view, batch.obs_tm1))
+        logits_tm1, sight_logits = self.outputs_and_sight(online, training_view(config, key_view, batch.obs_tm1))
         logits_t = self.outputs(target, batch.obs_t)
         q_tm1, q_t = self.q_values(logits_tm1), self.q_values(logits_t)
         q_t_selector = q_t
@@ -134,6 +136,8 @@ class Rainbow(NetworkAgent):
                 loss = losses.quantile_huber(z_tm1, losses.quantile_midpoints(config.num_quantiles), targets)
         else:
             loss, priority = losses.huber(td), jnp.abs(td)
+        if sight_logits is not None and batch.sight_tm1 is not None:
+            loss += config.sight_weight * losses.sight(sight_logits, batch.sight_tm1, len(SIGHT_CLASSES))
         priority, td_error = jax.lax.stop_gradient((priority, td))
         return AgentLoss(loss, priority, losses.take_action(q_tm1, batch.a_tm1), td_error)
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gvz.core.env_config import SIGHT_CLASSES
 from gvz.core.errors import ConfigError
 from gvz.core.registry import discover
 from learner.agents.base import Agent, AgentSpec, OffPolicyAgent, epsilon_greedy, make_agent
@@ -285,6 +286,33 @@ def test_quantiles_and_munchausen_are_their_equations_in_float64(num_quantiles: 
         )
         np.testing.assert_allclose(result.loss[i], wanted, rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(result.priority[i], abs(td), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.isa
+def test_the_loss_of_sight_is_the_cross_entropy_of_logits_on_the_encoders_features():
+    """In float64 numpy. It is added to the loss alone: priorities and actions are those of the agent without it."""
+    C = len(SIGHT_CLASSES) * 4
+    spec, config = replace(SPEC, num_sights=C), replace(RAINBOW, sight_weight=0.7)
+    agent, plain = make_agent(config, spec), make_agent(RAINBOW, SPEC)
+    assert isinstance(agent, OffPolicyAgent)
+    assert isinstance(plain, OffPolicyAgent)
+    params, target = made_up_params(agent, 0), made_up_params(agent, 1)
+    without, target_without = (
+        {"params": {k: v for k, v in p["params"].items() if k != "sight"}} for p in (params, target)
+    )
+    seen = np.random.default_rng(5).integers(0, 2, (B, C), dtype=np.uint8)
+    key, b = jax.random.key(3), replace(batch(), sight_tm1=jnp.asarray(seen))
+    found, alone = jax.jit(agent.loss)(params, target, key, b), jax.jit(plain.loss)(without, target_without, key, b)
+
+    conv, head = ({k: np.asarray(w, np.float64) for k, w in params["params"][n].items()} for n in ("conv_0", "sight"))
+    x = reference.convolve(np.asarray(b.obs_tm1.frames, np.float64) / 255, conv["kernel"], conv["bias"], 2)
+    p = 1 / (1 + np.exp(-(np.maximum(x, 0).reshape(B, -1) @ head["kernel"] + head["bias"])))
+    nats = -np.where(seen, np.log(p), np.log(1 - p)).reshape(B, len(SIGHT_CLASSES), 4).mean(axis=2).sum(axis=1)
+    np.testing.assert_allclose(found.loss, alone.loss + 0.7 * nats, rtol=1e-4, atol=1e-5)
+    for name in ("priority", "q_tm1", "td_error"):
+        np.testing.assert_allclose(getattr(found, name), getattr(alone, name), rtol=1e-5, atol=1e-6)
+    acted = [jax.jit(one.act)(p, key, b.obs_tm1, jnp.float32(0)) for one, p in ((agent, params), (plain, without))]
+    jax.tree.map(np.testing.assert_array_equal, *acted)
 
 
 def test_only_the_online_network_sees_augmented_frames_and_hidden_inputs(agent_name: str):

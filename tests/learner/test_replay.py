@@ -92,10 +92,10 @@ def record(lane: int = 0, *, reward=0.0, first=False, terminated=False, truncate
         ({"n_steps": 1, "stack_size": 1, "num_lanes": 1, "capacity": 17, "prioritized": False}, 2, 4_000),
         ({"n_steps": 7, "stack_size": 3, "num_lanes": 2, "capacity": 61, "num_newest": 5}, 5, 6_000),
         ({"stack_size": 2, "num_lanes": 5, "capacity": 2_000, "discount": 0.5}, 40, 5_000),
-        ({"num_past_actions": 6, "num_variables": 3, "num_extras": 2}, 7, 5_000),
+        ({"num_past_actions": 6, "num_variables": 3, "num_extras": 2, "num_sights": 5}, 7, 5_000),
         ({"equal_shares": True, "num_lanes": 4, "capacity": 400}, 6, 5_000),
     ],
-    ids=["rainbow", "dqn", "long windows", "long episodes", "past actions and variables", "equal shares"],
+    ids=["rainbow", "dqn", "long windows", "long episodes", "past actions, variables and sight", "equal shares"],
 )
 def test_every_sample_is_what_the_actor_saw_and_the_oracle_says(changes, mean_steps, num_records):
     """Thousands of random episodes in random blocks: every drawable slot, stack, return and discount."""

@@ -128,9 +128,12 @@ def test_random_bytes_are_refused(data: bytes):
         decode(data)
 
 
-@pytest.mark.parametrize(("num_variables", "num_extras", "size"), [(0, 0, 48), (1, 0, 56), (2, 0, 56), (3, 2, 72)])
-def test_a_step_record_is_aligned_and_has_no_more_than_it_needs(num_variables: int, num_extras: int, size: int):
-    dtype = step_dtype(num_variables, num_extras)
+@pytest.mark.parametrize(
+    ("numbers", "size"),
+    [((0, 0, 0), 48), ((1, 0, 0), 56), ((2, 0, 0), 56), ((3, 2, 0), 72), ((0, 0, 60), 112), ((3, 0, 60), 120)],
+)
+def test_a_step_record_is_aligned_and_has_no_more_than_it_needs(numbers: tuple[int, int, int], size: int):
+    dtype = step_dtype(*numbers)
     assert dtype.itemsize == size
     assert dtype.fields is not None
     assert sum(field.itemsize for field, *_ in dtype.fields.values()) == size

@@ -49,6 +49,9 @@ class RainbowConfig(ValueConfig):
     """decisions of each game for which an actor keeps one draw of noise. 1: every decision of every game has its own.
     More: all games of an actor share the draw, which is folded into the weights, so that acting costs as much as
     without noise. Each decision's noise has the same distribution, but within a stretch the policy is deterministic"""
+    sight_weight: Annotated[float, Range(0.0, 1000.0)] = 0.0
+    """weight of a further loss: tell from the encoder's features what is in sight, by class and column, as the engine's
+    labels have it (game features, Lample and Chaplot 2017). Labels are needed in training alone; 0: off"""
     noisy_epsilon: Share = 0.0
     """probability of a uniformly random action beside the noise"""
 
@@ -68,6 +71,10 @@ class RainbowConfig(ValueConfig):
     def has_atoms(self) -> bool:
         """The return distribution is categorical."""
         return self.distributional and self.num_quantiles == 0
+
+    @property
+    def learns_sight(self) -> bool:
+        return self.sight_weight > 0.0
 
     def value_range(self, v_min: float, v_max: float) -> tuple[float, float]:
         """(v_min, v_max) as configured; what is left open is the given one, that of the run's returns."""
