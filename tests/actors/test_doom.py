@@ -18,12 +18,14 @@ from actors.inline import InlinePool
 from actors.pool import PoolConfig
 from actors.process_pool import ProcessPool
 from gvz.core import janitor
-from gvz.core.env_config import EnvConfig
+from gvz.core.env_config import SIGHT_CLASSES, SIGHT_COLUMNS, EnvConfig
 from gvz.transport.messages import EpisodeStats, Fault, Message, StepBlock
 
 pytestmark = pytest.mark.engine
 
-ENV = EnvConfig(frame_height=32, frame_width=40, render_width=160, render_height=120, reward_weights=(("death", -3.0),))
+ENV = EnvConfig(
+    frame_height=32, frame_width=40, render_width=160, render_height=120, reward_weights=(("death", -3.0),), sight=True
+)
 
 
 def config(work_dir: Path, *, num_actors: int, second_task: str = "fuzzy_enemies") -> PoolConfig:
@@ -36,6 +38,7 @@ def config(work_dir: Path, *, num_actors: int, second_task: str = "fuzzy_enemies
         env_config=dataclasses.asdict(ENV),
         frame_shape=ENV.frame_shape,
         stack_size=4,
+        num_sights=len(SIGHT_CLASSES) * SIGHT_COLUMNS,
         num_actions=3,
         policy=b"",
         num_params=0,
@@ -72,6 +75,8 @@ def test_a_resumed_game_goes_on_bit_for_bit(tmp_path: Path):
     np.testing.assert_array_equal(steps, wanted_steps)
     np.testing.assert_array_equal(frames, wanted_frames)
     assert messages == wanted_messages
+    seen = steps["sight"].reshape(-1, len(SIGHT_CLASSES), SIGHT_COLUMNS).any(axis=(0, 2))
+    assert dict(zip(SIGHT_CLASSES, seen, strict=True)) == {name: name == "enemy" for name in SIGHT_CLASSES}
     assert len(messages) >= 2
 
 

@@ -95,8 +95,8 @@ def test_a_run_that_explores_by_epsilon_goes_on_bit_for_bit_between_two_publicat
 
 
 def test_a_run_goes_on_bit_for_bit_within_a_stretch_of_noise(tmp_path):
-    """About 110 decisions of each game: the cut at 80 of them lies in the third stretch, after the warm-up."""
-    agent = RainbowConfig(**NETWORK, noisy_sigma=0.5, noisy_period_steps=30, num_atoms=5)
+    """With a loss of sight. The cut at 80 of each game's 110 decisions lies in the third stretch, after the warm-up."""
+    agent = RainbowConfig(**NETWORK, noisy_sigma=0.5, noisy_period_steps=30, num_atoms=5, sight_weight=1.0)
     config = replace(DQN, name="rainbow", agent=agent)
     go_on(tmp_path / "whole", config, 80)
     go_on(tmp_path / "cut", config, 50)
@@ -107,6 +107,7 @@ def test_a_run_goes_on_bit_for_bit_within_a_stretch_of_noise(tmp_path):
     assert [name for name in whole if not np.array_equal(whole[name], cut[name])] == []
     assert (tmp_path / "whole" / "episodes.jsonl").read_bytes() == (tmp_path / "cut" / "episodes.jsonl").read_bytes()
     assert len(np.unique(whole["['replay'].store.action"])) > 1
+    assert 0 < whole["['replay'].store.sight"].mean() < 1, "the loss of sight had something to learn from"
 
 
 NETWORK = {"conv_channels": (4,), "conv_kernels": (8,), "conv_strides": (4,), "hidden_units": 16, "past_actions": 2}
