@@ -303,7 +303,9 @@ def test_the_loss_of_sight_is_the_cross_entropy_of_logits_on_the_encoders_featur
 
     conv, head = ({k: np.asarray(w, np.float64) for k, w in params["params"][n].items()} for n in ("conv_0", "sight"))
     x = reference.convolve(np.asarray(b.obs_tm1.frames, np.float64) / 255, conv["kernel"], conv["bias"], 2)
-    p = 1 / (1 + np.exp(-(np.maximum(x, 0).reshape(B, -1) @ head["kernel"] + head["bias"])))
+    x = np.maximum(x, 0).reshape(B, -1)
+    x = (x - x.mean(1, keepdims=True)) / np.sqrt(x.var(1, keepdims=True) + 1e-6)
+    p = 1 / (1 + np.exp(-(x @ head["kernel"] + head["bias"])))
     nats = -np.where(seen, np.log(p), np.log(1 - p)).reshape(B, len(SIGHT_CLASSES), 4).mean(axis=2).sum(axis=1)
     np.testing.assert_allclose(found.loss, without.loss + 0.7 * nats, rtol=1e-4, atol=1e-5)
     for name in ("priority", "q_tm1", "td_error"):
