@@ -1,6 +1,7 @@
 """From the engine's rendered screen to the agent's observation: sizes, colours, buffers."""
 
 from collections.abc import Sequence
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -108,10 +109,15 @@ def observe_sight(state: "GameState", config: EnvConfig) -> dict[str, list[bool]
 
 def in_sight(labels: np.ndarray, classes: Sequence[str], num_columns: int) -> np.ndarray:
     """Whether two pixels or more of a column are of each class: labels u8[H W 1] -> bool[classes columns]."""
-    starts = [columns[0] for columns in np.array_split(np.arange(labels.shape[1]), num_columns)]
     numbers = np.array([LABEL_CLASSES.index(name) for name in classes])
     pixels = (labels[None, :, :, 0] == numbers[:, None, None]).sum(axis=1)  # [classes, W]
-    return np.add.reduceat(pixels, starts, axis=1) >= _SIGHT_PIXELS
+    return np.add.reduceat(pixels, _column_starts(labels.shape[1], num_columns), axis=1) >= _SIGHT_PIXELS
+
+
+@cache
+def _column_starts(width: int, num_columns: int) -> tuple[int, ...]:
+    """The first pixel of each column: all of about equal width."""
+    return tuple(int(columns[0]) for columns in np.array_split(np.arange(width), num_columns))
 
 
 def _resized(picture: np.ndarray, config: EnvConfig) -> np.ndarray:
