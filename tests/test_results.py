@@ -3,6 +3,7 @@
 import gzip
 import itertools
 import json
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from gvz.reports.experiment_section import comparison_table, result_table
 from gvz.reports.joint_section import joint_sections
 from gvz.reports.results import read_results
 from gvz.reports.scores import agent_scores, estimate
-from gvz.tasks import named_tasks, scenario_named, scenarios
+from gvz.tasks import TaskSet, named_tasks, scenario_named, scenarios
 
 ROOT = Path(__file__).parent.parent
 
@@ -94,6 +95,16 @@ def test_the_joint_run_says_what_its_records_give():
     report = (folder / "report" / "report.md").read_text()
     assert "P_norm, 43.6 [42.8, 44.4]" in readme
     assert "| rainbow_all | 47.7 [46.8, 48.8] | 41.4 [40.2, 42.7] |" in report
+
+
+@pytest.mark.parametrize(("folder", "split", "num_episodes"), [("general_short", None, 50), ("gates", "gate", 20)])
+def test_every_run_has_all_episodes_of_its_evaluation(folder: str, split: TaskSet | None, num_episodes: int):
+    for file in (ROOT / "results" / folder).glob("runs/**/evaluation.jsonl.gz"):
+        trained = json.loads((file.parent / "config.json").read_text())["config"]["tasks"]
+        wanted = {task.id for task in named_tasks(trained[0].partition("/")[0], split=split)}
+        rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+        wanted |= set(trained) if split == "gate" else set()
+        assert Counter(row["task"] for row in rows) == dict.fromkeys(wanted, num_episodes), file
 
 
 def test_the_page_of_the_general_agents_says_what_their_records_give(tmp_path):
