@@ -147,6 +147,20 @@ def test_the_findings_compare_the_general_agents_as_their_records_do(words, othe
         assert f"| {scenario_named(name).title} | {called} | {cells} |" in page
 
 
+def test_the_findings_say_what_the_first_loss_of_sight_gave():
+    page = (ROOT / "docs" / "FINDINGS.md").read_text()
+    episodes = read_results([ROOT / "results" / "gates"]).episodes
+    agents = {"rainbow_general+plain": "none", "rainbow_general+sight_loss": "first form"}
+    for name, (agent, called) in itertools.product(("defend_the_center", "seek_and_kill"), agents.items()):
+        scores = agent_scores(episodes.filter(scenario=name), agent)
+        sets = [[task.id for task in named_tasks(name, split=split)] for split in ("train8", "gate")]
+        cells = " | ".join(estimate(scores, tasks).text for tasks in sets)
+        (line,) = [
+            line for line in page.splitlines() if line.startswith(f"| {scenario_named(name).title} | {called} |")
+        ]
+        assert line.endswith(f" | {cells} |")
+
+
 def test_the_findings_say_what_the_gates_records_give():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     results = read_results([ROOT / "results" / "gates"])
