@@ -132,6 +132,7 @@ def test_the_page_of_the_general_agents_says_what_their_records_give(tmp_path):
     [
         ("8 tasks", "rainbow_general (8 tasks and pairs)", "8 tasks and pairs"),
         ("screen", "rainbow_general+classes", "classes"),
+        ("no loss of sight", "rainbow_general+sight_loss", "loss of sight"),
     ],
 )
 def test_the_findings_compare_the_general_agents_as_their_records_do(words, other, words_of_other):
