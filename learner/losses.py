@@ -61,8 +61,8 @@ def sight(logits: Float[Array, "B C"], seen: UInt8[Array, "B C"], num_classes: i
         seen: the flags, 0 or 1, by class and column.
         num_classes: classes of things.
 
-    Source: Lample and Chaplot 2017, section 4.2 (game features). Differs: there a flag says whether a thing is anywhere
-        in sight; here each column of the frame has one.
+    Source: Lample and Chaplot 2017 (game features). Differs: there a flag says whether a thing is anywhere in sight;
+        here each column of the frame has one.
     """
     chex.assert_equal_shape([logits, seen])
     return num_classes * optax.sigmoid_binary_cross_entropy(logits, seen).mean(axis=1)

@@ -31,7 +31,7 @@ from tests.oracles import ReplayOracle, check_batch, play, step_block
 
 TASKS = ("easy", "hard")
 ONES = np.ones(len(TASKS), np.float32)
-REPLAY_SPEC = replace(REPLAY, num_lanes=4, capacity=4 * 40)
+REPLAY_SPEC = replace(REPLAY, num_lanes=4, capacity=4 * 40, num_sights=3)
 LEARNER = LearnerConfig(
     batch_size=16, total_updates=100, warmup_steps=200, target_period_updates=3, learning_rate=1e-3, step_tolerance=1000
 )
