@@ -109,8 +109,9 @@ def test_requests_that_come_while_the_policy_is_busy_are_answered_together(tmp_p
         publish(pool)
         run.until(lambda: pool.statistics().actors_ready == 3)
         run.play(100)
+        requests = [actor.requests for actor in pool._actors if actor.requests is not None]
         policy.may_go_on.clear()
-        run.until(lambda: {s.state for s in pool.writer_statuses()} == {WriterState.WAITING_FOR_ACTIONS})
+        run.until(lambda: [one.pending() is not None for one in requests] == [True] * 3)
         answered = len(policy.sizes)
         policy.may_go_on.set()
         run.play(100)
