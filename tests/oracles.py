@@ -166,7 +166,9 @@ def check_batch(batch: Transitions, want: list[Expected]) -> None:
         np.testing.assert_array_equal(observed.vector, np.float32([record.vector for record in records]))
         np.testing.assert_array_equal(observed.actions, np.array([record.past_actions for record in records], int))
         np.testing.assert_array_equal(observed.task, [record.task for record in records])
-    if batch.sight_tm1 is not None:
+    if not want[0].record_tm1.sight:
+        assert batch.sight_tm1 is None
+    else:
         np.testing.assert_array_equal(batch.sight_tm1, [one.record_tm1.sight for one in want])
     np.testing.assert_array_equal(batch.a_tm1, [one.record_tm1.action for one in want])
     np.testing.assert_array_equal(batch.discount_t, np.float32([one.discount_t for one in want]))

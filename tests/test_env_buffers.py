@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gvz import LABEL_CLASSES
-from gvz.core.env_config import SIGHT_CLASSES, SIGHT_COLUMNS
+from gvz.core.env_config import SIGHT_CLASSES, SIGHT_COLUMNS, EnvConfig
 from gvz.core.errors import ConfigError
 from gvz.env import DoomEnv
 from gvz.observation import CLASS_GREYS
@@ -150,3 +150,9 @@ def test_sight_says_which_columns_of_the_frame_have_what(shown: dict[str, Any]):
     assert found["enemy"] > 0
     assert found["kit"] == found["poison"] == 0
     env.close()
+
+
+def test_a_frame_with_fewer_pixels_than_columns_of_sight_is_refused():
+    with pytest.raises(ConfigError, match=r"env\.frame_width: got 11 with env\.sight, want 12 or more"):
+        DoomEnv("defend_the_center/default", sight=True, frame_width=11)
+    EnvConfig(sight=True, frame_width=12)

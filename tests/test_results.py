@@ -99,8 +99,12 @@ def test_the_joint_run_says_what_its_records_give():
 
 @pytest.mark.parametrize(("folder", "split", "num_episodes"), [("general_short", None, 50), ("gates", "gate", 20)])
 def test_every_run_has_all_episodes_of_its_evaluation(folder: str, split: TaskSet | None, num_episodes: int):
-    for file in (ROOT / "results" / folder).glob("runs/**/evaluation.jsonl.gz"):
-        trained = json.loads((file.parent / "config.json").read_text())["config"]["tasks"]
+    files = list((ROOT / "results" / folder).glob("runs/**/evaluation.jsonl.gz"))
+    assert files
+    for file in files:
+        config = json.loads((file.parent / "config.json").read_text())["config"]
+        assert config["run_dir"] is None, f"{file}: a path of the machine that trained it"
+        trained = config["tasks"]
         wanted = {task.id for task in named_tasks(trained[0].partition("/")[0], split=split)}
         rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
         wanted |= set(trained) if split == "gate" else set()

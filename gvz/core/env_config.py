@@ -88,6 +88,9 @@ class EnvConfig:
             if not low <= value <= high:
                 raise ConfigError(f"env.{name}: got {value}, want {low}..{high}")
 
+        if self.sight and self.frame_width < SIGHT_COLUMNS:
+            raise ConfigError(f"env.frame_width: got {self.frame_width} with env.sight, want {SIGHT_COLUMNS} or more")
+
     @property
     def channels(self) -> int:
         return 1 if self.grayscale or self.frames == "classes" else 3

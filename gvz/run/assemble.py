@@ -104,7 +104,9 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
         games_per_actor=config.games_per_actor,
         seed=config.games_seed,
         env_entry_point=ENV_ENTRY_POINT,
-        env_config=dataclasses.asdict(config.env) | {"sight": config.env.sight or config.agent.learns_sight},
+        env_config=dataclasses.asdict(
+            dataclasses.replace(config.env, sight=config.env.sight or config.agent.learns_sight)
+        ),
         frame_shape=config.env.frame_shape,
         stack_size=config.agent.stack_size,
         past_actions=spec.num_past_actions,
