@@ -183,12 +183,17 @@ def training_view(config: ValueConfig, key: PRNGKeyArray, obs: Observation) -> O
     """What the online network is shown of an observation in training: augmented, or in parts hidden, as configured."""
     key_frames, key_hidden = jax.random.split(key)
     if config.augmentations:
-        channels = obs.frames.shape[3] // config.stack_size
-        strength, clean_share = config.augmentation_strength, config.augmentation_clean_share
-        obs = replace(
-            obs, frames=augment(config.augmentations, key_frames, obs.frames, channels, strength, clean_share)
-        )
+        obs = with_augmented_frames(config, config.augmentations, key_frames, obs)
     if config.hidden_input_share > 0.0 and obs.vector.shape[1] + obs.actions.shape[1] > 0:
         hidden = jax.random.uniform(key_hidden, obs.task.shape)[:, None] < config.hidden_input_share
         obs = replace(obs, vector=jnp.where(hidden, 0.0, obs.vector), actions=jnp.where(hidden, -1, obs.actions))
     return obs
+
+
+def with_augmented_frames(
+    config: ValueConfig, names: tuple[str, ...], key: PRNGKeyArray, obs: Observation
+) -> Observation:
+    """The observation with the named augmentations of its frames, as strong and in as many samples as configured."""
+    channels = obs.frames.shape[3] // config.stack_size
+    strength, clean_share = config.augmentation_strength, config.augmentation_clean_share
+    return replace(obs, frames=augment(names, key, obs.frames, channels, strength, clean_share))

@@ -16,7 +16,7 @@ from gvz.core.errors import ConfigError
 from learner import losses
 from learner.agents.base import AgentLoss, Evaluation, NetworkAgent, Params, allowed_values, epsilon_greedy
 from learner.agents.configs.rainbow import RainbowConfig
-from learner.augment import training_view
+from learner.augment import training_view, with_augmented_frames
 from learner.networks import QNetwork, add_noise, draw_noise, fold_noise, initial_logits, is_folded
 from learner.observation import Observation
 from learner.replay import Transitions
@@ -136,6 +136,10 @@ class Rainbow(NetworkAgent):
                 loss = losses.quantile_huber(z_tm1, losses.quantile_midpoints(config.num_quantiles), targets)
         else:
             loss, priority = losses.huber(td), jnp.abs(td)
+        if config.sight_augmentations:
+            key_sight = jax.random.fold_in(key, 4)
+            view = with_augmented_frames(config, config.sight_augmentations, key_sight, batch.obs_tm1)
+            _, sight_logits = self.outputs_and_sight(online, view)
         if sight_logits is not None and batch.sight_tm1 is not None:
             loss += config.sight_weight * losses.sight(sight_logits, batch.sight_tm1, len(SIGHT_CLASSES))
         priority, td_error = jax.lax.stop_gradient((priority, td))

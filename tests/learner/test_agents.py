@@ -13,8 +13,10 @@ import pytest
 from gvz.core.env_config import SIGHT_CLASSES
 from gvz.core.errors import ConfigError
 from gvz.core.registry import discover
+from learner import losses
 from learner.agents.base import Agent, AgentSpec, OffPolicyAgent, epsilon_greedy, make_agent
 from learner.agents.configs.rainbow import RainbowConfig
+from learner.agents.rainbow import Rainbow
 from learner.config import ValueConfig, agent_config_class, change_agent
 from learner.networks import add_noise
 from learner.observation import Observation
@@ -314,6 +316,33 @@ def test_the_loss_of_sight_is_the_cross_entropy_of_logits_on_the_encoders_featur
     jax.tree.map(np.testing.assert_array_equal, *acted)
 
 
+def test_augmentations_of_sight_change_the_frames_of_the_loss_of_sight_alone():
+    """Each sample's loss of sight is that of its clean or of its inverted frames; values and priorities stay."""
+    C = len(SIGHT_CLASSES) * 4
+    clean_config = replace(RAINBOW, sight_weight=0.7, stack_size=2)
+    config = replace(clean_config, sight_augmentations=("inversion",), augmentation_clean_share=0.0)
+    agent, clean_agent = (Rainbow(config=c, spec=replace(SPEC, num_sights=C)) for c in (config, clean_config))
+    params, target = made_up_params(agent, 0), made_up_params(agent, 1)
+    seen = np.random.default_rng(5).integers(0, 2, (B, C), dtype=np.uint8)
+    b = replace(batch(), sight_tm1=jnp.asarray(seen))
+    inverted = replace(b, obs_tm1=replace(b.obs_tm1, frames=255 - b.obs_tm1.frames))
+    clean_loss, key = jax.jit(clean_agent.loss), jax.random.key(3)
+    found, clean = jax.jit(agent.loss)(params, target, key, b), clean_loss(params, target, key, b)
+    for name in ("priority", "q_tm1", "td_error"):
+        np.testing.assert_allclose(getattr(found, name), getattr(clean, name), rtol=1e-5, atol=1e-6)
+
+    change = np.asarray(found.loss - clean.loss)
+    logits, inverted_logits = (agent.outputs_and_sight(params, x.obs_tm1)[1] for x in (b, inverted))
+    assert logits is not None
+    assert inverted_logits is not None
+    sight, inverted_sight = (losses.sight(x, jnp.asarray(seen), len(SIGHT_CLASSES)) for x in (logits, inverted_logits))
+    wanted = 0.7 * np.asarray(inverted_sight - sight)
+    is_inverted = np.isclose(change, wanted, rtol=1e-3, atol=1e-5)
+    assert (is_inverted | np.isclose(change, 0, atol=1e-5)).all()
+    assert 0 < is_inverted.sum() < B
+    assert np.abs(wanted).min() > 1e-3, "the two cannot be told apart"
+
+
 def test_only_the_online_network_sees_augmented_frames_and_hidden_inputs(agent_name: str):
     """At strength 0, and with nothing hidden, the loss is as without; else its targets stay as they were."""
     plain = plain_config(agent_name)
@@ -333,6 +362,8 @@ def test_only_the_online_network_sees_augmented_frames_and_hidden_inputs(agent_n
 
 
 def test_parts_that_do_not_fit_together_are_refused():
+    with pytest.raises(ConfigError, match=r"agent\.sight_augmentations: got inversion without a loss that reads them"):
+        replace(RAINBOW, sight_augmentations=("inversion",))
     with pytest.raises(ConfigError, match=r"agent\.munchausen: got True with atoms, for which no form is published"):
         replace(RAINBOW, munchausen=True)
     with pytest.raises(ConfigError, match=r"agent\.num_quantiles: got quantiles of no distribution"):

@@ -52,6 +52,9 @@ class RainbowConfig(ValueConfig):
     sight_weight: Annotated[float, Range(0.0, 1000.0)] = 0.0
     """weight of a further loss: tell from the encoder's features what is in sight, by class and column, as the engine's
     labels have it (game features, Lample and Chaplot 2017). Labels are needed in training alone; 0: off"""
+    sight_augmentations: tuple[str, ...] = ()
+    """random changes of the frames that this loss alone learns from, as `augmentations`, and with their strength and
+    clean share. The values learn from frames without these. Empty: this loss reads what the values read"""
     noisy_epsilon: Share = 0.0
     """probability of a uniformly random action beside the noise"""
 
@@ -63,6 +66,11 @@ class RainbowConfig(ValueConfig):
             raise ConfigError(
                 "agent.munchausen: got True with atoms, for which no form is published; set agent.num_quantiles, or "
                 "agent.distributional False"
+            )
+        if self.sight_augmentations and not self.learns_sight:
+            raise ConfigError(
+                f"agent.sight_augmentations: got {' '.join(self.sight_augmentations)} without a loss that reads them; "
+                "set agent.sight_weight, such as 0.1"
             )
         if self.v_min is not None and self.v_max is not None and not self.v_min < self.v_max:
             raise ConfigError(f"agent.v_min, v_max: got {self.v_min}, {self.v_max}, want v_min < v_max")
