@@ -169,7 +169,7 @@ def test_the_findings_say_what_the_first_loss_of_sight_gave():
 def test_the_findings_say_what_the_gates_records_give():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     results = read_results([ROOT / "results" / "gates"])
-    world, reward, sight, ammo, defend, colour = results.asked
+    world, reward, sight, ammo, defend, colour, augmented = results.asked
     for trained, title in ((False, "gate tasks"), (True, "training tasks")):
         for scenario, _, *cells in result_table(results, world, trained=trained).rows[:-1]:
             assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
@@ -178,6 +178,9 @@ def test_the_findings_say_what_the_gates_records_give():
         for gate in (reward, ammo, defend, colour):
             _, _, *cells = result_table(results, gate, trained=trained).rows[0]
             assert f"| {title} | {' | '.join(cell.text for cell in cells)} |" in page
+        _, _, *cells = result_table(results, augmented, trained=trained).rows[1]
+        assert [cell.text for cell in cells[:1]] == ["-"], "its run is that of general_sight_loss"
+        assert f" | {' | '.join(cell.text for cell in cells[1:])} |" in page
     for _, compared, gain, _ in comparison_table(results, world).rows[:2]:
         value, _, interval = gain.text.partition(" ")
         assert compared.text == "8 tasks against 4 tasks"
