@@ -121,6 +121,11 @@ def test_the_page_of_the_general_agents_says_what_their_records_give(tmp_path):
         (line,) = [line for line in page.splitlines() if line.startswith(f"| {title.text} |")]
         assert score.text in line
     (section,) = joint_sections(results, tmp_path)
+    report = (folder / "report" / "report.md").read_text()
+    for table in section.blocks[0].tables:
+        rows_of_ours = [row for row in table.rows if row[0].text not in ("scripted", "sweep")]
+        assert len(rows_of_ours) == 5
+        assert all(f"| {' | '.join(cell.text for cell in row)} |" in report for row in rows_of_ours)
     means = {agent.text: mean.text for agent, *_, mean in section.blocks[0].tables[0].rows}
     assert means["rainbow_general (8 tasks)"] == ours[2].text
     assert ours[2].estimate is not None
