@@ -3,6 +3,7 @@
 import gzip
 import itertools
 import json
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -194,6 +195,16 @@ def test_the_findings_say_what_the_gates_records_give():
     pooled = {row[0].text: row[2].text for row in comparison_table(results, sight).rows[:3]}
     assert list(pooled) == ["Dodge Projectiles", "Health Gathering", "Defend the Center"]
     assert all(gain in page for gain in pooled.values())
+
+
+def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
+    page = (ROOT / "docs" / "FINDINGS.md").read_text()
+    summary = page.partition("## In short")[2].partition("\n## ")[0]
+    named = set(re.findall(r"-?\d+\.\d \[-?\d+\.\d, -?\d+\.\d\]", summary))
+    results = read_results([ROOT / "results" / "gates"])
+    gains = {row[2].text for gate in results.asked for row in comparison_table(results, gate).rows}
+    assert len(named) > 10
+    assert named <= gains
 
 
 def test_the_readme_says_how_fast_the_records_are():
