@@ -98,7 +98,9 @@ def test_the_joint_run_says_what_its_records_give():
     assert "| rainbow_all | 47.7 [46.8, 48.8] | 41.4 [40.2, 42.7] |" in report
 
 
-@pytest.mark.parametrize(("folder", "split", "num_episodes"), [("general_short", None, 50), ("gates", "gate", 20)])
+@pytest.mark.parametrize(
+    ("folder", "split", "num_episodes"), [("general_short", None, 50), ("general", None, 100), ("gates", "gate", 20)]
+)
 def test_every_run_has_all_episodes_of_its_evaluation(folder: str, split: TaskSet | None, num_episodes: int):
     files = list((ROOT / "results" / folder).glob("runs/**/evaluation.jsonl.gz"))
     assert files
@@ -156,6 +158,17 @@ def test_the_findings_compare_the_general_agents_as_their_records_do(words, othe
         sets = [[task.id for task in named_tasks(name, split=split)] for split in ("train8", "gate", "test")]
         cells = " | ".join(estimate(scores, tasks).text for tasks in sets)
         assert f"| {scenario_named(name).title} | {called} | {cells} |" in page
+
+
+def test_the_findings_say_what_six_times_the_time_gave():
+    page = (ROOT / "docs" / "FINDINGS.md").read_text()
+    for folder, seconds in (("general_short", "900 s"), ("general", "5,400 s")):
+        episodes = read_results([ROOT / "results" / folder]).episodes
+        for name in ("defend_the_center", "seek_and_kill"):
+            scores = agent_scores(episodes.filter(scenario=name), "rainbow_general+sight_loss")
+            sets = [named_tasks(name, split=split) for split in ("train8", "gate", "test")]
+            cells = [estimate(scores, [t.id for t in tasks]).text for tasks in (*sets, named_tasks(name, level=4))]
+            assert f"| {scenario_named(name).title} | {seconds} | {' | '.join(cells)} |" in page
 
 
 def test_the_findings_say_what_the_first_loss_of_sight_gave():

@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import hashlib
 import json
+import math
 import shutil
 import tempfile
 import zipfile
@@ -26,8 +27,8 @@ PREFIX = "zoo:"
 MAX_BYTES = 2_000_000
 """of a file"""
 RECORDS = ("config.json", "metrics.jsonl", "episodes.jsonl", "starts.jsonl", "evaluation.jsonl")
-_ROUNDED_BITS = 14
-"""of a float32's 23 bits of fraction that are rounded away: half the file's size, a relative change of at most 2^-10"""
+MAX_METRICS_ROWS = 200
+"""that are kept of a run's metrics, at equal distances, the last one among them"""
 
 
 def zoo_names() -> list[str]:
@@ -71,7 +72,7 @@ class Packed:
 
 
 def pack(run_dir: Path, name: str, checkpoint: str = "newest", agent_file: Path | None = None) -> Packed:
-    """Puts a policy of a run into the zoo. Its parameters are rounded to 9 bits of fraction.
+    """Puts a policy of a run into the zoo. Its parameters are rounded to bfloat16: less than half of the bytes.
 
     Only evaluation episodes of the rounded parameters go with it. So pack, evaluate `zoo:NAME`, and pack `zoo:NAME`
     again.
@@ -102,6 +103,7 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", agent_file: Path 
         for record in RECORDS[1:-1]:
             if (run_dir / record).exists():
                 shutil.copy(run_dir / record, packed)
+        _keep_some_rows(packed / "metrics.jsonl")
         saved = config_to_dict(dataclasses.replace(config, run_dir=None))  # no path of this machine
         (packed / RECORDS[0]).write_text(json.dumps(saved, indent=2) + "\n")
         checkpoints.write(packed / "policies" / str(num_updates), _rounded(params), {"num_updates": num_updates})
@@ -120,13 +122,17 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", agent_file: Path 
 
 def _rounded(params: object) -> object:
     import jax
+    import jax.numpy as jnp
     import numpy as np
 
     def rounded(leaf: "np.ndarray") -> "np.ndarray":
-        if leaf.dtype != np.float32:
-            return leaf
-        bits = np.ascontiguousarray(leaf).view(np.uint32)
-        half, mask = np.uint32(1 << (_ROUNDED_BITS - 1)), np.uint32(~((1 << _ROUNDED_BITS) - 1) & 0xFFFFFFFF)
-        return ((bits + half) & mask).view(np.float32)
+        return leaf.astype(jnp.bfloat16).astype(np.float32) if leaf.dtype == np.float32 else leaf
 
     return jax.tree.map(rounded, params)
+
+
+def _keep_some_rows(metrics: Path) -> None:
+    if metrics.exists():
+        rows = metrics.read_text().splitlines(keepends=True)
+        distance = max(1, math.ceil(len(rows) / MAX_METRICS_ROWS))
+        metrics.write_text("".join(rows[::-distance][::-1]))

@@ -1,19 +1,17 @@
-"""The experiment `general` on eight training tasks, with the loss of sight."""
+"""The experiment `general_sight_loss` with the time and the episodes of `general`."""
 
 import dataclasses
 
-from gvz.experiments.gate_sight_loss import EXPERIMENT as GATE
 from gvz.experiments.general import EXPERIMENT as GENERAL
+from gvz.experiments.general_sight_loss import EXPERIMENT as SHORT
 
 EXPERIMENT = dataclasses.replace(
-    GENERAL,
+    SHORT,
     name="general_long",
     title="Generalization with the engine's labels in training, within 90 minutes of one core",
     question="What do six times the time of general_sight_loss give?",
-    variants={"sight_loss": GATE.variants["sight_0.1"]},
-    trainings=("train8",),
     seeds=(1111,),
-    columns="config",
+    max_processor_s=GENERAL.max_processor_s,
+    episodes=GENERAL.episodes,
     players=("random",),
-    notes=("Labels are needed in training alone: agents act, and are evaluated, on the same frames as others.",),
 )
