@@ -26,6 +26,7 @@ from gvz.observation import (
 )
 from gvz.scenarios.base import BOOKKEEPING, Task
 from gvz.scenarios.compiler import compile_task, task_content
+from gvz.segmentation import segmented_frame, segmenter_of
 from gvz.tasks import parse_task
 from gvz.viewer import Window
 
@@ -48,8 +49,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
     """One game of a task.
 
     - Observation: uint8 [H, W, C], the screen as the player sees it, or with `config.frames` the classes of what it
-      shows; with `config.buffers` a dict of `screen` and of `depth` [H, W, 1], `labels` [H, W, 1] (numbers of
-      gvz.LABEL_CLASSES) and `automap` [H, W, C] (the whole map).
+      shows, or what a network takes them for; with `config.buffers` a dict of `screen` and of `depth` [H, W, 1],
+      `labels` [H, W, 1] (numbers of gvz.LABEL_CLASSES) and `automap` [H, W, C] (the whole map).
     - Actions: `action_meanings`, each held for `config.frame_skip` game tics.
     - Reward: the sum of `info["reward_components"]`.
     - Termination: the agent died; the final observation shows this moment. (The buffers are those before it.)
@@ -96,7 +97,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         Raises:
             TaskError: no such task.
             ConfigError: an unknown field or reward component, a value of a wrong type or out of range, an impossible
-                render size.
+                render size, no network for segmented frames.
             EngineError: the map does not load.
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -131,6 +132,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             start_tic=_WEAPON_UP_TIC if scenario.render_weapon else 1,
         )
         check_config(self._engine_config)
+        self._segmenter = segmenter_of(self.task.scenario.id, config) if config.frames == "segmented" else None
         ensure_loads(self._compiled.wad_path)
         if config.action_set == "multi_discrete_v1":
             self.action_space = MultiDiscrete([len(axis) for axis in AXES_V1])
@@ -292,6 +294,11 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         if self.config.frames == "classes":
             assert self._state is not None
             self._observation = observe_classes(self._state, self.config)
+            return self._observation
+        if self.config.frames == "segmented":
+            assert self._segmenter is not None
+            probabilities = self._segmenter(engine.screen)
+            self._observation = segmented_frame(probabilities, self.config.frame_width, self.config.frame_height)
             return self._observation
         self._observation = observe_screen(engine.screen, self.config)
         if self.config.buffers:

@@ -16,9 +16,10 @@ class Gallery:
     """directory for <kind>_<scenario>.png"""
     scenario: str | None = None
     """only this one"""
-    kind: Literal["gallery", "varied", "procedural", "severity", "augmented"] = "gallery"
+    kind: Literal["gallery", "varied", "procedural", "severity", "augmented", "segmented"] = "gallery"
     """gallery: the named tasks; varied, procedural: the first maps of such a task; severity: each attribute alone at
-    four severities; augmented: the default task under each augmentation that a learner can train with"""
+    four severities; augmented: the default task under each augmentation that a learner can train with; segmented: the
+    default and the gate tasks, each beside what the scenario's segmentation network takes it for"""
     moving: bool = False
     """also agents.webp: agents of the core scenarios at play, level after level; policies of the zoo if there are"""
 

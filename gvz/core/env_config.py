@@ -44,8 +44,12 @@ class EnvConfig:
     """width of an observation frame, pixels"""
     grayscale: bool = False
     """one luminance channel instead of RGB"""
-    frames: Literal["screen", "classes"] = "screen"
-    """classes: instead of the screen, a grey picture of what each pixel shows (LABEL_CLASSES)"""
+    frames: Literal["screen", "classes", "segmented"] = "screen"
+    """classes: instead of the screen, a grey picture of what each pixel shows (LABEL_CLASSES). segmented: a picture of
+    what a network takes each pixel of the screen for"""
+    segmenter: str = ""
+    """the network of segmented frames: one that comes with GViZDoom, by its name, or the path of an ONNX file (gvz
+    segmenter trains one); default: that of the scenario's name"""
     frame_skip: int = 4
     """game tics an action is held; one decision = frame_skip frames"""
     render_width: int = 256
@@ -75,8 +79,10 @@ class EnvConfig:
         names = [name for name, _ in self.reward_weights]
         if len(set(names)) < len(names):
             raise ConfigError(f"env.reward_weights: got {' '.join(names)}, want each component once")
-        if self.frames == "classes" and self.buffers:
-            raise ConfigError(f"env.buffers: got {' '.join(self.buffers)} with env.frames classes, want none")
+        if self.frames != "screen" and self.buffers:
+            raise ConfigError(f"env.buffers: got {' '.join(self.buffers)} with env.frames {self.frames}, want none")
+        if self.segmenter and self.frames != "segmented":
+            raise ConfigError(f"env.segmenter: got {self.segmenter} with env.frames {self.frames}, want segmented")
         for name, low, high in (
             ("frame_height", 8, 1080),
             ("frame_width", 8, 1920),
@@ -93,7 +99,7 @@ class EnvConfig:
 
     @property
     def channels(self) -> int:
-        return 1 if self.grayscale or self.frames == "classes" else 3
+        return 3 if self.frames == "segmented" else 1 if self.grayscale or self.frames == "classes" else 3
 
     @property
     def frame_shape(self) -> tuple[int, int, int]:

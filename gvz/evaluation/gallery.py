@@ -27,6 +27,7 @@ from gvz.scenarios.base import Scenario, Task
 from gvz.scenarios.compiler import CompiledTask, compile_task, map_source, task_content
 from gvz.scenarios.layout import FIRST_PLACE, MAP_SPOT
 from gvz.scenarios.map_set import NUMBERS, MapSet
+from gvz.segmentation import segmented_frame, segmenter_of
 from gvz.tasks import named_tasks, parse_task, scenarios
 from gvz.wad.udmf import UdmfMap, parse_textmap
 
@@ -174,12 +175,23 @@ def augmented_sheet(scenario: Scenario) -> Image.Image:
     return tiled(cells, COLUMNS)
 
 
+def segmented_sheet(scenario: Scenario) -> Image.Image:
+    """Frames of the default task and of the gate tasks, each beside what the scenario's network takes it for."""
+    segment, cells = segmenter_of(scenario.id, EnvConfig()), []
+    for task in (parse_task(f"{scenario.id}/default"), *named_tasks(scenario.id, split="gate")):
+        frame = task_frame(task)
+        seen = segmented_frame(segment(frame), FRAME_WIDTH, FRAME_HEIGHT)
+        cells += [(frame, task.name, task.level), (seen, f"{task.name}, segmented", task.level)]
+    return tiled(cells, COLUMNS)
+
+
 SHEETS = {
     "gallery": contact_sheet,
     "varied": varied_sheet,
     "procedural": procedural_sheet,
     "severity": severity_sheet,
     "augmented": augmented_sheet,
+    "segmented": segmented_sheet,
 }
 
 

@@ -19,6 +19,7 @@ from gvz.core.errors import ConfigError
 from gvz.run.config import RunConfig, off_policy
 from gvz.run.footprint import Footprint
 from gvz.scenarios.compiler import compile_task
+from gvz.segmentation import segmenter_of
 from gvz.task_table import TaskTable
 from learner.acting import DevicePolicy
 from learner.agents.base import Agent, AgentSpec, OffPolicyAgent, OnPolicyAgent, folding, make_agent
@@ -92,6 +93,9 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
     table = config.table
     for task in table.tasks:
         compile_task(task, config.env.profile)  # once, here: the actors find it in the cache
+    if config.env.frames == "segmented":
+        for scenario in table.scenarios:
+            segmenter_of(scenario.id, config.env)  # its errors are the run's, not an actor's
     agent = run_agent(config)
     spec, params = agent.spec, jax.eval_shape(agent.init, jax.random.key(0))
     num_params = sum(leaf.size for leaf in jax.tree.leaves(params))

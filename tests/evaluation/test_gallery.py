@@ -160,6 +160,16 @@ def test_the_augmented_sheets_in_the_docs_show_every_augmentation(scenario):
         assert sheet.height // len(AUGMENTATIONS) > FRAME_HEIGHT
 
 
+@pytest.mark.parametrize("scenario", scenarios())
+def test_the_segmented_sheets_in_the_docs_show_the_default_and_the_gate_tasks(scenario):
+    file = IMAGES / f"segmented_{scenario}.png"
+    assert file.stat().st_size < 700_000
+    with Image.open(file) as sheet:
+        rows = -(-2 * (1 + len(named_tasks(scenario, split="gate"))) // COLUMNS)
+        assert sheet.height % rows == 0
+        assert sheet.height // rows > FRAME_HEIGHT
+
+
 def test_the_sheet_of_severities_in_the_docs_shows_every_attribute():
     attributes = all_scenarios()["defend_the_center"].attributes
     with Image.open(IMAGES / "severity_defend_the_center.png") as sheet:

@@ -1,0 +1,16 @@
+"""`rainbow_general` on frames that show what a network takes each part of the screen for (docs/BENCHMARK.md).
+
+The network (`gvz segmenter`) has learned from the engine's labels what things look like, and the agent learns play
+alone. Frames are 24x42, half as high and wide, so the convolutions are half as large with half the strides.
+"""
+
+import dataclasses
+
+from configs.rainbow_general import CONFIG as GENERAL
+
+CONFIG = dataclasses.replace(
+    GENERAL,
+    name="rainbow_segmented",
+    env=dataclasses.replace(GENERAL.env, frames="segmented", frame_height=24, frame_width=42, grayscale=False),
+    agent=dataclasses.replace(GENERAL.agent, conv_kernels=(4, 4), conv_strides=(2, 2)),
+)

@@ -1,0 +1,111 @@
+"""Frames with the engine's labels, to train a segmentation network on and to score it by."""
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from gvz.core.env_config import LABEL_CLASSES, SIGHT_CLASSES, EnvConfig
+from gvz.env import DoomEnv
+from gvz.evaluation.play import episode_seed
+from gvz.evaluation.players import Player, RandomPlayer, ScriptedPlayer
+from gvz.scenarios.base import Task
+from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, network_input
+from learner.segmentation import CELL
+from learner.segmentation_views import changed_view, mirrored
+
+Labelled = tuple[np.ndarray, np.ndarray]
+"""frames u8[N INPUT_HEIGHT INPUT_WIDTH 3] and their labels u8[N INPUT_HEIGHT INPUT_WIDTH], numbers of LABEL_CLASSES"""
+
+CLASS_WEIGHTS = np.where(np.isin(LABEL_CLASSES, SIGHT_CLASSES), 8.0, 1.0).astype(np.float32)
+"""f32[C] of pixels in the loss: what an agent acts on covers few of them"""
+_BASE_SEED = 7
+"""of the episodes; evaluations have 0"""
+_DECISIONS_APART = 5
+"""between frames of an episode, which hardly differ otherwise"""
+_FRAMES_PER_EPISODE = 60
+_CLEAN_SHARE = 0.3
+"""of a batch's frames that are only mirrored"""
+_MIN_CELLS = 100
+"""that show a class, for a score of it"""
+
+
+def labelled_frames(task: Task, num_frames: int) -> Labelled:
+    """Frames of a task that a random player and the scripted one see in turns, an episode each.
+
+    Raises:
+        EngineError: the engine does not start, or dies.
+    """
+    frames, labels = [], []
+    config = EnvConfig(frame_height=INPUT_HEIGHT, frame_width=INPUT_WIDTH, buffers=("labels",))
+    env = DoomEnv(task, config)
+    try:
+        for episode in range(10**9):
+            seed = episode_seed(task.id, episode, _BASE_SEED)
+            observation, info = env.reset(options={"episode_seed": seed})
+            player: Player = RandomPlayer() if episode % 2 else ScriptedPlayer()
+            player.begin(env, observation, info, seed)
+            for decision in range(_FRAMES_PER_EPISODE * _DECISIONS_APART):
+                assert isinstance(observation, dict)
+                if decision % _DECISIONS_APART == 0:
+                    frames.append(observation["screen"])
+                    labels.append(observation["labels"][:, :, 0])
+                    if len(frames) == num_frames:
+                        return np.stack(frames), np.stack(labels)
+                observation, _, terminated, truncated, info = env.step(player.act())
+                player.observe(observation, info)
+                if terminated or truncated:
+                    break
+    finally:
+        env.close()
+    raise AssertionError
+
+
+def training_batches(tasks: Sequence[Labelled], batch_size: int, seed: int) -> Iterator[Labelled]:
+    """Batches without end: (network inputs f32[B 3 H W], labels u8[B H W]), each frame of a task drawn at random."""
+    rng = np.random.default_rng(seed)
+    while True:
+        inputs, answers = [], []
+        for _ in range(batch_size):
+            (frame, labels), (other, other_labels) = _drawn(rng, tasks), _drawn(rng, tasks)
+            if rng.random() >= _CLEAN_SHARE:
+                frame, labels = changed_view(rng, frame, labels, other, other_labels)
+            frame, labels = mirrored(rng, frame, labels)
+            inputs.append(network_input(np.ascontiguousarray(frame)))
+            answers.append(labels)
+        yield np.stack(inputs), np.stack(answers)
+
+
+def _drawn(rng: np.random.Generator, tasks: Sequence[Labelled]) -> Labelled:
+    frames, labels = tasks[int(rng.integers(len(tasks)))]
+    number = rng.integers(len(frames))
+    return frames[number], labels[number]
+
+
+def score(probabilities: np.ndarray, labels: np.ndarray) -> Mapping[str, float]:
+    """The average precision of each class that an agent acts on, 0..1: how well its cells stand before all others.
+
+    A cell shows a class if an eighth of its pixels do. Classes in fewer than 100 cells have no score.
+
+    Args:
+        probabilities: f32[N h w C], C as LABEL_CLASSES.
+        labels: u8[N H W].
+    """
+    n, h, w, _ = probabilities.shape
+    cells = labels.reshape(n, h, CELL, w, CELL).swapaxes(2, 3).reshape(n, h, w, CELL * CELL)
+    found = {}
+    for name in SIGHT_CLASSES:
+        number = LABEL_CLASSES.index(name)
+        shown = (cells == number).sum(axis=-1) >= CELL * CELL / 8
+        if shown.sum() >= _MIN_CELLS:
+            found[name] = average_precision(probabilities[..., number], shown)
+    return found
+
+
+def average_precision(ratings: np.ndarray, relevant: np.ndarray) -> float:
+    """The mean over relevant items of the precision at their rank, by falling rating: 1 if they stand before all else.
+
+    Source: Manning, Raghavan and Schuetze 2008, section 8.4. At equal ratings the order is that of the arrays.
+    """
+    hits = relevant.ravel()[np.argsort(-ratings.ravel(), kind="stable")]
+    precision = np.cumsum(hits) / np.arange(1, hits.size + 1)
+    return float(precision[hits].mean())

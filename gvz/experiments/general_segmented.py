@@ -1,0 +1,20 @@
+"""The experiment `general_short` on frames that show what a network takes each part of the screen for."""
+
+import dataclasses
+
+from gvz.experiments.general_short import EXPERIMENT as SHORT
+
+EXPERIMENT = dataclasses.replace(
+    SHORT,
+    name="general_segmented",
+    title="Generalization with a segmentation network",
+    question="How well does an agent play unseen tasks that sees what a network takes the screen for?",
+    configs=("rainbow_segmented",),
+    columns="config",
+    players=(),
+    published={},
+    notes=(
+        "The networks come with GViZDoom. Each learned from the engine's labels, on the eight training tasks of its "
+        "scenario, for 600 seconds of processor time, which come to the time of these runs. Agents need no labels.",
+    ),
+)

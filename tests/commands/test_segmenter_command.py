@@ -1,0 +1,56 @@
+"""gvz segmenter, as it is called."""
+
+import json
+
+import pytest
+
+from gvz import cli
+from gvz.commands import segmenter
+from gvz.env import DoomEnv
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--scenario seek_and_kil --out n.onnx", "unknown scenario 'seek_and_kil' (did you mean 'seek_and_kill'?)"),
+        ("--scenario seek_and_kill --out n.pt", "--out: got n.pt, want a name that ends in .onnx"),
+        ("--scenario seek_and_kill --out none/n.onnx", "--out: none is no directory"),
+        ("--scenario seek_and_kill --out n.onnx --frames 0", "--frames: got 0, want at least 1"),
+        ("--scenario seek_and_kill --out n.onnx --gate-frames 0", "--gate-frames: got 0, want at least 1"),
+        ("--scenario seek_and_kill --out n.onnx --processor-s 0", "--processor-s: got 0, want more than 0"),
+    ],
+)
+def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["segmenter", *arguments.split()]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: ")
+    assert message in err
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_onnx_it_says_so_before_anything_is_played(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(segmenter, "find_spec", lambda _: None)
+    assert cli.main(["segmenter", "--scenario", "seek_and_kill", "--out", str(tmp_path / "n.onnx")]) == 2
+    assert "pip install 'gvizdoom[segmenter]'" in capsys.readouterr().err
+
+
+@pytest.mark.engine
+def test_a_network_is_trained_scored_and_played_with(capsys, tmp_path):
+    file = tmp_path / "mine.onnx"
+    flags = f"--scenario health_gathering --training-set train4 --out {file} --frames 20 --gate-frames 60"
+    assert cli.main([*"segmenter --processor-s 15".split(), *flags.split()]) == 0
+    out, _ = capsys.readouterr()
+    record = json.loads(file.with_suffix(".json").read_text())
+    names = ("default", "lava", "obstacles", "stimpacks")
+    assert sorted(record["tasks"]) == [f"health_gathering/{name}" for name in names]
+    assert record["gradient_steps"] >= 1
+    assert len(record["average_precision"]) == 4, "gate tasks"
+    for task, found in record["average_precision"].items():
+        assert task in out
+        assert 0 < found["kit"] <= 1
+    env = DoomEnv("health_gathering/water", frames="segmented", segmenter=str(file), frame_height=24, frame_width=42)
+    frame, _ = env.reset(seed=1)
+    assert frame.shape == (24, 42, 3)
+    env.close()

@@ -1,0 +1,80 @@
+"""Labelled frames of the real engine, batches of them, and scores of what a network says."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from gvz.core.env_config import LABEL_CLASSES
+from gvz.evaluation import segmentation
+from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, network_input
+from gvz.tasks import parse_task
+
+ENEMY, KIT = LABEL_CLASSES.index("enemy"), LABEL_CLASSES.index("kit")
+
+
+@pytest.mark.parametrize(
+    ("ratings", "relevant", "expected"),
+    [
+        ([0.9, 0.8, 0.7, 0.1], [1, 1, 0, 0], 1.0),
+        ([0.9, 0.8, 0.7, 0.1], [0, 0, 1, 1], (1 / 3 + 2 / 4) / 2),
+        ([0.1, 0.8, 0.7, 0.9], [1, 0, 1, 0], (1 / 3 + 2 / 4) / 2),
+        ([0.3], [1], 1.0),
+    ],
+)
+def test_average_precision_of_hand_worked_ranks(ratings: list[float], relevant: list[int], expected: float):
+    assert segmentation.average_precision(np.array(ratings), np.array(relevant, bool)) == pytest.approx(expected)
+
+
+def test_a_cell_shows_a_class_if_an_eighth_of_its_pixels_do():
+    labels = np.zeros((40, 8, 12), np.uint8)  # 2x3 cells each
+    labels[:, 0, :2] = ENEMY  # two pixels of the first cell
+    labels[:, 4, 8:11] = ENEMY  # three of the last
+    labels[:, 0, 4] = ENEMY  # one of the second: too few
+    labels[:20, 7, 0] = KIT
+    probabilities = np.full((40, 2, 3, len(LABEL_CLASSES)), 0.1, np.float32)
+    probabilities[:, 0, 0, ENEMY], probabilities[:, 1, 2, ENEMY], probabilities[:, 0, 1, ENEMY] = 0.9, 0.5, 0.3
+    assert segmentation.score(probabilities[:, :, :], labels) == {}, "80 cells are too few for a score"
+    labels, probabilities = np.concatenate([labels] * 2), np.concatenate([probabilities] * 2)
+    assert segmentation.score(probabilities, labels) == {"enemy": 1.0}
+    probabilities[:, 0, 1, ENEMY] = 1.0  # now 80 cells that show none stand before all
+    expected = np.mean([rank / (rank + 80) for rank in range(1, 161)])
+    assert segmentation.score(probabilities, labels)["enemy"] == pytest.approx(expected)
+
+
+@pytest.mark.engine
+def test_labelled_frames_are_the_same_each_time_and_show_what_the_task_has():
+    task = parse_task("defend_the_center/gore")
+    frames, labels = segmentation.labelled_frames(task, 90)
+    assert frames.shape == (90, INPUT_HEIGHT, INPUT_WIDTH, 3)
+    assert labels.shape == (90, INPUT_HEIGHT, INPUT_WIDTH)
+    again, labels_again = segmentation.labelled_frames(task, 90)
+    np.testing.assert_array_equal(frames, again)
+    np.testing.assert_array_equal(labels, labels_again)
+    assert {LABEL_CLASSES[n] for n in np.unique(labels)} >= {"wall", "plane", "weapon", "enemy", "scenery"}
+    assert len({frame.tobytes() for frame in frames}) > 80, "few frames are alike"
+
+
+def test_batches_hold_network_inputs_and_labels_of_all_tasks():
+    rng = np.random.default_rng(0)
+    tasks = [
+        (rng.integers(0, 256, (5, INPUT_HEIGHT, INPUT_WIDTH, 3), dtype=np.uint8), np.full((5, 96, 168), n, np.uint8))
+        for n in (ENEMY, KIT)
+    ]
+    batches = list(itertools.islice(segmentation.training_batches(tasks, 8, seed=3), 4))
+    assert {int(n) for _, labels in batches for n in np.unique(labels)} == {ENEMY, KIT}
+    again = list(itertools.islice(segmentation.training_batches(tasks, 8, seed=3), 4))
+    for (inputs, labels), (inputs_again, labels_again) in zip(batches, again, strict=True):
+        assert (inputs.shape, inputs.dtype) == ((8, 3, INPUT_HEIGHT, INPUT_WIDTH), np.float32)
+        np.testing.assert_array_equal(inputs, inputs_again)
+        np.testing.assert_array_equal(labels, labels_again)
+
+
+def test_a_network_sees_frames_of_mean_zero_whatever_their_light():
+    rng = np.random.default_rng(0)
+    screen = rng.integers(40, 120, (144, 256, 3), dtype=np.uint8)
+    dark, bright = network_input(screen), network_input(screen * 2)
+    assert dark.shape == (3, INPUT_HEIGHT, INPUT_WIDTH)
+    assert abs(dark.mean()) < 1e-5
+    np.testing.assert_allclose(dark.std() * (1 + 12.75 / np.std(screen)), 1, rtol=0.2)
+    assert np.corrcoef(dark.ravel(), bright.ravel())[0, 1] > 0.999

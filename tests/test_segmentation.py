@@ -1,0 +1,123 @@
+"""Segmented frames: what a network takes the screen for, in place of the screen."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from gvz.core.env_config import LABEL_CLASSES, EnvConfig
+from gvz.core.errors import ConfigError
+from gvz.env import DoomEnv
+from gvz.segmentation import (
+    CLASS_COLOURS,
+    INPUT_HEIGHT,
+    INPUT_WIDTH,
+    Segmenter,
+    network_input,
+    segmented_frame,
+    segmenter_names,
+)
+from gvz.tasks import scenarios
+from learner.segmentation import SegmentationNetwork, write_onnx
+
+
+def write_network(file: Path, num_classes: int = len(LABEL_CLASSES), height: int = INPUT_HEIGHT) -> Path:
+    """A network that has learned nothing."""
+    network = SegmentationNetwork(num_classes)
+    write_onnx(network.init(jax.random.key(0), np.zeros((1, height, INPUT_WIDTH, 3))), file, height, INPUT_WIDTH)
+    return file
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return str(write_network(tmp_path_factory.mktemp("segmenter") / "fresh.onnx"))
+
+
+def test_a_frame_is_the_mean_of_the_colours_of_classes_by_probability():
+    probabilities = np.zeros((2, 3, len(LABEL_CLASSES)), np.float32)
+    probabilities[..., LABEL_CLASSES.index("wall")] = 1.0
+    probabilities[0, 0] = np.eye(len(LABEL_CLASSES))[LABEL_CLASSES.index("enemy")]
+    probabilities[1, 2, LABEL_CLASSES.index("wall")] = 0.25
+    probabilities[1, 2, LABEL_CLASSES.index("kit")] = 0.75
+    frame = segmented_frame(probabilities, width=3, height=2)
+    assert frame.dtype == np.uint8
+    assert frame[0, 0].tolist() == [255, 0, 0]
+    assert frame[1, 2].tolist() == [0, 191, 0]
+    assert frame[0, 1].tolist() == [0, 0, 0]
+    assert segmented_frame(probabilities, width=84, height=48).shape == (48, 84, 3)
+
+
+def test_classes_that_an_agent_must_tell_apart_have_colours_far_from_each_other():
+    acted_on = [np.array(CLASS_COLOURS[name]) for name in ("enemy", "projectile", "kit", "poison", "key", "wall")]
+    for i, a in enumerate(acted_on):
+        for b in acted_on[:i]:
+            assert np.abs(a - b).max() >= 250
+    assert set(CLASS_COLOURS) == set(LABEL_CLASSES)
+
+
+@pytest.mark.engine
+def test_an_environment_shows_what_the_network_says_of_the_screen(network: str):
+    config = EnvConfig(frames="segmented", segmenter=network, frame_height=24, frame_width=42)
+    env = DoomEnv("seek_and_kill/blue", config, render_mode="rgb_array")
+    assert env.observation_space.shape == (24, 42, 3)
+    segment = Segmenter(network)
+    observation, _ = env.reset(options={"episode_seed": 4})
+    frames = set()
+    for action in (0, 1, 2, 3, 3) * 3:
+        screen = env.render()
+        assert screen is not None
+        np.testing.assert_array_equal(observation, segmented_frame(segment(screen), 42, 24))
+        assert env.observation_space.contains(observation)
+        frames.add(observation.tobytes())
+        observation, *_ = env.step(action)
+    assert len(frames) > 5
+    assert not env._engine_config.labels, "whoever plays needs no labels, which take the engine's time"
+    env.close()
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("scenario", scenarios())
+def test_every_scenario_has_a_network_that_finds_what_the_labels_show(scenario: str):
+    """Cells where the network is surest of a class are where the engine's labels have it, on the default task."""
+    kind = {"health_gathering": "kit"}.get(scenario, "enemy")
+    assert scenario in segmenter_names()
+    segment, number = Segmenter(scenario), LABEL_CLASSES.index(kind)
+    env = DoomEnv(f"{scenario}/default", frame_height=INPUT_HEIGHT, frame_width=INPUT_WIDTH, buffers=("labels",))
+    hits = looked = 0
+    for seed in range(6):
+        env.reset(options={"episode_seed": seed})
+        for _ in range(10):
+            observation, _, terminated, *_ = env.step(1)
+            shown = (observation["labels"][:, :, 0] == number).reshape(24, 4, 42, 4).any(axis=(1, 3))
+            sure = segment(observation["screen"])[..., number]
+            if shown.any() and not terminated:
+                looked += 1
+                hits += bool(shown[np.unravel_index(sure.argmax(), sure.shape)])
+            if terminated:
+                break
+    env.close()
+    assert looked >= 20
+    assert hits > 0.75 * looked
+
+
+def test_input_has_the_shape_of_the_network_whatever_the_screen():
+    for height, width in ((144, 256), (480, 640), (96, 168)):
+        assert network_input(np.zeros((height, width, 3), np.uint8)).shape == (3, INPUT_HEIGHT, INPUT_WIDTH)
+    assert np.isfinite(network_input(np.zeros((144, 256, 3), np.uint8))).all(), "a black screen has no deviation"
+
+
+def test_what_is_no_network_is_refused_by_name(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"env\.segmenter: got 'seek_and_kil' \(did you mean 'seek_and_kill'\?\)"):
+        DoomEnv("seek_and_kill/default", frames="segmented", segmenter="seek_and_kil")
+    with pytest.raises(ConfigError, match=r"got '/nowhere/mine\.onnx', want one of .*seek_and_kill"):
+        Segmenter("/nowhere/mine.onnx")
+    (tmp_path / "text.onnx").write_text("no network")
+    with pytest.raises(ConfigError, match=r"text\.onnx is no segmentation network"):
+        Segmenter(str(tmp_path / "text.onnx"))
+    with pytest.raises(ConfigError, match=r"few\.onnx has 5 classes, want 11: wall, plane"):
+        Segmenter(str(write_network(tmp_path / "few.onnx", num_classes=5)))
+    with pytest.raises(ConfigError, match=r"env\.buffers: got depth with env\.frames segmented, want none"):
+        EnvConfig(frames="segmented", buffers=("depth",))
+    with pytest.raises(ConfigError, match=r"env\.segmenter: got mine\.onnx with env\.frames screen, want segmented"):
+        EnvConfig(segmenter="mine.onnx")
