@@ -127,9 +127,12 @@ def test_the_page_of_the_general_agents_says_what_their_records_give(tmp_path):
     report = (folder / "report" / "report.md").read_text()
     for table in section.blocks[0].tables:
         rows_of_ours = [row for row in table.rows if row[0].text not in ("scripted", "sweep")]
-        assert len(rows_of_ours) == 5
+        assert len(rows_of_ours) == 6
         assert all(f"| {' | '.join(cell.text for cell in row)} |" in report for row in rows_of_ours)
     means = {agent.text: mean.text for agent, *_, mean in section.blocks[0].tables[0].rows}
+    for of_segmented in (ROOT / "README.md", ROOT / "docs" / "FINDINGS.md"):
+        value, _, interval = means["rainbow_segmented"].partition(" ")
+        assert re.search(rf"{re.escape(value)}%? {re.escape(interval)}", of_segmented.read_text())
     assert means["rainbow_general (8 tasks)"] == ours[2].text
     assert ours[2].estimate is not None
     assert ours[2].estimate.low > 41.84, "the thesis's best mean over the scenarios"
@@ -145,6 +148,7 @@ def test_the_page_of_the_general_agents_says_what_their_records_give(tmp_path):
         ("8 tasks", "rainbow_general (8 tasks and pairs)", "8 tasks and pairs"),
         ("screen", "rainbow_general+classes", "classes"),
         ("no loss of sight", "rainbow_general+sight_loss", "loss of sight"),
+        ("screen", "rainbow_segmented", "segmented"),
     ],
 )
 def test_the_findings_compare_the_general_agents_as_their_records_do(words, other, words_of_other):
@@ -158,6 +162,19 @@ def test_the_findings_compare_the_general_agents_as_their_records_do(words, othe
         sets = [[task.id for task in named_tasks(name, split=split)] for split in ("train8", "gate", "test")]
         cells = " | ".join(estimate(scores, tasks).text for tasks in sets)
         assert f"| {scenario_named(name).title} | {called} | {cells} |" in page
+
+
+def test_the_findings_say_how_well_segmentation_networks_find_things():
+    page = (ROOT / "docs" / "FINDINGS.md").read_text()
+    for name in scenarios():
+        record = json.loads((ROOT / "gvz" / "segmenters" / f"{name}.json").read_text())
+        assert record["tasks"] == [task.id for task in named_tasks(name, split="train8")], "no gate or test task"
+        assert list(record["average_precision"]) == [task.id for task in named_tasks(name, split="gate")]
+        for task, found in record["average_precision"].items():
+            cells = (
+                f"{found[kind]:.2f}" if kind in found else "-" for kind in ("enemy", "projectile", "kit", "poison")
+            )
+            assert f"| `{task}` | {' | '.join(cells)} |" in page
 
 
 def test_the_findings_say_what_six_times_the_time_gave():
