@@ -1,7 +1,7 @@
 """Random changes of labelled frames: what a thing is stays, what it and its surroundings look like does not.
 
 Labels say which pixels are walls, floors or things, so each can be changed by itself, and things can stand before
-surroundings that they were never seen in. On the host, by numpy and OpenCV: a frame takes 0.5 ms of one core.
+surroundings that they were never seen in. On the host, by numpy and OpenCV.
 
 Source: Tobin et al. 2017 (domain randomization: looks at random, so that the real one is one more); Ghiasi et al. 2021
 (copy-paste of things between frames); Lee et al. 2020 (random convolution).
