@@ -11,29 +11,36 @@ from pathlib import Path
 
 import psutil
 import pytest
-from command import alive
+from command import STARTED, alive, arguments
 
 from gvz.experiments import inventory as progress
 from gvz.experiments.plan import read_plan
 
-pytestmark = [pytest.mark.e2e, pytest.mark.engine, pytest.mark.timeout(1800)]
+pytestmark = [
+    pytest.mark.e2e,
+    pytest.mark.engine,
+    pytest.mark.timeout(1800),
+    pytest.mark.usefixtures("nothing_left"),
+]
 
 RAINBOW = "rainbow_4task/defend_the_center/train4/seed_1111"
 DQN = "dqn_4task/defend_the_center/train4/seed_1111"
 
 
-def command(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "gvz.cli", "experiment", *arguments]
+def command(*words: str) -> list[str]:
+    return [sys.executable, "-m", "gvz.cli", "experiment", *words]
 
 
 def begin(results: Path) -> subprocess.Popen[str]:
     names = ("algorithm_comparison", "rainbow_evaluation")
     flags = ("--results", str(results), "--scale", "0.001", "--jobs", "2")
-    return subprocess.Popen(command("run", *names, *flags), stderr=subprocess.PIPE, text=True, start_new_session=True)
+    runner = subprocess.Popen(command("run", *names, *flags), stderr=subprocess.PIPE, text=True, start_new_session=True)
+    STARTED.append(runner)
+    return runner
 
 
 def training_process(runner: subprocess.Popen[str], run: str) -> psutil.Process:
-    (found,) = [p for p in psutil.Process(runner.pid).children() if any(a.endswith(run) for a in p.cmdline())]
+    (found,) = [p for p in psutil.Process(runner.pid).children() if any(a.endswith(run) for a in arguments(p))]
     return found
 
 

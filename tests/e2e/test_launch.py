@@ -10,7 +10,7 @@ from pathlib import Path
 import msgpack
 import numpy as np
 import pytest
-from command import alive, arrays_of, descendants, faults, finish, launch, num_updates, rows, wait_until
+from command import alive, arguments, arrays_of, descendants, faults, finish, launch, num_updates, rows, wait_until
 from scipy import stats
 
 from learner.checkpoint import checkpoint_steps, verify
@@ -163,7 +163,7 @@ def test_a_run_that_acts_on_the_learners_device_goes_on_after_a_kill_and_after_a
     process = launch(run, "--actors.inference", "device", "--learner.total-updates", "1000000")
     wait_until(lambda: num_updates(run) >= 20, "20 updates")
     children = descendants(process)
-    actors = [child for child in children if "actors.worker" in child.cmdline()]
+    actors = [child for child in children if "actors.worker" in arguments(child)]
     assert len(actors) == 2
     assert not [
         line for actor in actors for line in Path(f"/proc/{actor.pid}/maps").read_text().split() if "jax" in line
