@@ -4,7 +4,7 @@ Labels say which pixels are walls, floors or things, so each can be changed by i
 surroundings that they were never seen in. On the host, by numpy and OpenCV.
 
 Source: Tobin et al. 2017 (domain randomization: looks at random, so that the real one is one more); Ghiasi et al. 2021
-(copy-paste of things between frames); Lee et al. 2020 (random convolution).
+(copy-paste of things between frames).
 """
 
 import cv2
@@ -13,10 +13,11 @@ import numpy as np
 from gvz.core.env_config import LABEL_CLASSES
 
 Frame = np.ndarray
-"""f32[H W 3], 0..255 or beside it until the last step"""
+"""f32[H W 3], 0..255 or beside it until its light is changed"""
 
 _THINGS = ("enemy", "projectile", "kit", "poison", "other", "key")
-_PARTS = (("wall",), ("plane",), _THINGS, ("scenery", "effect"))
+_DECORATIONS = ("scenery", "effect")
+_PARTS = (("wall",), ("plane",), _THINGS, _DECORATIONS)
 """what has colours of its own"""
 
 
@@ -40,18 +41,20 @@ def changed_view(
         (u8[H W 3], u8[H W]).
     """
     view = frame.astype(np.float32)
-    if rng.random() < 0.4:
-        things = _is(labels, _THINGS)
+    if rng.random() < 0.5:
+        things, surroundings = _is(labels, _THINGS), other_frame.astype(np.float32)
+        decorations = _is(labels, _DECORATIONS)
         if rng.random() < 0.7:
             view = _other_colours(rng, view, 0.5)
-        view = np.where(things[..., None], view, other_frame.astype(np.float32))
-        labels = np.where(things, labels, other_labels)
+        before = cv2.copyTo(view, decorations, surroundings.copy())
+        if rng.random() < 0.5:
+            view = _other_style(rng, view, before)
+        view = cv2.copyTo(view, things, before)
+        labels = cv2.copyTo(labels, things | decorations, other_labels.copy())
     if rng.random() < 0.5:
         view = _other_parts(rng, view, labels)
-    view = _other_light(rng, view)
-    if rng.random() < 0.7:
-        view, labels = _other_place(rng, view, labels)
-    return view.astype(np.uint8), labels
+    changed = _other_light(rng, view)
+    return _other_place(rng, changed, labels) if rng.random() < 0.7 else (changed, labels)
 
 
 def mirrored(rng: np.random.Generator, frame: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -60,29 +63,42 @@ def mirrored(rng: np.random.Generator, frame: np.ndarray, labels: np.ndarray) ->
 
 
 def _is(labels: np.ndarray, classes: tuple[str, ...]) -> np.ndarray:
-    chosen = np.zeros(256, bool)
-    chosen[[LABEL_CLASSES.index(name) for name in classes]] = True
+    """u8[H W], 1 where the label is one of the classes."""
+    chosen = np.zeros(256, np.uint8)
+    chosen[[LABEL_CLASSES.index(name) for name in classes]] = 1
     return chosen[labels]
 
 
 def _other_colours(rng: np.random.Generator, view: Frame, strength: float) -> Frame:
     """Contrast about 110, tint and brightness, each drawn around no change."""
     contrast = np.exp(rng.normal(0, 0.35 * strength))
-    tint = np.exp(rng.normal(0, 0.25 * strength, 3)).astype(np.float32)
-    return (view - 110) * (contrast * tint).astype(np.float32) + np.float32(110 + rng.normal(0, 25 * strength))
+    slopes = contrast * np.exp(rng.normal(0, 0.25 * strength, 3))
+    offsets = 110 * (1 - slopes) + rng.normal(0, 25 * strength)
+    return cv2.transform(view, np.column_stack([np.diag(slopes), offsets]))
+
+
+def _other_style(rng: np.random.Generator, things: Frame, surroundings: Frame) -> Frame:
+    """Things through which one sees their surroundings, as the engine's render styles draw them."""
+    kind = rng.integers(4)
+    if kind == 0:  # Shadow
+        return surroundings * np.float32(rng.uniform(0.3, 0.85))
+    if kind == 1:  # Translucent
+        return surroundings + np.float32(rng.uniform(0.3, 0.8)) * (things - surroundings)
+    if kind == 2:  # Fuzzy
+        return surroundings * rng.uniform(rng.uniform(0, 0.6), 1, (*surroundings.shape[:2], 1)).astype(np.float32)
+    return np.full_like(things, rng.uniform(0, 255, 3))  # Stencil
 
 
 def _other_parts(rng: np.random.Generator, view: Frame, labels: np.ndarray) -> Frame:
     """Walls, floors, things and scenery each get other colours or, walls and floors, another texture."""
     for part in _PARTS:
         if rng.random() < 0.5:
-            here = _is(labels, part)[..., None]
             if part in (("wall",), ("plane",)) and rng.random() < 0.35:
                 share = np.float32(rng.uniform(0.3, 1.0))
                 changed = (1 - share) * view + share * _texture(rng, *labels.shape)
             else:
                 changed = _other_colours(rng, view, 1.0)
-            view = np.where(here, changed, view)
+            view = cv2.copyTo(changed, _is(labels, part), view.copy())
     return view
 
 
@@ -105,36 +121,30 @@ def _texture(rng: np.random.Generator, height: int, width: int) -> Frame:
     return (pattern * contrast + colour).astype(np.float32)
 
 
-def _other_light(rng: np.random.Generator, view: Frame) -> Frame:
-    """The whole frame: colours, their order, inversion, a random filter, gamma. The result is within 0..255."""
-    if rng.random() < 0.7:
-        view = _other_colours(rng, view, 0.6)
-    kind = rng.random()
-    if kind < 0.15:
-        view = np.repeat(view.mean(axis=-1, keepdims=True), 3, axis=-1)
-    elif kind < 0.25:
-        view = view[..., rng.permutation(3)]
-    elif kind < 0.32:
-        view = 255 - view
-    if rng.random() < 0.15:
-        kernel = (rng.normal(0, 1, (3, 3)) / 3).astype(np.float32)
-        kernel[1, 1] += 1
-        view = cv2.filter2D(np.ascontiguousarray(view), -1, kernel)
-    view = np.clip(view, 0, 255)
+def _other_light(rng: np.random.Generator, view: Frame) -> np.ndarray:
+    """The whole frame: colours, grey, gamma; u8[H W 3]."""
+    if rng.random() < 0.6:
+        view = _other_colours(rng, view, 0.5)
+    if rng.random() < 0.05:
+        view = cv2.transform(view, np.full((3, 3), 1 / 3))
+    changed = np.clip(view, 0, 255).astype(np.uint8)
     if rng.random() < 0.4:
-        view = 255 * (view / 255) ** np.float32(np.exp(rng.normal(0, 0.4)))
-    return view
+        levels = 255 * (np.arange(256) / 255) ** np.exp(rng.normal(0, 0.4))
+        changed = cv2.LUT(changed, np.rint(levels).astype(np.uint8))
+    return changed
 
 
-def _other_place(rng: np.random.Generator, view: Frame, labels: np.ndarray) -> tuple[Frame, np.ndarray]:
-    """Larger or smaller by up to 1.4, and moved by up to 10 pixels; edges are mirrored."""
+def _other_place(rng: np.random.Generator, view: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Larger or smaller by up to 1.4, wider or narrower by 1.2, moved by up to 10 pixels; edges are mirrored."""
     height, width = labels.shape
-    scale = np.exp(rng.uniform(-0.35, 0.35))
+    scale_y = np.exp(rng.uniform(-0.35, 0.35))
+    scale_x = scale_y * np.exp(rng.uniform(-0.2, 0.2))
     x, y = rng.uniform(-10, 10, 2)
-    move = np.array([[scale, 0, (width - 1) / 2 * (1 - scale) + x], [0, scale, (height - 1) / 2 * (1 - scale) + y]])
+    move = np.array(
+        [[scale_x, 0, (width - 1) / 2 * (1 - scale_x) + x], [0, scale_y, (height - 1) / 2 * (1 - scale_y) + y]]
+    )
 
     def moved(picture: np.ndarray, how: int) -> np.ndarray:
-        picture = np.ascontiguousarray(picture)
         return cv2.warpAffine(picture, move, (width, height), flags=how, borderMode=cv2.BORDER_REFLECT)
 
     return moved(view, cv2.INTER_LINEAR), moved(labels, cv2.INTER_NEAREST)

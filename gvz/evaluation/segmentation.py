@@ -16,8 +16,8 @@ from learner.segmentation_views import changed_view, mirrored
 Labelled = tuple[np.ndarray, np.ndarray]
 """frames u8[N INPUT_HEIGHT INPUT_WIDTH 3] and their labels u8[N INPUT_HEIGHT INPUT_WIDTH], numbers of LABEL_CLASSES"""
 
-CLASS_WEIGHTS = np.where(np.isin(LABEL_CLASSES, SIGHT_CLASSES), 8.0, 1.0).astype(np.float32)
-"""f32[C] of pixels in the loss: what an agent acts on covers few of them"""
+CLASS_WEIGHTS = np.where(np.isin(LABEL_CLASSES, ("wall", "plane", "weapon")), 1.0, 8.0).astype(np.float32)
+"""f32[C] of pixels in the loss: things cover few of them, and all weigh the same, so that none is taken for another"""
 _BASE_SEED = 7
 """of the episodes; evaluations have 0"""
 _DECISIONS_APART = 5
@@ -35,11 +35,11 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
     Raises:
         EngineError: the engine does not start, or dies.
     """
-    frames, labels = [], []
+    frames, labels, episode = [], [], 0
     config = EnvConfig(frame_height=INPUT_HEIGHT, frame_width=INPUT_WIDTH, buffers=("labels",))
     env = DoomEnv(task, config)
     try:
-        for episode in range(10**9):
+        while len(frames) < num_frames:
             seed = episode_seed(task.id, episode, _BASE_SEED)
             observation, info = env.reset(options={"episode_seed": seed})
             player: Player = RandomPlayer() if episode % 2 else ScriptedPlayer()
@@ -49,15 +49,14 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
                 if decision % _DECISIONS_APART == 0:
                     frames.append(observation["screen"])
                     labels.append(observation["labels"][:, :, 0])
-                    if len(frames) == num_frames:
-                        return np.stack(frames), np.stack(labels)
                 observation, _, terminated, truncated, info = env.step(player.act())
                 player.observe(observation, info)
-                if terminated or truncated:
+                if terminated or truncated or len(frames) == num_frames:
                     break
+            episode += 1
     finally:
         env.close()
-    raise AssertionError
+    return np.stack(frames), np.stack(labels)
 
 
 def training_batches(tasks: Sequence[Labelled], batch_size: int, seed: int) -> Iterator[Labelled]:
