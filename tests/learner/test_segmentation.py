@@ -114,6 +114,53 @@ def test_a_view_that_is_moved_takes_its_labels_along():
     assert moved == 30
 
 
+def test_decorations_go_along_with_the_things():
+    frame, labels = parted()
+    labels[:24, :20] = LABEL_CLASSES.index("scenery")
+    other, other_labels = np.zeros_like(frame), np.full_like(labels, LABEL_CLASSES.index("plane"))
+    for seed in range(60):
+        _, found = views.changed_view(np.random.default_rng(seed), frame, labels, other, other_labels)
+        assert LABEL_CLASSES.index("scenery") in found
+
+
+def test_render_styles_let_the_surroundings_show_through():
+    """Shadow darkens what is behind evenly, Translucent mixes, Fuzzy darkens pixel by pixel, Stencil has one colour."""
+    rng = np.random.default_rng(0)
+    things, behind = (rng.uniform(50, 250, (24, 30, 3)).astype(np.float32) for _ in range(2))
+    seen = set()
+    for seed in range(40):
+        view = views._other_style(np.random.default_rng(seed), things, behind)
+        share, shade = (view - behind) / (things - behind), view / behind
+        if np.ptp(view, axis=(0, 1)).max() == 0:
+            seen.add("Stencil")
+        elif np.ptp(shade) < 1e-3:
+            seen.add("Shadow")
+            assert 0.3 <= shade.mean() <= 0.85
+        elif np.ptp(np.median(share, axis=(0, 1))) < 1e-3 and 0.3 <= np.median(share) <= 0.8:
+            seen.add("Translucent")
+            np.testing.assert_allclose(view, behind + np.median(share) * (things - behind), atol=0.01)
+        else:
+            seen.add("Fuzzy")
+            assert np.ptp(shade, axis=-1).max() < 1e-3, "a pixel keeps its colour"
+            assert shade.min() >= 0
+            assert shade.max() <= 1
+    assert seen == {"Shadow", "Translucent", "Fuzzy", "Stencil"}
+
+
+def test_other_colours_are_a_contrast_a_tint_and_a_brightness():
+    """Each channel is a line of its own values: at the mean contrast's fixed point of 110 only brightness moves it."""
+    frame = parted()[0].astype(np.float32)
+    for seed in range(10):
+        view = views._other_colours(np.random.default_rng(seed), frame, 1.0)
+        at_110 = []
+        for channel in range(3):
+            slope, offset = np.polyfit(frame[..., channel].ravel(), view[..., channel].ravel(), 1)
+            np.testing.assert_allclose(view[..., channel], slope * frame[..., channel] + offset, atol=1e-2)
+            assert slope > 0
+            at_110.append(slope * 110 + offset)
+        np.testing.assert_allclose(at_110, at_110[0], atol=1e-2)
+
+
 def test_parts_are_changed_each_by_itself():
     frame, labels = parted()
     changed = []
