@@ -42,15 +42,14 @@ def changed_view(
     """
     view = frame.astype(np.float32)
     if rng.random() < 0.5:
-        things, surroundings = _is(labels, _THINGS), other_frame.astype(np.float32)
-        decorations = _is(labels, _DECORATIONS)
+        surroundings = other_frame.astype(np.float32)
         if rng.random() < 0.7:
             view = _other_colours(rng, view, 0.5)
-        before = cv2.copyTo(view, decorations, surroundings.copy())
+        before = cv2.copyTo(view, _is(labels, _DECORATIONS), surroundings)
         if rng.random() < 0.5:
             view = _other_style(rng, view, before)
-        view = cv2.copyTo(view, things, before)
-        labels = cv2.copyTo(labels, things | decorations, other_labels.copy())
+        view = cv2.copyTo(view, _is(labels, _THINGS), before)
+        labels = cv2.copyTo(labels, _is(labels, _THINGS + _DECORATIONS), other_labels.copy())
     if rng.random() < 0.5:
         view = _other_parts(rng, view, labels)
     changed = _other_light(rng, view)

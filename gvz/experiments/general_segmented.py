@@ -15,6 +15,6 @@ EXPERIMENT = dataclasses.replace(
     published={},
     notes=(
         "The networks come with GViZDoom. Each learned from the engine's labels, on the eight training tasks of its "
-        "scenario, for 600 seconds of processor time, which come to the time of these runs. Agents need no labels.",
+        "scenario, for 720 seconds of processor time, which come to the time of these runs. Agents need no labels.",
     ),
 )

@@ -1,0 +1,14 @@
+"""A gate: do agents keep what they have learned if the replay keeps all that they played?"""
+
+from gvz.experiments.gate import Gate
+
+EXPERIMENT = Gate(
+    name="gate_replay",
+    title="Gate: a replay of a part of the run, or of all of it",
+    question="Agents get worse in Defend the Center once their replay is full. Do they with one that does not fill up?",
+    configs=("rainbow_segmented",),
+    variants={"replay_100k": {"replay.capacity": 100_000}, "replay_400k": {"replay.capacity": 400_000}},
+    scenarios=("defend_the_center", "seek_and_kill"),
+    trainings=("train8",),
+    max_processor_s=900.0,
+)
