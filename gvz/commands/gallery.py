@@ -15,7 +15,7 @@ class Gallery:
     out: Path = Path("gallery")
     """directory for <kind>_<scenario>.png"""
     scenario: str | None = None
-    """only this one"""
+    """only this one; default: all, with segmented those that a network comes for"""
     kind: Literal["gallery", "varied", "procedural", "severity", "augmented", "segmented"] = "gallery"
     """gallery: the named tasks; varied, procedural: the first maps of such a task; severity: each attribute alone at
     four severities; augmented: the default task under each augmentation that a learner can train with; segmented: the
@@ -31,7 +31,10 @@ class Gallery:
         except OSError as error:
             raise ConfigError(f"--out: {self.out} cannot be made: {error.strerror}") from error
         from gvz.evaluation.gallery import write_contact_sheet, write_moving_picture
+        from gvz.segmentation import segmenter_names
 
+        if self.scenario is None and self.kind == "segmented":
+            chosen = [scenario for scenario in chosen if scenario.id in segmenter_names()]
         for scenario in chosen:
             print(write_contact_sheet(scenario, self.out, self.kind))
         if self.moving:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gvz.commands import gallery
 from gvz.core.env_config import EnvConfig
 from gvz.evaluation.episode_log import simple_player
 from gvz.evaluation.gallery import (
@@ -168,6 +169,15 @@ def test_the_segmented_sheets_in_the_docs_show_the_default_and_the_gate_tasks(sc
         rows = -(-2 * (1 + len(named_tasks(scenario, split="gate"))) // COLUMNS)
         assert sheet.height % rows == 0
         assert sheet.height // rows > FRAME_HEIGHT
+
+
+def test_segmented_sheets_are_drawn_of_the_scenarios_that_a_network_comes_for(tmp_path, monkeypatch, capsys):
+    drawn = []
+    monkeypatch.setattr(
+        "gvz.evaluation.gallery.write_contact_sheet", lambda scenario, out, kind: drawn.append((scenario.id, kind))
+    )
+    assert gallery.COMMAND(out=tmp_path, kind="segmented").run() == 0
+    assert drawn == [(name, "segmented") for name in scenarios()]
 
 
 def test_the_sheet_of_severities_in_the_docs_shows_every_attribute():
