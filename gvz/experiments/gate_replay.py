@@ -8,7 +8,7 @@ EXPERIMENT = Gate(
     question="Agents get worse in Defend the Center once their replay is full. Do they with one that does not fill up?",
     configs=("rainbow_segmented",),
     variants={"replay_100k": {"replay.capacity": 100_000}, "replay_400k": {"replay.capacity": 400_000}},
-    scenarios=("defend_the_center", "seek_and_kill"),
+    scenarios=("defend_the_center",),
     trainings=("train8",),
     max_processor_s=900.0,
 )
