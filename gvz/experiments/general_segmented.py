@@ -15,6 +15,7 @@ EXPERIMENT = dataclasses.replace(
     published={},
     notes=(
         "The networks come with GViZDoom. Each learned from the engine's labels, on the eight training tasks of its "
-        "scenario, for 720 seconds of processor time, which come to the time of these runs. Agents need no labels.",
+        "scenario, for 600 or 720 seconds of processor time, which come to the time of these runs. Agents need no "
+        "labels.",
     ),
 )
