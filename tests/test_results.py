@@ -227,6 +227,28 @@ def test_the_findings_say_what_the_gates_records_give():
     assert all(gain in page for gain in pooled.values())
 
 
+def test_the_findings_say_how_training_went_on_in_the_gate_of_the_replay():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    falls, means = [], []
+    for size in ("100k", "400k"):
+        runs = (ROOT / "results" / "gates" / "runs" / f"rainbow_segmented+replay_{size}").glob("**/episodes.jsonl.gz")
+        found = []
+        for file in runs:
+            rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+            last = max(row["num_updates"] for row in rows) - 2_000
+            early = [row["normalized_score"] for row in rows if 6_000 <= row["num_updates"] < 8_000]
+            late = [row["normalized_score"] for row in rows if row["num_updates"] >= last]
+            found.append((np.mean(early), np.mean(late)))
+        assert len(found) == 2
+        falls += [early - late for early, late in found]
+        means += [f"{value:.0f}" for value in np.mean(found, axis=0)]
+    early, late, early_of_large, late_of_large = means
+    assert f"had {early} points with a replay of 100,000" in page
+    assert f"those of the last 2,000 steps had {late}." in page
+    assert f"they had {early_of_large} and {late_of_large} (means over both seeds)" in page
+    assert f"by {min(falls):.0f} to {max(falls):.0f} points a run" in page
+
+
 def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     summary = page.partition("## In short")[2].partition("\n## ")[0]

@@ -15,7 +15,7 @@ class Gallery:
     out: Path = Path("gallery")
     """directory for <kind>_<scenario>.png"""
     scenario: str | None = None
-    """only this one; default: all, with segmented those that a network comes for"""
+    """only this one; default: all, or with segmented all that have a network"""
     kind: Literal["gallery", "varied", "procedural", "severity", "augmented", "segmented"] = "gallery"
     """gallery: the named tasks; varied, procedural: the first maps of such a task; severity: each attribute alone at
     four severities; augmented: the default task under each augmentation that a learner can train with; segmented: the

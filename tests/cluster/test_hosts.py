@@ -29,6 +29,7 @@ from gvz.core import janitor
 from gvz.core.errors import ConfigError, ResumeError, WorkerError
 from gvz.transport.messages import EpisodeStats, Fault, ParamsHeader, Ready
 from tests.cluster.conftest import FAKE_GAMES, RayCluster
+from tests.processes import arguments
 
 pytestmark = [pytest.mark.e2e, pytest.mark.xdist_group("ray")]
 DEADLINE_S = 200.0
@@ -118,12 +119,12 @@ def play(backend_of, tmp_path: Path, nodes: RayCluster):
 
 def processes() -> list[psutil.Process]:
     """Of hosts and actors of this module's cluster, on all its nodes."""
-    return [p for p in _ours() if "RemoteHost" in "".join(_words(p)) or "actors.worker" in _words(p)]
+    return [p for p in _ours() if "RemoteHost" in "".join(arguments(p)) or "actors.worker" in arguments(p)]
 
 
 def host_processes() -> list[psutil.Process]:
     """Of hosts, oldest first."""
-    return sorted((p for p in _ours() if "RemoteHost" in "".join(_words(p))), key=lambda p: p.create_time())
+    return sorted((p for p in _ours() if "RemoteHost" in "".join(arguments(p))), key=lambda p: p.create_time())
 
 
 def _ours() -> list[psutil.Process]:
@@ -134,13 +135,6 @@ def _ours() -> list[psutil.Process]:
             if process.pid in mine and process.status() != psutil.STATUS_ZOMBIE:
                 found.append(process)
     return found
-
-
-def _words(process: psutil.Process) -> list[str]:
-    try:
-        return process.cmdline()
-    except psutil.Error:  # it has just ended
-        return []
 
 
 # --------------------------------------------------------------------------------------------- play
@@ -232,7 +226,7 @@ def test_a_host_that_dies_or_is_silent_is_replaced(play, fault: str, monkeypatch
 def _host_of(process: psutil.Process) -> int:
     """The host's index: its actors' logs are named by their numbers."""
     for child in process.children(recursive=True):
-        if "actors.worker" in _words(child):
+        if "actors.worker" in arguments(child):
             with contextlib.suppress(psutil.Error, OSError):
                 log = Path(f"/proc/{child.pid}/fd/1").readlink().stem
                 return int(log.removeprefix("actor_")) // 2
@@ -242,7 +236,7 @@ def _host_of(process: psutil.Process) -> int:
 def test_an_actor_that_dies_is_its_hosts_matter(play):
     played = play({"length": 20})
     played.until_all_ready()
-    victims = [p for p in processes() if "actors.worker" in _words(p)]
+    victims = [p for p in processes() if "actors.worker" in arguments(p)]
     victims[0].kill()
     told = played.until_fault("died")
     assert "was ended by SIGKILL; restart 1 of 20" in told.message

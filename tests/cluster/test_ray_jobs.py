@@ -20,6 +20,7 @@ from gvz.core import records
 from gvz.core.errors import ConfigError, GvzError
 from gvz.experiments import inventory
 from gvz.experiments.plan import read_plan
+from tests.processes import arguments
 
 pytestmark = pytest.mark.xdist_group("ray")
 RUN = "rainbow_4task/defend_the_center/train4/seed_1111"
@@ -146,7 +147,7 @@ def test_a_run_whose_node_loses_its_power_goes_on_elsewhere_from_its_checkpoint(
     log, directory = inventory.log_file(results, RUN), results / "runs" / RUN
     try:
         wait_until((directory / "checkpoints" / "100").exists, driver)
-        at_work = [p for p in psutil.process_iter() if str(directory) in cmdline(p) and "gvz.launch" in cmdline(p)]
+        at_work = [p for p in psutil.process_iter() if str(directory) in arguments(p) and "gvz.launch" in arguments(p)]
         cluster.kill_node_of(at_work[0])
         cluster.tell("add")
         wait_until(lambda: "goes on from update 100" in log.read_text(), driver)
@@ -174,13 +175,6 @@ def test_a_cluster_that_a_job_does_not_fit_on_is_refused(cluster, tmp_path):
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "no node has 2 cores and 0 GPUs for a job; lower --job-cores" in done.stderr
     assert not (tmp_path / "results" / "plan.json").exists()
-
-
-def cmdline(process: psutil.Process) -> list[str]:
-    try:
-        return process.cmdline()
-    except psutil.Error:
-        return []
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ import orbax.checkpoint as ocp
 import psutil
 
 from gvz.core import janitor, records
+from tests.processes import arguments
 
 SMALL = (
     "--actors.num-actors 2 --actors.games-per-actor 2 --env.frame-height 36 "
@@ -89,13 +90,6 @@ def descendants(process: subprocess.Popen[str]) -> list[psutil.Process]:
 def engines(process: psutil.Process | subprocess.Popen[str]) -> list[psutil.Process]:
     """The engines of an actor or of a whole run, those too that are still starting."""
     return [p for p in psutil.Process(process.pid).children(recursive=True) if "+viz_instance_id" in arguments(p)]
-
-
-def arguments(process: psutil.Process) -> list[str]:
-    try:
-        return process.cmdline()
-    except psutil.Error:  # it has just ended
-        return []
 
 
 def alive(processes: list[psutil.Process]) -> list[psutil.Process]:

@@ -11,10 +11,11 @@ from pathlib import Path
 
 import psutil
 import pytest
-from command import STARTED, alive, arguments
+from command import STARTED, alive
 
 from gvz.experiments import inventory as progress
 from gvz.experiments.plan import read_plan
+from tests.processes import arguments
 
 pytestmark = [
     pytest.mark.e2e,

@@ -10,10 +10,11 @@ from pathlib import Path
 import msgpack
 import numpy as np
 import pytest
-from command import alive, arguments, arrays_of, descendants, faults, finish, launch, num_updates, rows, wait_until
+from command import alive, arrays_of, descendants, faults, finish, launch, num_updates, rows, wait_until
 from scipy import stats
 
 from learner.checkpoint import checkpoint_steps, verify
+from tests.processes import arguments
 
 pytestmark = [pytest.mark.e2e, pytest.mark.engine, pytest.mark.timeout(1800), pytest.mark.usefixtures("nothing_left")]
 

@@ -171,7 +171,7 @@ def test_the_segmented_sheets_in_the_docs_show_the_default_and_the_gate_tasks(sc
         assert sheet.height // rows > FRAME_HEIGHT
 
 
-def test_segmented_sheets_are_drawn_of_the_scenarios_that_a_network_comes_for(tmp_path, monkeypatch):
+def test_segmented_sheets_are_drawn_of_the_scenarios_that_have_a_network(tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(
         "gvz.evaluation.gallery.write_contact_sheet", lambda scenario, _, kind: drawn.append((scenario.id, kind))

@@ -148,7 +148,7 @@ def test_render_styles_let_the_surroundings_show_through():
 
 
 def test_other_colours_are_a_contrast_a_tint_and_a_brightness():
-    """Each channel is a line of its own values: at the mean contrast's fixed point of 110 only brightness moves it."""
+    """Each channel is a line of its old values. Contrast and tint turn it about 110, brightness moves it."""
     frame = parted()[0].astype(np.float32)
     for seed in range(10):
         view = views._other_colours(np.random.default_rng(seed), frame, 1.0)
