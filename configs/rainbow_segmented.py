@@ -1,7 +1,8 @@
 """`rainbow_general` on frames that show what a network takes each part of the screen for (docs/BENCHMARK.md).
 
 The network (`gvz segmenter`) has learned from the engine's labels what things look like, and the agent learns play
-alone. Frames are 24x42, half as high and wide, so the convolutions are half as large with half the strides.
+alone. Frames are 24x42, half as high and wide, so the convolutions are half as large with half the strides. The agent
+also observes the game variables, and looks less far ahead, with a discount of 0.95 (docs/FINDINGS.md).
 """
 
 import dataclasses
@@ -12,5 +13,7 @@ CONFIG = dataclasses.replace(
     GENERAL,
     name="rainbow_segmented",
     env=dataclasses.replace(GENERAL.env, frames="segmented", frame_height=24, frame_width=42, grayscale=False),
-    agent=dataclasses.replace(GENERAL.agent, conv_kernels=(4, 4), conv_strides=(2, 2)),
+    agent=dataclasses.replace(
+        GENERAL.agent, conv_kernels=(4, 4), conv_strides=(2, 2), discount=0.95, game_variables=True
+    ),
 )

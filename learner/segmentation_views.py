@@ -30,6 +30,9 @@ def changed_view(
 ) -> tuple[np.ndarray, np.ndarray]:
     """A frame as it might look elsewhere, and its labels.
 
+    In three of five, all keeps its looks, and only stands elsewhere: so attributes of a task meet that are known from
+    others. In the others, looks change as well.
+
     Args:
         rng: of every choice.
         frame: u8[H W 3].
@@ -40,19 +43,20 @@ def changed_view(
     Returns:
         (u8[H W 3], u8[H W]).
     """
-    view = frame.astype(np.float32)
-    if rng.random() < 0.5:
-        surroundings = other_frame.astype(np.float32)
-        if rng.random() < 0.7:
+    view, surroundings = frame.astype(np.float32), other_frame.astype(np.float32)
+    elsewhere, other_looks = rng.random(2) < (0.7, 0.4)
+    if elsewhere:
+        if other_looks:
+            surroundings = _other_parts(rng, surroundings, other_labels)
             view = _other_colours(rng, view, 0.5)
         before = cv2.copyTo(view, _is(labels, _DECORATIONS), surroundings)
         if rng.random() < 0.5:
             view = _other_style(rng, view, before)
         view = cv2.copyTo(view, _is(labels, _THINGS), before)
         labels = cv2.copyTo(labels, _is(labels, _THINGS + _DECORATIONS), other_labels.copy())
-    if rng.random() < 0.5:
+    elif other_looks:
         view = _other_parts(rng, view, labels)
-    changed = _other_light(rng, view)
+    changed = _other_light(rng, view) if other_looks else np.clip(view, 0, 255).astype(np.uint8)
     return _other_place(rng, changed, labels) if rng.random() < 0.7 else (changed, labels)
 
 

@@ -205,13 +205,13 @@ def test_the_findings_say_what_the_first_loss_of_sight_gave():
 def test_the_findings_say_what_the_gates_records_give():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     results = read_results([ROOT / "results" / "gates"])
-    world, reward, sight, ammo, defend, colour, augmented, replay = results.asked
+    world, reward, sight, ammo, defend, colour, augmented, replay, horizon = results.asked
     for trained, title in ((False, "gate tasks"), (True, "training tasks")):
         for scenario, _, *cells in result_table(results, world, trained=trained).rows[:-1]:
             assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
         for scenario, _, *cells in result_table(results, sight, trained=trained).rows[:-1]:
             assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
-        for gate in (reward, ammo, defend, colour, replay):
+        for gate in (reward, ammo, defend, colour, replay, horizon):
             _, _, *cells = result_table(results, gate, trained=trained).rows[0]
             assert f"| {title} | {' | '.join(cell.text for cell in cells)} |" in page
         _, _, *cells = result_table(results, augmented, trained=trained).rows[1]
@@ -227,11 +227,12 @@ def test_the_findings_say_what_the_gates_records_give():
     assert all(gain in page for gain in pooled.values())
 
 
-def test_the_findings_say_how_training_went_on_in_the_gate_of_the_replay():
+def test_the_findings_say_how_training_went_on_in_the_gates_of_the_replay_and_the_horizon():
     page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
-    falls, means = [], []
-    for size in ("100k", "400k"):
-        runs = (ROOT / "results" / "gates" / "runs" / f"rainbow_segmented+replay_{size}").glob("**/episodes.jsonl.gz")
+
+    def scores_of_training(variant: str) -> np.ndarray:
+        """Of each run: the mean score of episodes at 6,000 to 8,000 gradient steps, and in the last 2,000."""
+        runs = (ROOT / "results" / "gates" / "runs" / f"rainbow_segmented+{variant}").glob("**/episodes.jsonl.gz")
         found = []
         for file in runs:
             rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
@@ -239,14 +240,23 @@ def test_the_findings_say_how_training_went_on_in_the_gate_of_the_replay():
             early = [row["normalized_score"] for row in rows if 6_000 <= row["num_updates"] < 8_000]
             late = [row["normalized_score"] for row in rows if row["num_updates"] >= last]
             found.append((np.mean(early), np.mean(late)))
-        assert len(found) == 2
-        falls += [early - late for early, late in found]
-        means += [f"{value:.0f}" for value in np.mean(found, axis=0)]
-    early, late, early_of_large, late_of_large = means
-    assert f"had {early} points with a replay of 100,000" in page
-    assert f"those of the last 2,000 steps had {late}." in page
-    assert f"they had {early_of_large} and {late_of_large} (means over both seeds)" in page
+        return np.array(found)
+
+    small, large = scores_of_training("replay_100k"), scores_of_training("replay_400k")
+    assert len(small) == len(large) == 2
+    (early, late), (early_of_large, late_of_large) = small.mean(axis=0), large.mean(axis=0)
+    falls = [*(small[:, 0] - small[:, 1]), *(large[:, 0] - large[:, 1])]
+    assert f"had {early:.0f} points with a replay of 100,000" in page
+    assert f"those of the last 2,000 steps had {late:.0f}." in page
+    assert f"they had {early_of_large:.0f} and {late_of_large:.0f} (means over both seeds)" in page
     assert f"by {min(falls):.0f} to {max(falls):.0f} points a run" in page
+    assert f"had {early:.0f} points at 6,000 to 8,000 gradient steps and {late:.0f} in the last 2,000" in page
+    means = [scores_of_training(variant).mean(axis=0) for variant in ("discount_95", "game_variables", "both")]
+    words = (
+        f"{early:.0f} and {late:.0f} ({name})"
+        for (early, late), name in zip(means, ("discount", "game variables", "both"), strict=True)
+    )
+    assert f"Now they have {', '.join(words)}" in page
 
 
 def test_the_summary_of_the_findings_has_the_gains_of_the_gates():

@@ -2,12 +2,18 @@
 
 from gvz.experiments.gate import Gate
 
+FAR = {"agent.discount": 0.99, "agent.game_variables": False}
+"""what `rainbow_segmented` had until `gate_horizon`"""
+
 EXPERIMENT = Gate(
     name="gate_replay",
     title="Gate: a replay of a part of the run, or of all of it",
     question="Agents get worse in Defend the Center once their replay is full. Do they with one that does not fill up?",
     configs=("rainbow_segmented",),
-    variants={"replay_100k": {"replay.capacity": 100_000}, "replay_400k": {"replay.capacity": 400_000}},
+    variants={
+        "replay_100k": {"replay.capacity": 100_000, **FAR},
+        "replay_400k": {"replay.capacity": 400_000, **FAR},
+    },
     scenarios=("defend_the_center",),
     trainings=("train8",),
     max_processor_s=900.0,

@@ -101,6 +101,19 @@ def test_a_changed_view_has_the_things_of_one_frame_and_the_surroundings_of_eith
     assert not any("scenery" in names and len(names) > 1 for names in seen)
 
 
+def test_things_stand_before_other_surroundings_that_keep_their_looks_in_every_fifth_view():
+    frame, labels = parted()
+    frame[labels == LABEL_CLASSES.index("enemy")] = (200, 10, 10)
+    other, other_labels = np.full_like(frame, 90), np.full_like(labels, LABEL_CLASSES.index("wall"))
+    alike = 0
+    for seed in range(400):
+        view, found = views.changed_view(np.random.default_rng(seed), frame, labels, other, other_labels)
+        inner = cv2.erode(np.uint8(found == LABEL_CLASSES.index("wall")), np.ones((5, 5)), borderValue=0) > 0
+        enemy = cv2.erode(np.uint8(found == LABEL_CLASSES.index("enemy")), np.ones((5, 5)), borderValue=0) > 0
+        alike += bool((view[inner] == 90).all() and enemy.any() and (view[enemy] == (200, 10, 10)).all())
+    assert 60 <= alike <= 110, "400 * 0.7 * 0.6 * 0.5: elsewhere, no other looks, no render style"
+
+
 def test_a_view_that_is_moved_takes_its_labels_along():
     """The picture shows the labels themselves, so that they can be compared after the move."""
     _, labels = parted()
