@@ -2,7 +2,7 @@
 
 The network (`gvz segmenter`) has learned from the engine's labels what things look like, and the agent learns play
 alone. Frames are 24x42, half as high and wide, so the convolutions are half as large with half the strides. The agent
-also observes the game variables, and looks less far ahead, with a discount of 0.95 (docs/FINDINGS.md).
+also observes the scenario's game variables, and looks less far ahead, with a discount of 0.95 (docs/FINDINGS.md).
 """
 
 import dataclasses

@@ -30,8 +30,8 @@ def changed_view(
 ) -> tuple[np.ndarray, np.ndarray]:
     """A frame as it might look elsewhere, and its labels.
 
-    In three of five, all keeps its looks, and only stands elsewhere: so attributes of a task meet that are known from
-    others. In the others, looks change as well.
+    Three of five keep colours, textures and light, and most of these have other surroundings: so looks meet that are
+    known from different tasks. In the others, looks change as well.
 
     Args:
         rng: of every choice.

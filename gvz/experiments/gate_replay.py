@@ -2,8 +2,8 @@
 
 from gvz.experiments.gate import Gate
 
-FAR = {"agent.discount": 0.99, "agent.game_variables": False}
-"""what `rainbow_segmented` had until `gate_horizon`"""
+_BEFORE = {"agent.discount": 0.99, "agent.game_variables": False}
+"""of `rainbow_segmented` until `gate_horizon`"""
 
 EXPERIMENT = Gate(
     name="gate_replay",
@@ -11,8 +11,8 @@ EXPERIMENT = Gate(
     question="Agents get worse in Defend the Center once their replay is full. Do they with one that does not fill up?",
     configs=("rainbow_segmented",),
     variants={
-        "replay_100k": {"replay.capacity": 100_000, **FAR},
-        "replay_400k": {"replay.capacity": 400_000, **FAR},
+        "replay_100k": {"replay.capacity": 100_000, **_BEFORE},
+        "replay_400k": {"replay.capacity": 400_000, **_BEFORE},
     },
     scenarios=("defend_the_center",),
     trainings=("train8",),
