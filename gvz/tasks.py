@@ -9,7 +9,7 @@ from typing import Literal, get_args
 from gvz.core.errors import TaskError, nearest
 from gvz.core.registry import discover
 from gvz.scenarios.base import MAX_LEVEL, Scenario, Suite, Task
-from gvz.scenarios.map_set import names_map_set, parse_map_set
+from gvz.scenarios.map_set import VARIED, names_map_set, parse_map_set
 
 LEVELS = range(MAX_LEVEL + 1)
 """levels of tasks, the easiest first"""
@@ -54,8 +54,8 @@ def parse_task(text: str) -> Task:
     Args:
         text: `<scenario>/default`, `<scenario>/complete` or `<scenario>/<attribute>+<attribute>...`, attributes
             in any order, each perhaps with a severity from 0 to 1, such as `fast_enemies=0.5` (also `complete=0.5`);
-            or a set of drawn maps (gvz.scenarios.map_set), such as `<scenario>/varied-10` or
-            `<scenario>/procedural-train-100+layout=0.5`.
+            or a set of drawn maps (gvz.scenarios.map_set), such as `<scenario>/varied-10`, which may have attributes,
+            too (`<scenario>/varied+fast_enemies`), or `<scenario>/procedural-train-100+layout=0.5`.
 
     Raises:
         TaskError: another form, an unknown name, or two attributes of one group; the message says what is possible.
@@ -68,18 +68,20 @@ def parse_task(text: str) -> Task:
         )
     scenario = scenario_named(scenario_id)
     whole_sets: dict[str, tuple[str, ...]] = {"default": (), "complete": scenario.complete}
+    maps, words = None, name.split("+")
     if names_map_set(name):
-        return Task(scenario, maps=parse_map_set(name))
-    graded = [_severity(scenario, word) for word in name.split("+")]
+        maps = parse_map_set(words[0] if name.startswith(VARIED) else name)
+        words = words[1:] if maps.split == VARIED else []
+    graded = [_severity(scenario, word) for word in words]
     names = tuple(one for one, _ in graded)
     for whole in (*whole_sets, *filter(names_map_set, names)):
-        if whole in names and len(names) > 1:
+        if whole in names and len(words) + (maps is not None) > 1:
             raise TaskError(f"task: got {text!r}, but {whole!r} is a task and no attribute; want {scenario.choices()}")
     if name.startswith("default="):
         raise TaskError(f"task: got {text!r}, but 'default' has no attribute to grade; want {scenario.choices()}")
     if len(graded) == 1 and (whole := whole_sets.get(name.partition("=")[0])) is not None:
         graded = [(one, graded[0][1]) for one in whole]
-    return Task(scenario, tuple(one for one, _ in graded), severities=tuple(graded))
+    return Task(scenario, tuple(one for one, _ in graded), maps, severities=tuple(graded))
 
 
 def _severity(scenario: Scenario, word: str) -> tuple[str, float]:

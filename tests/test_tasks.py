@@ -174,10 +174,22 @@ def test_a_scenario_that_does_not_say_what_may_differ_has_no_varied_task():
     with pytest.raises(TaskError, match="defend_the_center: got varied, but the scenario has no variety"):
         Task(plain, maps=MapSet("varied"))
     assert "varied" not in plain.choices()
-    with pytest.raises(TaskError, match="got varied and gore, want one of them"):
-        Task(centre, ("gore",), MapSet("varied"))
+    with pytest.raises(TaskError, match="got procedural-train and gore, want one of them; 'varied' takes attributes"):
+        Task(centre, ("gore",), MapSet("train"))
     with pytest.raises(TaskError, match="varied--1: want 1 to 1000 maps"):
         MapSet("varied", -1)
+
+
+def test_a_varied_task_may_have_attributes_but_none_of_textures():
+    task = parse_task("defend_the_center/varied-10+resized+gore")
+    assert task.maps == MapSet("varied", 10)
+    assert (task.attributes, task.level) == (("gore", "resized_enemies"), 2)
+    assert task.id == "defend_the_center/varied-10+gore+resized_enemies"
+    assert parse_task(task.id) == task == pickle.loads(pickle.dumps(task))
+    graded = parse_task("defend_the_center/varied+gore=0.5")
+    assert (graded.id, graded.severity("gore")) == ("defend_the_center/varied+gore=0.5", 0.5)
+    shadows = parse_task("seek_and_kill/varied+shadows+obstacles+resized+mixed")
+    assert shadows.name == "varied+mixed_enemies+obstacles+resized_enemies+shadows"
 
 
 def test_a_procedural_task_has_a_split_a_number_of_maps_and_strengths():
@@ -279,7 +291,11 @@ def test_the_main_job_trains_on_default_gore_stone_wall_and_fast_enemies():
             "defend_the_center/varid",
             r"unknown attribute 'varid' \(did you mean 'varied'\?\).* varied-<number of maps>, procedural-<split>",
         ),
-        ("defend_the_center/varied+gore", "'varied' takes no attribute and no strength; 'procedural' does"),
+        ("defend_the_center/varied+stone_wall", "got varied and stone_wall, but textures are drawn"),
+        ("defend_the_center/varied+layout=0.5", "unknown attribute 'layout'"),
+        ("defend_the_center/varied+complete", "'complete' is a task and no attribute"),
+        ("defend_the_center/varied+varied", "'varied' is a task and no attribute"),
+        ("defend_the_center/varied+", "unknown attribute ''"),
         ("defend_the_center/gore+varied-10", "'varied-10' is a task and no attribute"),
         ("seek_and_kill/varied-0", "got 'varied-0', want 'varied-<number of maps>', as 'varied-10'"),
         ("seek_and_kill/varied-1001", "varied-1001: want 1 to 1000 maps"),

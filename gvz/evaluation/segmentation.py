@@ -9,6 +9,7 @@ from gvz.env import DoomEnv
 from gvz.evaluation.play import episode_seed
 from gvz.evaluation.players import Player, RandomPlayer, ScriptedPlayer
 from gvz.scenarios.base import Task
+from gvz.scenarios.map_set import MapSet
 from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, network_input
 from learner.segmentation import CELL
 from learner.segmentation_views import changed_view, mirrored
@@ -20,13 +21,24 @@ CLASS_WEIGHTS = np.where(np.isin(LABEL_CLASSES, ("wall", "plane", "weapon")), 1.
 """f32[C] of pixels in the loss: things cover few of them, and all weigh the same, so that none is taken for another"""
 _BASE_SEED = 7
 """of the episodes; evaluations have 0"""
-_DECISIONS_APART = 5
+_DECISIONS_APART, _FRAMES_PER_EPISODE = 5, 60
 """between frames of an episode, which hardly differ otherwise"""
-_FRAMES_PER_EPISODE = 60
+_DRAWN_DECISIONS_APART, _DRAWN_FRAMES_PER_EPISODE = 12, 10
+"""where every episode has another map, so that there are more maps"""
 _CLEAN_SHARE = 0.3
 """of a batch's frames that are only mirrored"""
 _MIN_CELLS = 100
 """that show a class, for a score of it"""
+
+
+def drawn_tasks(tasks: Sequence[Task]) -> tuple[Task, ...]:
+    """The same tasks on maps with drawn looks (`varied`): each once, without those that only change textures."""
+    drawn: dict[str, Task] = {}
+    for task in tasks:
+        kept = [name for name in task.attributes if "textures" not in task.scenario.attribute(name).groups]
+        one = Task(task.scenario, tuple(kept), MapSet("varied"))
+        drawn[one.id] = one
+    return tuple(drawn.values())
 
 
 def labelled_frames(task: Task, num_frames: int) -> Labelled:
@@ -36,6 +48,9 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
         EngineError: the engine does not start, or dies.
     """
     frames, labels, episode = [], [], 0
+    apart, per_episode = _DECISIONS_APART, _FRAMES_PER_EPISODE
+    if task.maps is not None:
+        apart, per_episode = _DRAWN_DECISIONS_APART, _DRAWN_FRAMES_PER_EPISODE
     config = EnvConfig(frame_height=INPUT_HEIGHT, frame_width=INPUT_WIDTH, buffers=("labels",))
     env = DoomEnv(task, config)
     try:
@@ -44,9 +59,9 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
             observation, info = env.reset(options={"episode_seed": seed})
             player: Player = RandomPlayer() if episode % 2 else ScriptedPlayer()
             player.begin(env, observation, info, seed)
-            for decision in range(_FRAMES_PER_EPISODE * _DECISIONS_APART):
+            for decision in range(per_episode * apart):
                 assert isinstance(observation, dict)
-                if decision % _DECISIONS_APART == 0:
+                if decision % apart == 0:
                     frames.append(observation["screen"])
                     labels.append(observation["labels"][:, :, 0])
                 observation, _, terminated, truncated, info = env.step(player.act())

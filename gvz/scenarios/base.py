@@ -303,13 +303,14 @@ class Task:
     Attributes:
         scenario: the scenario.
         attributes: canonical names, sorted.
-        maps: drawn maps; an episode's seed says which is played. None: one map, that of the attributes.
+        maps: drawn maps; an episode's seed says which is played. None: one map, that of the attributes. Maps of
+            `varied` can have attributes, but not those of group `textures`, which are drawn.
         severities: (attribute, severity) pairs of attributes that are graded (gvz.scenarios.severity), sorted. Those
             left out have severity 1; an attribute given with severity 0 is left out altogether.
 
     Raises:
-        TaskError: an unknown attribute, two of one group, a severity out of range, or attributes together with drawn
-            maps.
+        TaskError: an unknown attribute, two of one group, a severity out of range, or an attribute that such drawn maps
+            cannot have.
     """
 
     scenario: Scenario
@@ -322,11 +323,14 @@ class Task:
             raise TaskError(
                 f"scenario {self.scenario.id}: got {self.maps.name}, but the scenario has no variety; set it"
             )
-        if self.maps is not None and self.attributes:
+        if self.maps is not None and self.maps.split != VARIED and self.attributes:
             raise TaskError(
-                f"{self.scenario.id}: got {self.maps.name} and {'+'.join(self.attributes)}, want one of them"
+                f"{self.scenario.id}: got {self.maps.name} and {'+'.join(self.attributes)}, want one of them; "
+                f"{VARIED!r} takes attributes"
             )
         found = [self.scenario.attribute(name) for name in self.attributes]
+        if self.maps is not None and (drawn := [one.name for one in found if "textures" in one.groups]):
+            raise TaskError(f"{self.scenario.id}: got {self.maps.name} and {drawn[0]}, but textures are drawn")
         taken: dict[str, str] = {}
         for attribute in found:
             for group in attribute.groups:
@@ -355,12 +359,11 @@ class Task:
     @property
     def name(self) -> str:
         """The id without its scenario: "gore+mossy_bricks", "default", "complete", "gore=0.5", "procedural-train"."""
-        if self.maps is not None:
-            return self.maps.name
         severities = {self.severity(name) for name in self.attributes}
-        if set(self.attributes) == set(self.scenario.complete) and len(severities) == 1:
+        if self.maps is None and set(self.attributes) == set(self.scenario.complete) and len(severities) == 1:
             return "complete" + graded_name(*severities)
-        return "+".join(name + graded_name(self.severity(name)) for name in self.attributes) or "default"
+        drawn = () if self.maps is None else (self.maps.name,)
+        return "+".join((*drawn, *(name + graded_name(self.severity(name)) for name in self.attributes))) or "default"
 
     @property
     def id(self) -> str:
@@ -369,7 +372,7 @@ class Task:
 
     @property
     def level(self) -> int:
-        """Difficulty: the number of groups its attributes change, at most MAX_LEVEL. Drawn maps have none: 0."""
+        """Difficulty: the number of groups its attributes change, at most MAX_LEVEL. What is drawn does not count."""
         groups = sum(len(self.scenario.attribute(name).groups) for name in self.attributes)
         return min(groups, MAX_LEVEL)
 

@@ -59,9 +59,9 @@ class CompiledTask:
         Raises:
             TaskError: the drawn map cannot be played.
         """
-        if self.task.maps is not None:
-            return _map_alone(self.task, self.profile, self.task.maps.number_of(episode_seed))
-        played = _in_force(self.task, self.profile, episode_seed)
+        played, maps = _in_force(self.task, self.profile, episode_seed), self.task.maps
+        if maps is not None:
+            return _map_alone(played, self.profile, maps.number_of(episode_seed))
         return (None, self.map_magic) if played == self.task else _map_alone(played, self.profile)
 
 
@@ -298,7 +298,8 @@ def _draw_of_set(task: Task, maps: MapSet, content: Content, number: int) -> tup
         content = content.overlaid(Content(things={content.base_wad or "": ()}, parameters=layout.parameters))
     drawn = _draw(task, content, layout)
     floor = None if layout is None else Floor(drawn)
-    content = looks.draw_look(scenario, content, drawn, maps, number, layout, floor)
+    given = {name for attribute in task.attributes for name in scenario.attribute(attribute).content.entity}
+    content = looks.draw_look(scenario, content, drawn, maps, number, given, layout, floor)
     if layout is not None and floor is not None:
         solids = looks.solid_places(drawn)
         problem = layout.problem(Floor(drawn, solids) if solids else floor)

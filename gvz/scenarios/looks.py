@@ -26,7 +26,7 @@ that move, with writing, and those that are very dark, bright or restless.
 import math
 import random
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from functools import cache, lru_cache
 from typing import TypeVar
 
@@ -186,17 +186,19 @@ def draw_look(
     room: UdmfMap,
     maps: MapSet,
     number: int,
+    given: Collection[str] = (),
     layout: Layout | None = None,
     floor: Floor | None = None,
 ) -> Content:
-    """Gives a map of the default task another look.
+    """Gives a map another look.
 
     Args:
-        scenario: whose default task it is; it has a variety.
-        content: of that task.
+        scenario: whose map it is; it has a variety.
+        content: of the default task, perhaps with attributes.
         room: its map; changed in place, before the content's things are added.
         maps: the set with the map.
         number: of the map.
+        given: properties of entities that an attribute sets; they keep these.
         layout: of the map, if it has one of its own.
         floor: of this layout.
 
@@ -216,7 +218,7 @@ def draw_look(
         kinds = pool((*SOLID, *LOOSE), maps.split, strength)
         most = round(strength * variety.max_decorations)
         _draw_decorations(decorations, variety, room, starts, kinds, most, layout, floor)
-    return _draw_entities(entities, variety, content, maps)
+    return _draw_entities(entities, variety, content, maps, given)
 
 
 def _draw_surfaces(rng: random.Random, room: UdmfMap, wall_pool: Sequence[str], flat_pool: Sequence[str]) -> None:
@@ -334,15 +336,20 @@ def open_places(
     return tuple(zip(x[inside].tolist(), y[inside].tolist(), distance[inside].tolist(), strict=True))
 
 
-def _draw_entities(rng: random.Random, variety: Variety, content: Content, maps: MapSet) -> Content:
+def _draw_entities(
+    rng: random.Random, variety: Variety, content: Content, maps: MapSet, given: Collection[str]
+) -> Content:
     """The content with other looks of enemies or kits, and with all classes that some map of the set needs."""
     strength = maps.strength("entities")
     entity: dict[str, Value] = {}
     if rng.random() < 0.5 * strength:
         scale = 1 + strength * (rng.uniform(*SCALE) - 1)
-        entity |= {name: scale * _number(content.entity.get(name, 1.0)) for name in ("ScaleX", "ScaleY")}
+        sizes = (name for name in ("ScaleX", "ScaleY") if name not in given)
+        entity |= {name: scale * _number(content.entity.get(name, 1.0)) for name in sizes}
     style = rng.choice((*STYLES, None, None, None))
     if strength < 1 and rng.random() >= strength:
+        style = None
+    if "RenderStyle" in given:
         style = None
     if style == "STYLE_Translucent":
         entity |= {"RenderStyle": style, "Alpha": 1 + strength * (rng.uniform(*ALPHA) - 1)}

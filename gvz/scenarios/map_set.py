@@ -99,8 +99,9 @@ def parse_map_set(name: str) -> MapSet:
     """The set of a name.
 
     Args:
-        name: `varied` or `varied-<number of maps>`; or `procedural`, which is `procedural-train`,
-            `procedural-<split>` or `procedural-<split>-<number of maps>`, then `+<part>=<strength>` for any parts.
+        name: `varied` or `varied-<number of maps>`, without the attributes that may follow; or `procedural`, which is
+            `procedural-train`, `procedural-<split>` or `procedural-<split>-<number of maps>`, then `+<part>=<strength>`
+            for any parts.
 
     Raises:
         TaskError: another form, or something out of range; the message says what is possible.
@@ -117,8 +118,6 @@ def parse_map_set(name: str) -> MapSet:
         raise TaskError(
             f"got {name!r}, want '{kind}{'-<split>' * (kind == PROCEDURAL)}-<number of maps>', as {example}"
         )
-    if kind == VARIED and settings:
-        raise TaskError(f"got {name!r}, but {VARIED!r} takes no attribute and no strength; {PROCEDURAL!r} does")
     strengths: dict[str, float] = {}
     for setting in settings:
         part, _, value = setting.partition("=")

@@ -7,8 +7,9 @@ import pytest
 
 from gvz.core.env_config import LABEL_CLASSES
 from gvz.evaluation import segmentation
+from gvz.scenarios.base import words
 from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, network_input
-from gvz.tasks import parse_task
+from gvz.tasks import named_tasks, parse_task
 
 ENEMY, KIT = LABEL_CLASSES.index("enemy"), LABEL_CLASSES.index("kit")
 
@@ -53,6 +54,23 @@ def test_labelled_frames_are_the_same_each_time_and_show_what_the_task_has():
     np.testing.assert_array_equal(labels, labels_again)
     assert {LABEL_CLASSES[n] for n in np.unique(labels)} >= {"wall", "plane", "weapon", "enemy", "scenery"}
     assert len({frame.tobytes() for frame in frames}) > 80, "few frames are alike"
+
+
+def test_drawn_tasks_have_every_attribute_but_textures_once():
+    drawn = segmentation.drawn_tasks(named_tasks("seek_and_kill", split="train8"))
+    names = (
+        "varied",
+        *(f"varied+{one}" for one in words("obstacles resized_enemies shadows mixed_enemies invulnerable")),
+    )
+    assert [task.name for task in drawn] == list(names)
+
+
+@pytest.mark.engine
+def test_drawn_frames_show_many_maps():
+    frames, labels = segmentation.labelled_frames(parse_task("defend_the_center/varied+gore"), 40)
+    assert {LABEL_CLASSES[n] for n in np.unique(labels)} >= {"wall", "plane", "weapon", "enemy", "scenery"}
+    skies = {frame[0, 0].tobytes() for frame in frames[::10]}
+    assert len(skies) == 4, "ten frames of each map"
 
 
 def test_batches_hold_network_inputs_and_labels_of_all_tasks():

@@ -26,6 +26,7 @@ from gvz.scenarios.base import BOOKKEEPING, Content, Scenario, Task
 from gvz.scenarios.compiler import CompiledTask, compile_task, map_source, task_content
 from gvz.scenarios.looks import FLATS, LOOSE, SOLID, STYLES, WALLS
 from gvz.scenarios.map_set import MapSet
+from gvz.scenarios.severity import in_force
 from gvz.tasks import all_scenarios, named_tasks, parse_task
 from gvz.wad.lumps import read_maps, read_wad
 from gvz.wad.stock import stock_editor_numbers, stock_textures
@@ -162,6 +163,39 @@ def test_nothing_but_looks_differs_from_the_default_task(scenario: Scenario, pro
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=str)
+def test_an_attribute_is_whole_on_drawn_maps_and_all_else_is_as_drawn(scenario: Scenario):
+    for attribute in scenario.attributes:
+        if "textures" in attribute.groups:
+            continue
+        plain, own = Task(scenario, maps=FIFTY), task_content(Task(scenario, (attribute.name,)), "thesis")
+        for number in range(10):
+            task = Task(scenario, (attribute.name,), FIFTY)
+            room, drawn = (parse_textmap(map_source(one, "thesis", number).textmap) for one in (task, plain))
+            if attribute.content.base_wad is None:
+                assert [side.get("texturemiddle") for side in room.sidedefs] == [
+                    side.get("texturemiddle") for side in drawn.sidedefs
+                ]
+            floors = {sector[name] for sector in room.sectors for name in ("texturefloor", "lightlevel", "lightcolor")}
+            assert floors == {s[name] for s in drawn.sectors for name in ("texturefloor", "lightlevel", "lightcolor")}
+            places = {(thing["type"], thing["x"], thing["y"]) for thing in room.things}
+            assert {(t.type, t.x, t.y) for t in own.things.get(own.base_wad, ())} <= places
+            content = looks.draw_look(scenario, own, room, FIFTY, number, attribute.content.entity)
+            assert {name: content.entity[name] for name in attribute.content.entity} == attribute.content.entity
+            assert (
+                "RenderStyle" not in attribute.content.entity or not {"Alpha", "StencilColor"} & content.entity.keys()
+            )
+            assert (content.agent, content.base_wad) == (own.agent, own.base_wad)
+
+
+@pytest.mark.usefixtures("cache")
+def test_an_attribute_of_half_severity_is_in_force_on_half_of_the_maps():
+    compiled = compile_task(parse_task("seek_and_kill/varied-50+mixed_enemies=0.5"))
+    mixed = [b"ZombieMan" in (compiled.map_of(seed)[0] or b"") for seed in range(50)]
+    assert mixed == [in_force(0.5, "mixed_enemies", seed) for seed in range(50)]
+    assert 10 < sum(mixed) < 40
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=str)
 def test_decorations_stand_inside_the_map_and_clear_of_starts_enemies_and_each_other(scenario: Scenario):
     num_own = len(parse_textmap(map_source(Task(scenario), "thesis").textmap).things)
     found = 0
@@ -276,6 +310,15 @@ def test_every_map_plays_and_is_the_right_one(scenario: Scenario):
         assert env._engine is not None
         log = env._engine.log.read_text(errors="replace")
         assert bad_lines(log) == []
+
+
+@pytest.mark.engine
+def test_maps_with_attributes_play():
+    with closing(DoomEnv("health_gathering/varied-6+supreme+poison+resized_kits", buffers=("labels",))) as env:
+        frames = {env.reset(options={"episode_seed": number})[0]["screen"].tobytes() for number in range(6)}
+        assert len(frames) == 6
+        assert env._engine is not None
+        assert bad_lines(env._engine.log.read_text(errors="replace")) == []
 
 
 @pytest.mark.engine
