@@ -7,6 +7,8 @@ Source: Tobin et al. 2017 (domain randomization: looks at random, so that the re
 (copy-paste of things between frames).
 """
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -27,6 +29,8 @@ def changed_view(
     labels: np.ndarray,
     other_frame: np.ndarray,
     other_labels: np.ndarray,
+    style: str | None = None,
+    known_styles: Sequence[str] = (),
 ) -> tuple[np.ndarray, np.ndarray]:
     """A frame as it might look elsewhere, and its labels.
 
@@ -39,6 +43,8 @@ def changed_view(
         labels: u8[H W], numbers of LABEL_CLASSES.
         other_frame: u8[H W 3], from another task of the scenario: things may stand before it.
         other_labels: u8[H W], its labels.
+        style: of OUTLINES, that of the frame's things.
+        known_styles: of OUTLINES, those that some task has: half of all styles that are drawn.
 
     Returns:
         (u8[H W 3], u8[H W]).
@@ -50,8 +56,11 @@ def changed_view(
             surroundings = _other_parts(rng, surroundings, other_labels)
             view = _other_colours(rng, view, 0.5)
         before = cv2.copyTo(view, _is(labels, _DECORATIONS), surroundings)
-        if rng.random() < 0.5:
-            view = _other_style(rng, view, before)
+        if style is not None:
+            view = _STYLES[style](rng, view, before)
+        elif rng.random() < 0.5:
+            names = known_styles if known_styles and rng.random() < 0.5 else tuple(_STYLES)
+            view = _STYLES[names[int(rng.integers(len(names)))]](rng, view, before)
         view = cv2.copyTo(view, _is(labels, _THINGS), before)
         labels = cv2.copyTo(labels, _is(labels, _THINGS + _DECORATIONS), other_labels.copy())
     elif other_looks:
@@ -80,16 +89,28 @@ def _other_colours(rng: np.random.Generator, view: Frame, strength: float) -> Fr
     return cv2.transform(view, np.column_stack([np.diag(slopes), offsets]))
 
 
-def _other_style(rng: np.random.Generator, things: Frame, surroundings: Frame) -> Frame:
-    """Things through which one sees their surroundings, as the engine's render styles draw them."""
-    kind = rng.integers(4)
-    if kind == 0:  # Shadow
-        return surroundings * np.float32(rng.uniform(0.3, 0.85))
-    if kind == 1:  # Translucent
-        return surroundings + np.float32(rng.uniform(0.3, 0.8)) * (things - surroundings)
-    if kind == 2:  # Fuzzy
-        return surroundings * rng.uniform(rng.uniform(0, 0.6), 1, (*surroundings.shape[:2], 1)).astype(np.float32)
-    return np.full_like(things, rng.uniform(0, 255, 3))  # Stencil
+def _shadow(rng: np.random.Generator, _things: Frame, surroundings: Frame) -> Frame:
+    """The engine takes a third of the light away; here it is somewhat more or less."""
+    return surroundings * np.float32(1 - rng.uniform(0.25, 0.45))
+
+
+def _translucent(rng: np.random.Generator, things: Frame, surroundings: Frame) -> Frame:
+    return surroundings + np.float32(rng.uniform(0.3, 0.8)) * (things - surroundings)
+
+
+def _fuzzy(rng: np.random.Generator, _things: Frame, surroundings: Frame) -> Frame:
+    """Each pixel as dark as chance will have it."""
+    return surroundings * rng.uniform(rng.uniform(0, 0.6), 1, (*surroundings.shape[:2], 1)).astype(np.float32)
+
+
+def _stencil(rng: np.random.Generator, things: Frame, _surroundings: Frame) -> Frame:
+    return np.full_like(things, rng.uniform(0, 255, 3))
+
+
+_STYLES = {"STYLE_Shadow": _shadow, "STYLE_Translucent": _translucent, "STYLE_Fuzzy": _fuzzy, "STYLE_Stencil": _stencil}
+"""f(rng, things, surroundings) -> things as the engine draws them in a render style"""
+OUTLINES = ("STYLE_Shadow", "STYLE_Fuzzy")
+"""render styles that show nothing of a thing but its outline: before other surroundings it looks different"""
 
 
 def _other_parts(rng: np.random.Generator, view: Frame, labels: np.ndarray) -> Frame:

@@ -19,8 +19,8 @@ class TrainSegmenter:
     """Train a network that tells from the screen what each part of it shows, for `--env.frames segmented`.
 
     It learns from frames of a scenario's training tasks with the engine's labels, seen by a random player and by the
-    scripted one, and changed in many ways. Further frames show the same tasks on maps with drawn looks
-    (`varied`). It is then scored on frames of the gate tasks. Whoever plays with it needs no labels.
+    scripted one, and changed in many ways. It is then scored on frames of the gate tasks. Whoever plays with it needs
+    no labels.
 
     Example: gvz segmenter --scenario seek_and_kill --out segmenter.onnx
     """
@@ -31,8 +31,6 @@ class TrainSegmenter:
     """the ONNX file to write; beside it comes a .json file with what it was trained on, and its scores"""
     training_set: TrainSet = "train8"
     """the tasks that it learns from"""
-    drawn_looks: bool = True
-    """whether it also learns from these tasks on maps with drawn textures, light, decorations and tints"""
     frames: int = 1500
     """labelled frames of each training task"""
     gate_frames: int = 300
@@ -61,14 +59,12 @@ class TrainSegmenter:
         import jax
         import numpy as np
 
-        from gvz.evaluation.segmentation import CLASS_WEIGHTS, drawn_tasks, labelled_frames, score, training_batches
+        from gvz.evaluation.segmentation import CLASS_WEIGHTS, labelled_frames, score, training_batches
         from gvz.run import machine
         from gvz.run.bars import Bar, Bars
         from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, Segmenter
         from learner.segmentation import train_segmentation, write_onnx
 
-        if self.drawn_looks:
-            tasks += drawn_tasks(tasks)
         begun_s, steps, loss = machine.processor_s(), 0, 0.0
         with Bars(line_period_s=10.0) as bars:
 
@@ -96,7 +92,7 @@ class TrainSegmenter:
             segment, scores = Segmenter(str(self.out)), {}
             for task in named_tasks(self.scenario, split="gate"):
                 show("tasks", len(scores), len(scores) + 1, f"scores on {task.id}")
-                frames, labels = labelled_frames(task, self.gate_frames)
+                frames, labels, _ = labelled_frames(task, self.gate_frames)
                 scores[task.id] = score(np.stack([segment(frame) for frame in frames]), labels)
         record = {
             "scenario": self.scenario,

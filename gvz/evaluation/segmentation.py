@@ -1,6 +1,7 @@
 """Frames with the engine's labels, to train a segmentation network on and to score it by."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,36 +10,33 @@ from gvz.env import DoomEnv
 from gvz.evaluation.play import episode_seed
 from gvz.evaluation.players import Player, RandomPlayer, ScriptedPlayer
 from gvz.scenarios.base import Task
-from gvz.scenarios.map_set import MapSet
 from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, network_input
 from learner.segmentation import CELL
-from learner.segmentation_views import changed_view, mirrored
+from learner.segmentation_views import OUTLINES, changed_view, mirrored
 
-Labelled = tuple[np.ndarray, np.ndarray]
-"""frames u8[N INPUT_HEIGHT INPUT_WIDTH 3] and their labels u8[N INPUT_HEIGHT INPUT_WIDTH], numbers of LABEL_CLASSES"""
+
+class Labelled(NamedTuple):
+    """Frames of a task."""
+
+    frames: np.ndarray
+    """u8[N INPUT_HEIGHT INPUT_WIDTH 3]"""
+    labels: np.ndarray
+    """u8[N INPUT_HEIGHT INPUT_WIDTH], numbers of LABEL_CLASSES"""
+    style: str | None = None
+    """the engine's render style of the task's things, if it shows nothing of them but their outline"""
+
 
 CLASS_WEIGHTS = np.where(np.isin(LABEL_CLASSES, ("wall", "plane", "weapon")), 1.0, 8.0).astype(np.float32)
 """f32[C] of pixels in the loss: things cover few of them, and all weigh the same, so that none is taken for another"""
 _BASE_SEED = 7
 """of the episodes; evaluations have 0"""
-_DECISIONS_APART, _FRAMES_PER_EPISODE = 5, 60
+_DECISIONS_APART = 5
 """between frames of an episode, which hardly differ otherwise"""
-_DRAWN_DECISIONS_APART, _DRAWN_FRAMES_PER_EPISODE = 12, 10
-"""where every episode has another map, so that there are more maps"""
+_FRAMES_PER_EPISODE = 60
 _CLEAN_SHARE = 0.3
 """of a batch's frames that are only mirrored"""
 _MIN_CELLS = 100
 """that show a class, for a score of it"""
-
-
-def drawn_tasks(tasks: Sequence[Task]) -> tuple[Task, ...]:
-    """The same tasks on maps with drawn looks (`varied`): each once, without those that only change textures."""
-    drawn: dict[str, Task] = {}
-    for task in tasks:
-        kept = [name for name in task.attributes if "textures" not in task.scenario.attribute(name).groups]
-        one = Task(task.scenario, tuple(kept), MapSet("varied"))
-        drawn[one.id] = one
-    return tuple(drawn.values())
 
 
 def labelled_frames(task: Task, num_frames: int) -> Labelled:
@@ -48,9 +46,6 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
         EngineError: the engine does not start, or dies.
     """
     frames, labels, episode = [], [], 0
-    apart, per_episode = _DECISIONS_APART, _FRAMES_PER_EPISODE
-    if task.maps is not None:
-        apart, per_episode = _DRAWN_DECISIONS_APART, _DRAWN_FRAMES_PER_EPISODE
     config = EnvConfig(frame_height=INPUT_HEIGHT, frame_width=INPUT_WIDTH, buffers=("labels",))
     env = DoomEnv(task, config)
     try:
@@ -59,9 +54,9 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
             observation, info = env.reset(options={"episode_seed": seed})
             player: Player = RandomPlayer() if episode % 2 else ScriptedPlayer()
             player.begin(env, observation, info, seed)
-            for decision in range(per_episode * apart):
+            for decision in range(_FRAMES_PER_EPISODE * _DECISIONS_APART):
                 assert isinstance(observation, dict)
-                if decision % apart == 0:
+                if decision % _DECISIONS_APART == 0:
                     frames.append(observation["screen"])
                     labels.append(observation["labels"][:, :, 0])
                 observation, _, terminated, truncated, info = env.step(player.act())
@@ -71,18 +66,20 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
             episode += 1
     finally:
         env.close()
-    return np.stack(frames), np.stack(labels)
+    styles = (task.scenario.attribute(name).content.entity.get("RenderStyle") for name in task.attributes)
+    return Labelled(np.stack(frames), np.stack(labels), next((str(one) for one in styles if one in OUTLINES), None))
 
 
-def training_batches(tasks: Sequence[Labelled], batch_size: int, seed: int) -> Iterator[Labelled]:
+def training_batches(tasks: Sequence[Labelled], batch_size: int, seed: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Batches without end: (network inputs f32[B 3 H W], labels u8[B H W]), each frame of a task drawn at random."""
     rng = np.random.default_rng(seed)
+    styles = sorted({task.style for task in tasks if task.style is not None})
     while True:
         inputs, answers = [], []
         for _ in range(batch_size):
-            (frame, labels), (other, other_labels) = _drawn(rng, tasks), _drawn(rng, tasks)
+            (frame, labels, style), (other, other_labels, _) = _drawn(rng, tasks), _drawn(rng, tasks)
             if rng.random() >= _CLEAN_SHARE:
-                frame, labels = changed_view(rng, frame, labels, other, other_labels)
+                frame, labels = changed_view(rng, frame, labels, other, other_labels, style, styles)
             frame, labels = mirrored(rng, frame, labels)
             inputs.append(network_input(np.ascontiguousarray(frame)))
             answers.append(labels)
@@ -90,9 +87,9 @@ def training_batches(tasks: Sequence[Labelled], batch_size: int, seed: int) -> I
 
 
 def _drawn(rng: np.random.Generator, tasks: Sequence[Labelled]) -> Labelled:
-    frames, labels = tasks[int(rng.integers(len(tasks)))]
+    frames, labels, style = tasks[int(rng.integers(len(tasks)))]
     number = rng.integers(len(frames))
-    return frames[number], labels[number]
+    return Labelled(frames[number], labels[number], style)
 
 
 def score(probabilities: np.ndarray, labels: np.ndarray) -> Mapping[str, float]:

@@ -16,8 +16,8 @@ EXPERIMENT = Gate(
     trainings=("train8",),
     max_processor_s=900.0,
     notes=(
-        "A player that walks from one end of the strip to the other and looks at nothing has 92 on `arachnotron`, a gate "
-        "task. An agent that walks straight on gets some 0.012 a decision for it; to live gives 0.01, and a hit costs 1. "
-        "Scores are the protocol's, whatever an agent was rewarded for.",
+        "A player that walks from one end of the strip to the other and looks at nothing has 92 on `arachnotron`, a "
+        "gate task. An agent that walks straight on gets some 0.012 a decision for it. To live gives 0.01, and a hit "
+        "costs 1. Scores are the protocol's, whatever an agent was rewarded for.",
     ),
 )

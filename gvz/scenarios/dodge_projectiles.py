@@ -230,8 +230,8 @@ SCENARIO = Scenario(
             paces=(Pace(tics=2, times=3), Pace(tics=10, times=10), Pace(tics=16, times=12)),
             levdoom_paces=(Pace(tics=2, times=4), Pace(tics=10, times=16), Pace(tics=14, times=16)),
         ),
-        # Not of the thesis. Map units a tic, each counted by five decisions: 8.4 while hits push the agent, 6.5 along the
-        # strip.
+        # Not of the thesis. Map units a tic, each counted by five decisions: 8.4 while hits push the agent, 6.5 along
+        # the strip.
         "moved": Reward(
             event=moved,
             weight=0.0,

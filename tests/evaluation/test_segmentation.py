@@ -7,9 +7,8 @@ import pytest
 
 from gvz.core.env_config import LABEL_CLASSES
 from gvz.evaluation import segmentation
-from gvz.scenarios.base import words
 from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, network_input
-from gvz.tasks import named_tasks, parse_task
+from gvz.tasks import parse_task
 
 ENEMY, KIT = LABEL_CLASSES.index("enemy"), LABEL_CLASSES.index("kit")
 
@@ -46,37 +45,30 @@ def test_a_cell_shows_a_class_if_an_eighth_of_its_pixels_do():
 @pytest.mark.engine
 def test_labelled_frames_are_the_same_each_time_and_show_what_the_task_has():
     task = parse_task("defend_the_center/gore")
-    frames, labels = segmentation.labelled_frames(task, 90)
+    frames, labels, style = segmentation.labelled_frames(task, 90)
+    assert style is None
     assert frames.shape == (90, INPUT_HEIGHT, INPUT_WIDTH, 3)
     assert labels.shape == (90, INPUT_HEIGHT, INPUT_WIDTH)
-    again, labels_again = segmentation.labelled_frames(task, 90)
+    again, labels_again, _ = segmentation.labelled_frames(task, 90)
     np.testing.assert_array_equal(frames, again)
     np.testing.assert_array_equal(labels, labels_again)
     assert {LABEL_CLASSES[n] for n in np.unique(labels)} >= {"wall", "plane", "weapon", "enemy", "scenery"}
     assert len({frame.tobytes() for frame in frames}) > 80, "few frames are alike"
 
 
-def test_drawn_tasks_have_every_attribute_but_textures_once():
-    drawn = segmentation.drawn_tasks(named_tasks("seek_and_kill", split="train8"))
-    names = (
-        "varied",
-        *(f"varied+{one}" for one in words("obstacles resized_enemies shadows mixed_enemies invulnerable")),
-    )
-    assert [task.name for task in drawn] == list(names)
-
-
 @pytest.mark.engine
-def test_drawn_frames_show_many_maps():
-    frames, labels = segmentation.labelled_frames(parse_task("defend_the_center/varied+gore"), 40)
-    assert {LABEL_CLASSES[n] for n in np.unique(labels)} >= {"wall", "plane", "weapon", "enemy", "scenery"}
-    skies = {frame[0, 0].tobytes() for frame in frames[::10]}
-    assert len(skies) == 4, "ten frames of each map"
+def test_frames_know_the_render_style_of_which_only_outlines_are_seen():
+    tasks = ("seek_and_kill/shadows", "defend_the_center/fast_enemies+fuzzy_enemies", "health_gathering/shaded_kits")
+    styles = [segmentation.labelled_frames(parse_task(task), 1).style for task in tasks]
+    assert styles == ["STYLE_Shadow", "STYLE_Fuzzy", None]
 
 
 def test_batches_hold_network_inputs_and_labels_of_all_tasks():
     rng = np.random.default_rng(0)
     tasks = [
-        (rng.integers(0, 256, (5, INPUT_HEIGHT, INPUT_WIDTH, 3), dtype=np.uint8), np.full((5, 96, 168), n, np.uint8))
+        segmentation.Labelled(
+            rng.integers(0, 256, (5, INPUT_HEIGHT, INPUT_WIDTH, 3), dtype=np.uint8), np.full((5, 96, 168), n, np.uint8)
+        )
         for n in (ENEMY, KIT)
     ]
     batches = list(itertools.islice(segmentation.training_batches(tasks, 8, seed=3), 4))

@@ -140,24 +140,53 @@ def test_render_styles_let_the_surroundings_show_through():
     """Shadow darkens what is behind evenly, Translucent mixes, Fuzzy darkens pixel by pixel, Stencil has one colour."""
     rng = np.random.default_rng(0)
     things, behind = (rng.uniform(50, 250, (24, 30, 3)).astype(np.float32) for _ in range(2))
-    seen = set()
-    for seed in range(40):
-        view = views._other_style(np.random.default_rng(seed), things, behind)
-        share, shade = (view - behind) / (things - behind), view / behind
-        if np.ptp(view, axis=(0, 1)).max() == 0:
-            seen.add("Stencil")
-        elif np.ptp(shade) < 1e-3:
-            seen.add("Shadow")
-            assert 0.3 <= shade.mean() <= 0.85
-        elif np.ptp(np.median(share, axis=(0, 1))) < 1e-3 and 0.3 <= np.median(share) <= 0.8:
-            seen.add("Translucent")
-            np.testing.assert_allclose(view, behind + np.median(share) * (things - behind), atol=0.01)
-        else:
-            seen.add("Fuzzy")
-            assert np.ptp(shade, axis=-1).max() < 1e-3, "a pixel keeps its colour"
-            assert shade.min() >= 0
-            assert shade.max() <= 1
-    assert seen == {"Shadow", "Translucent", "Fuzzy", "Stencil"}
+    for seed in range(20):
+        drawn = {name: draw(np.random.default_rng(seed), things, behind) for name, draw in views._STYLES.items()}
+        assert np.ptp(drawn.pop("STYLE_Stencil"), axis=(0, 1)).max() == 0
+        shade = drawn.pop("STYLE_Shadow") / behind
+        assert np.ptp(shade) < 1e-3
+        assert 0.55 <= shade.mean() <= 0.75
+        view = drawn.pop("STYLE_Translucent")
+        share = np.median((view - behind) / (things - behind))
+        assert 0.3 <= share <= 0.8
+        np.testing.assert_allclose(view, behind + share * (things - behind), atol=0.01)
+        shade = drawn.pop("STYLE_Fuzzy") / behind
+        assert np.ptp(shade, axis=-1).max() < 1e-3, "a pixel keeps its colour"
+        assert np.ptp(shade) > 0.3
+        assert shade.min() >= 0
+        assert shade.max() <= 1
+        assert not drawn
+
+
+def test_outlines_are_drawn_anew_before_other_surroundings():
+    """A shadow is a darker copy of what is behind it, so it cannot be taken along from its own frame."""
+    frame, labels = parted()
+    other, other_labels = np.full_like(frame, 90), np.full_like(labels, LABEL_CLASSES.index("wall"))
+    shades = []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        view, found = views.changed_view(rng, frame, labels, other, other_labels, "STYLE_Shadow", ["STYLE_Shadow"])
+        inner = cv2.erode(np.uint8(found == LABEL_CLASSES.index("wall")), np.ones((5, 5)), borderValue=0) > 0
+        enemy = cv2.erode(np.uint8(found == LABEL_CLASSES.index("enemy")), np.ones((5, 5)), borderValue=0) > 0
+        if (view[inner] == 90).all() and LABEL_CLASSES.index("plane") not in found and enemy.any():
+            shades.append(view[enemy].mean() / 90)
+    assert len(shades) > 20
+    assert all(0.54 <= shade <= 0.76 for shade in shades)
+
+
+def test_half_of_the_styles_that_are_drawn_are_known_ones():
+    frame, labels = parted()
+    frame[labels == LABEL_CLASSES.index("enemy")] = (200, 10, 10)
+    other, other_labels = np.full_like(frame, 90), np.full_like(labels, LABEL_CLASSES.index("wall"))
+    shadows = {(): 0, ("STYLE_Shadow",): 0}
+    for known in shadows:
+        for seed in range(400):
+            rng = np.random.default_rng(seed)
+            view, found = views.changed_view(rng, frame, labels, other, other_labels, None, known)
+            enemy = cv2.erode(np.uint8(found == LABEL_CLASSES.index("enemy")), np.ones((5, 5)), borderValue=0) > 0
+            shadows[known] += enemy.any() and np.ptp(view[enemy]) == 0 and 48 <= view[enemy].max() <= 69
+    assert 5 <= shadows[()] <= 40, "400 * 0.7 * 0.6 * 0.5 / 4 = 21"
+    assert 35 <= shadows["STYLE_Shadow",] <= 75, "400 * 0.7 * 0.6 * 0.5 * 5 / 8 = 53"
 
 
 def test_other_colours_are_a_contrast_a_tint_and_a_brightness():
