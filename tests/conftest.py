@@ -46,10 +46,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Compiles programs as users have them in tests marked isa; in others with little optimization, which is quick."""
-    import jax
+    from tests import compiling
 
-    jax.config.update("jax_disable_most_optimizations", "isa" not in item.keywords)
+    compiling.optimize("isa" in item.keywords)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
@@ -60,4 +59,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 def pytest_configure() -> None:
     import jax  # after the environment is set
 
+    from tests import compiling
+
     jax.config.update("jax_numpy_rank_promotion", "raise")
+    compiling.prepare()

@@ -25,6 +25,7 @@ from learner.agents.base import Agent, AgentSpec, make_agent
 from learner.agents.configs.rainbow import RainbowConfig
 from learner.config import LearnerConfig, ReplayConfig, ValueConfig, change_agent
 from learner.replay import ReplaySpec
+from tests import compiling
 from tests.learner.games import (
     Game,
     catch,
@@ -139,7 +140,7 @@ def compiled(training: Training) -> Callable[[Array], tuple[Any, Array]]:
 
     It is XLA's optimized code that differs between instruction sets.
     """
-    plain = {} if "xla_cpu_max_isa" in os.environ.get("XLA_FLAGS", "") else {"xla_backend_optimization_level": 0}
+    plain = {} if "xla_cpu_max_isa" in os.environ.get("XLA_FLAGS", "") else compiling.TRAINING
     return jax.jit(partial(train, training), compiler_options=plain)
 
 
