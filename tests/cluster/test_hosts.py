@@ -31,7 +31,7 @@ from gvz.transport.messages import EpisodeStats, Fault, ParamsHeader, Ready
 from tests.cluster.conftest import FAKE_GAMES, RayCluster
 from tests.processes import arguments
 
-pytestmark = [pytest.mark.e2e, pytest.mark.xdist_group("ray")]
+pytestmark = pytest.mark.e2e
 DEADLINE_S = 200.0
 ROOT = Path(__file__).parents[2]
 NUM_ACTORS = 4

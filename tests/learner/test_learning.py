@@ -260,7 +260,6 @@ def value_error(seed: int, config: ValueConfig) -> float:
     return float(np.mean(errors))
 
 
-@pytest.mark.xdist_group("delayed")  # they share a compiled training
 @pytest.mark.parametrize("part", [{"n_steps": 5}, {"dueling": True}], ids=["n-step returns", "dueling streams"])
 def test_values_of_a_delayed_reward_are_learnt_sooner_with(part: dict[str, Any], learning_seed, record_property):
     """n steps carry a reward n states back at once; where 16 actions do the same, a common value learns from all.
