@@ -13,6 +13,8 @@ LITTLE = {"xla_cpu_use_fusion_emitters": False}
 """beside jax_disable_most_optimizations: a large program compiles in less than half of the time and runs as fast"""
 TRAINING = {"xla_backend_optimization_level": 0, **LITTLE}
 """of a loop that runs for seconds"""
+MUCH = {"xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes": False, **dict.fromkeys(LITTLE, True)}
+"""of a small program that runs for seconds"""
 
 _options = compiler.get_compile_options
 _flags = os.environ.get("XLA_FLAGS", "")
