@@ -173,6 +173,7 @@ def test_a_learner_that_takes_nothing_holds_the_hosts_back_and_a_lane_gets_its_t
     played.checker.assigned = {1: 0, 6: 1}
     for lane, task in played.checker.assigned.items():
         played.pool.assign(lane, task)
+    played.until(lambda: {1, 6} <= played.checker.last.keys())
     played.until(lambda: all(played.checker.last[lane]["task"] == task for lane, task in ((1, 0), (6, 1))))
     assert played.pool.statistics().waited_for_space_s > 0.5
     state = played.pool.state()
