@@ -17,7 +17,6 @@ from learner.replay import Transitions
 from tests.learner import reference
 from tests.learner.small_agents import ALL_OFF, RAINBOW, SPEC, A, B, batch, jitted, made_up_params
 
-
 with_noise = jax.jit(add_noise, static_argnums=2)
 
 
