@@ -8,6 +8,9 @@ ARGS   ?=
 ISAS   ?= AVX2 SSE4_2
 EXPERIMENTS ?= training_difficulty training_set_size algorithm_comparison rainbow_evaluation
 
+# Tests start hundreds of Python processes: what one has compiled is kept, also where the environment says otherwise.
+export PYTHONDONTWRITEBYTECODE =
+
 .PHONY: help install engine install-cuda train test test-fast test-slow test-isa test-browser test-interop learning-seeds pipeline lint format lock bench bench-peers bench-micro soak soak-hosts fuzz docs clean
 
 help:            ## show this list
@@ -32,17 +35,17 @@ train: install   ## run the main job (ARGS="--learner.total-updates 5000 ...")
 	$(BIN)/python -m gvz.launch --config rainbow_4task.py $(ARGS)
 
 test: install    ## all tests but the slow lane, in two processes (some 20 minutes on 2 cores)
-	$(BIN)/python -m pytest -m "not slow and not browser" -n 2 --dist loadgroup $(ARGS)
+	$(BIN)/python -m pytest -m "not slow and not browser" -n 2 --dist loadfile $(ARGS)
 
 test-fast: install ## unit tests that start no engine
-	$(BIN)/python -m pytest -m "not slow and not engine and not e2e and not browser" -n 2 --dist loadgroup $(ARGS)
+	$(BIN)/python -m pytest -m "not slow and not engine and not e2e and not browser" -n 2 --dist loadfile $(ARGS)
 
 test-slow: install ## learning and fault tests that take minutes each
 	$(BIN)/python -m pytest -m slow --timeout 1800 $(ARGS)
 
 test-isa: install ## tests of learning and of the learner's numbers, as older processors compute them (ISAS=...)
 	for isa in $(ISAS); do \
-	  XLA_FLAGS=--xla_cpu_max_isa=$$isa $(BIN)/python -m pytest -m "isa and not slow" -n 2 --dist loadgroup $(ARGS) || exit 1; \
+	  XLA_FLAGS=--xla_cpu_max_isa=$$isa $(BIN)/python -m pytest -m "isa and not slow" -n 2 --dist loadfile $(ARGS) || exit 1; \
 	done
 
 learning-seeds: install ## ten seeds of every test of learning under three instruction sets: the figures beside the tests

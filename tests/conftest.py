@@ -9,6 +9,7 @@ import shutil
 import signal
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -45,11 +46,31 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     seeds.parametrize(metafunc)
 
 
-def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Compiles programs as users have them in tests marked isa; in others with little optimization, which is quick."""
-    import jax
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """End-to-end tests first: their files take minutes, so that one at the end would leave a worker without work."""
+    items.sort(key=lambda item: "e2e" not in item.keywords)
 
-    jax.config.update("jax_disable_most_optimizations", "isa" not in item.keywords)
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """`--dist loadfile`, in the order of the items, and with one worker for the tests that share a cluster of Ray.
+
+    The tests of a file share fixtures and compiled programs. Groups of pytest-xdist 3.8 have no effect with pytest 9.2.
+    """
+    from xdist.scheduler import LoadFileScheduling
+
+    class OneWorkerForRay(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return "ray" if nodeid.startswith("tests/cluster/") else super()._split_scope(nodeid)
+
+    config.option.loadscopereorder = False
+    return OneWorkerForRay(config, log)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    from tests import compiling
+
+    compiling.optimize("isa" in item.keywords)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
@@ -60,4 +81,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 def pytest_configure() -> None:
     import jax  # after the environment is set
 
+    from tests import compiling
+
     jax.config.update("jax_numpy_rank_promotion", "raise")
+    compiling.prepare()

@@ -16,6 +16,7 @@ BENCHMARK_MUST_NOT = ("jax", "flax", "optax", "chex", "orbax", "actors", "learne
 OURS = ("gvz", "actors", "learner", "configs")
 
 
+@cache
 def modules() -> list[tuple[str, Path]]:
     found = []
     for package in OURS:

@@ -5,6 +5,7 @@ import itertools
 import json
 import re
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +14,16 @@ import pytest
 from gvz.evaluation.statistics import bootstrap, bootstrap_runs
 from gvz.reports.experiment_section import comparison_table, result_table
 from gvz.reports.joint_section import joint_sections
-from gvz.reports.results import read_results
+from gvz.reports.results import Results, read_results
 from gvz.reports.scores import agent_scores, estimate
 from gvz.tasks import TaskSet, named_tasks, scenario_named, scenarios
 
 ROOT = Path(__file__).parent.parent
+
+
+@cache
+def results_of(folder: str) -> Results:
+    return read_results([ROOT / "results" / folder])
 
 
 def test_the_quick_runs_are_better_than_chance_on_the_same_episodes():
@@ -116,7 +122,7 @@ def test_every_run_has_all_episodes_of_its_evaluation(folder: str, split: TaskSe
 
 def test_the_page_of_the_general_agents_says_what_their_records_give(tmp_path):
     folder = ROOT / "results" / "general_short"
-    page, results = (folder / "README.md").read_text(), read_results([folder])
+    page, results = (folder / "README.md").read_text(), results_of("general_short")
     asked = results.asked[0]
     rows = result_table(results, asked).rows
     ours = rows[-2]  # the mean over the scenarios; the thesis's is below it
@@ -153,7 +159,7 @@ def test_the_page_of_the_general_agents_says_what_their_records_give(tmp_path):
 )
 def test_the_findings_compare_the_general_agents_as_their_records_do(words, other, words_of_other):
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
-    episodes = read_results([ROOT / "results" / "general_short"]).episodes
+    episodes = results_of("general_short").episodes
     names = episodes.filter(agent=other)["scenario"].unique(maintain_order=True)
     assert len(names) > 1
     agents = {"rainbow_general (8 tasks)": words, other: words_of_other}
@@ -180,7 +186,7 @@ def test_the_findings_say_how_well_segmentation_networks_find_things():
 def test_the_findings_say_what_six_times_the_time_gave():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     for folder, seconds in (("general_short", "900 s"), ("general", "5,400 s")):
-        episodes = read_results([ROOT / "results" / folder]).episodes
+        episodes = results_of(folder).episodes
         for name in ("defend_the_center", "seek_and_kill"):
             scores = agent_scores(episodes.filter(scenario=name), "rainbow_general+sight_loss")
             sets = [named_tasks(name, split=split) for split in ("train8", "gate", "test")]
@@ -190,7 +196,7 @@ def test_the_findings_say_what_six_times_the_time_gave():
 
 def test_the_findings_say_what_the_first_loss_of_sight_gave():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
-    episodes = read_results([ROOT / "results" / "gates"]).episodes
+    episodes = results_of("gates").episodes
     agents = {"rainbow_general+plain": "none", "rainbow_general+sight_loss": "first form"}
     for name, (agent, called) in itertools.product(("defend_the_center", "seek_and_kill"), agents.items()):
         scores = agent_scores(episodes.filter(scenario=name), agent)
@@ -204,7 +210,7 @@ def test_the_findings_say_what_the_first_loss_of_sight_gave():
 
 def test_the_findings_say_what_the_gates_records_give():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
-    results = read_results([ROOT / "results" / "gates"])
+    results = results_of("gates")
     world, reward, sight, ammo, defend, colour, augmented, replay, horizon = results.asked
     for trained, title in ((False, "gate tasks"), (True, "training tasks")):
         for scenario, _, *cells in result_table(results, world, trained=trained).rows[:-1]:
@@ -263,7 +269,7 @@ def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     summary = page.partition("## In short")[2].partition("\n## ")[0]
     named = set(re.findall(r"-?\d+\.\d \[-?\d+\.\d, -?\d+\.\d\]", summary))
-    results = read_results([ROOT / "results" / "gates"])
+    results = results_of("gates")
     gains = {row[2].text for gate in results.asked for row in comparison_table(results, gate).rows}
     assert len(named) > 10
     assert named <= gains

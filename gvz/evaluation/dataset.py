@@ -71,11 +71,11 @@ _IDENTITY = ("run_dir", "player", "params", "profile", "action_set", "frame_skip
 _NOT_RECORDS = {"discarded", "work", "checkpoints", "policies", "tensorboard"}
 """directories of a run that hold no records, or only discarded ones"""
 
-_PYTHON_TYPES: dict[pl.DataType, tuple[type, ...]] = {
-    pl.String(): (str,),
-    pl.Int64(): (int,),
-    pl.Float64(): (int, float),
-    pl.Boolean(): (bool,),
+_PYTHON_TYPES: dict[type[pl.DataType], tuple[type, ...]] = {
+    pl.String: (str,),
+    pl.Int64: (int,),
+    pl.Float64: (int, float),
+    pl.Boolean: (bool,),
 }
 
 
@@ -201,10 +201,11 @@ def _what_is_wrong(row: dict[str, Any]) -> str | None:
 
 def fits(value: Any, dtype: pl.DataType) -> bool:
     """Whether a value of JSON has a place in a column of texts, booleans, or finite numbers of 64 bits."""
-    if type(value) not in _PYTHON_TYPES[dtype]:
+    if type(value) not in _PYTHON_TYPES[type(dtype)]:
         return False
     if isinstance(value, str):
-        return not any("\ud800" <= letter <= "\udfff" for letter in value)  # halves of a pair, which no file can hold
+        # no file can hold halves of a pair
+        return value.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in value)
     return -(2**63) <= value < 2**63 if isinstance(value, int) else math.isfinite(value)
 
 

@@ -92,9 +92,11 @@ class RayCluster:
         return json.loads(line)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def cluster() -> Iterator[RayCluster]:
-    """Of all tests together, in one worker; a test that ends a node adds one."""
+    """Of all tests of this folder together; a test that ends a node adds one. Ray takes processor time as long as it is
+    there.
+    """
     made = RayCluster(3, num_cores=1)
     yield made
     made.close()

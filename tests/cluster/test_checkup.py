@@ -8,8 +8,6 @@ import pytest
 from gvz.cluster.checkup import closed_ports, security
 from gvz.run import shared_directory
 
-pytestmark = pytest.mark.xdist_group("ray")
-
 
 @pytest.mark.e2e
 def test_every_node_is_checked(cluster, tmp_path):

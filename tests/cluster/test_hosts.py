@@ -31,7 +31,7 @@ from gvz.transport.messages import EpisodeStats, Fault, ParamsHeader, Ready
 from tests.cluster.conftest import FAKE_GAMES, RayCluster
 from tests.processes import arguments
 
-pytestmark = [pytest.mark.e2e, pytest.mark.xdist_group("ray")]
+pytestmark = pytest.mark.e2e
 DEADLINE_S = 200.0
 ROOT = Path(__file__).parents[2]
 NUM_ACTORS = 4
@@ -173,6 +173,7 @@ def test_a_learner_that_takes_nothing_holds_the_hosts_back_and_a_lane_gets_its_t
     played.checker.assigned = {1: 0, 6: 1}
     for lane, task in played.checker.assigned.items():
         played.pool.assign(lane, task)
+    played.until(lambda: {1, 6} <= played.checker.last.keys())
     played.until(lambda: all(played.checker.last[lane]["task"] == task for lane, task in ((1, 0), (6, 1))))
     assert played.pool.statistics().waited_for_space_s > 0.5
     state = played.pool.state()

@@ -24,7 +24,6 @@ pytestmark = [
     pytest.mark.e2e,
     pytest.mark.engine,
     pytest.mark.timeout(900),
-    pytest.mark.xdist_group("ray"),
 ]
 METRICS_PAGE = Path(__file__).parents[2] / "docs" / "reference" / "metrics.md"
 SMALL = (

@@ -22,7 +22,6 @@ from gvz.experiments import inventory
 from gvz.experiments.plan import read_plan
 from tests.processes import arguments
 
-pytestmark = pytest.mark.xdist_group("ray")
 RUN = "rainbow_4task/defend_the_center/train4/seed_1111"
 DRIVER = """
 import sys

@@ -13,7 +13,6 @@ from gvz.core import addresses
 from gvz.core.errors import ConfigError, ResourceError
 from tests.cluster.conftest import RayCluster
 
-pytestmark = pytest.mark.xdist_group("ray")
 CONNECT = """
 import sys
 from gvz.cluster.session import connect

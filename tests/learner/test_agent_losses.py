@@ -17,6 +17,8 @@ from learner.replay import Transitions
 from tests.learner import reference
 from tests.learner.small_agents import ALL_OFF, RAINBOW, SPEC, A, B, batch, jitted, made_up_params
 
+with_noise = jax.jit(add_noise, static_argnums=2)
+
 
 def values(config: ValueConfig, params, obs, atoms=None) -> tuple[np.ndarray, np.ndarray]:
     """(logits, Q) in float64, of the network whose weights are the means of `params`."""
@@ -56,7 +58,7 @@ def test_rainbow_loss_is_its_equations_in_float64_with_a_noise_each_for_online_t
     key_online, key_target, key_selector = jax.random.split(jax.random.key(7), 3)
     atoms = np.linspace(SPEC.v_min, SPEC.v_max, config.num_atoms) if distributional else None
     online, moved_target, chooser = (
-        add_noise(p, key, "factorized")
+        with_noise(p, key, "factorized")
         for p, key in ((params, key_online), (target, key_target), (params, key_selector))
     )
     logits_tm1, q_tm1 = values(config, online, b.obs_tm1, atoms)

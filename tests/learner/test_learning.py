@@ -25,6 +25,7 @@ from learner.agents.base import Agent, AgentSpec, make_agent
 from learner.agents.configs.rainbow import RainbowConfig
 from learner.config import LearnerConfig, ReplayConfig, ValueConfig, change_agent
 from learner.replay import ReplaySpec
+from tests import compiling
 from tests.learner.games import (
     Game,
     catch,
@@ -139,7 +140,7 @@ def compiled(training: Training) -> Callable[[Array], tuple[Any, Array]]:
 
     It is XLA's optimized code that differs between instruction sets.
     """
-    plain = {} if "xla_cpu_max_isa" in os.environ.get("XLA_FLAGS", "") else {"xla_backend_optimization_level": 0}
+    plain = {} if "xla_cpu_max_isa" in os.environ.get("XLA_FLAGS", "") else compiling.TRAINING
     return jax.jit(partial(train, training), compiler_options=plain)
 
 
@@ -259,7 +260,6 @@ def value_error(seed: int, config: ValueConfig) -> float:
     return float(np.mean(errors))
 
 
-@pytest.mark.xdist_group("delayed")  # they share a compiled training
 @pytest.mark.parametrize("part", [{"n_steps": 5}, {"dueling": True}], ids=["n-step returns", "dueling streams"])
 def test_values_of_a_delayed_reward_are_learnt_sooner_with(part: dict[str, Any], learning_seed, record_property):
     """n steps carry a reward n states back at once; where 16 actions do the same, a common value learns from all.

@@ -23,6 +23,7 @@ from learner.agents.configs.pqn import PQNConfig
 from learner.config import OnPolicyConfig
 from learner.rollouts import RolloutSpec
 from learner.store import Store
+from tests import compiling
 from tests.learner.games import Game, catch, first_records, greedy_returns, observation, play, umbrella
 
 pytestmark = pytest.mark.isa
@@ -57,7 +58,7 @@ class Training:
 @cache
 def compiled(training: Training) -> Callable[[Array], Array]:
     """As test_learning.compiled."""
-    plain = {} if "xla_cpu_max_isa" in os.environ.get("XLA_FLAGS", "") else {"xla_backend_optimization_level": 0}
+    plain = {} if "xla_cpu_max_isa" in os.environ.get("XLA_FLAGS", "") else compiling.TRAINING
     return jax.jit(partial(train, training), compiler_options=plain)
 
 

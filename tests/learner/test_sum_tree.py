@@ -14,6 +14,7 @@ from scipy import stats
 
 from learner import sum_tree
 from learner.sum_tree import FANOUT, SumTree
+from tests import compiling
 from tests.learner.sum_trees import check_valid
 
 NUM_LEAVES = (1, FANOUT - 1, FANOUT, FANOUT**2, FANOUT**2 + 1, 1000)
@@ -22,6 +23,7 @@ set_leaves = jax.jit(sum_tree.set, donate_argnums=0)
 get_leaves = jax.jit(lambda tree: sum_tree.get(tree, jnp.arange(tree.num_leaves + 3)))
 total = jax.jit(sum_tree.total)
 draw = jax.jit(sum_tree.sample, static_argnames="batch_size")
+draw_many = jax.jit(sum_tree.sample, static_argnames="batch_size", compiler_options=compiling.MUCH)
 
 
 def tree_of(values) -> SumTree:
@@ -150,7 +152,8 @@ def test_a_million_leaves_are_drawn_in_proportion_and_those_of_zero_never():
     check_valid(tree)
     exact = math.fsum(values)
     assert abs(float(total(tree)) - exact) <= 4 * 5 * 2.0**-24 * exact  # four additions in each of five levels
-    drawn = [np.asarray(draw(tree, key, batch_size)[0]) for key in jax.random.split(jax.random.key(4), num_batches)]
+    keys = jax.random.split(jax.random.key(4), num_batches)
+    drawn = [np.asarray(draw_many(tree, key, batch_size)[0]) for key in keys]
     counts = np.bincount(np.concatenate(drawn), minlength=num_leaves)
     assert counts.size == num_leaves
     assert not counts[values == 0].any(), "drew a leaf of zero"
@@ -175,7 +178,7 @@ def test_a_leaf_below_the_rounding_step_of_the_total_gets_its_share():
     """4096 leaves of 1/256 behind one of 2^20, where float32 steps are 1/8: without the finer bits only every 32nd
     of them could ever be drawn."""
     tree = tree_of([2.0**20, *[2.0**-8] * 4096])
-    hits = [np.asarray(draw(tree, jax.random.key(seed), 2**17)[0]) for seed in range(24)]
+    hits = [np.asarray(draw_many(tree, jax.random.key(seed), 2**17)[0]) for seed in range(24)]
     small = np.concatenate(hits)
     small = small[small > 0]
     expected = 24 * 2**17 * 16 / (2**20 + 16)

@@ -15,7 +15,7 @@ from gvz.scenarios.compiler import compile_task
 from gvz.tasks import named_tasks, parse_task, scenarios
 from tests.scenarios.conftest import bad_lines
 
-pytestmark = [pytest.mark.engine, pytest.mark.xdist_group("games")]
+pytestmark = pytest.mark.engine
 
 
 THESIS = tuple((task.id, "thesis") for task in named_tasks())

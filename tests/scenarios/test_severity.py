@@ -116,7 +116,6 @@ def test_a_whole_attribute_is_in_force_in_its_share_of_the_episodes():
 
 
 @pytest.mark.engine
-@pytest.mark.xdist_group("games")
 @pytest.mark.parametrize("job", HALF, ids="-".join)
 def test_games_at_half_severity_are_what_they_say(measured, job):
     found = measured(HALF, job)
@@ -139,7 +138,6 @@ def test_games_at_half_severity_are_what_they_say(measured, job):
 
 
 @pytest.mark.engine
-@pytest.mark.xdist_group("games")
 def test_textures_at_a_severity_are_between_those_of_both_tasks():
     names = ("default", "stone_wall=0.25", "stone_wall=0.5", "stone_wall=0.75", "stone_wall")
     frames = [task_frame(parse_task(f"defend_the_center/{name}"))[:90].astype(float) for name in names]
