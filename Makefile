@@ -54,9 +54,9 @@ learning-seeds: install ## ten seeds of every test of learning under three instr
 	    --timeout 1800 -q $(ARGS) || exit 1; \
 	done
 
-pipeline: install ## the thesis's experiments at a thousandth of their size, and their report, in runs/pipeline
+pipeline: install ## the thesis's experiments at a two-thousandth of their size, and their report, in runs/pipeline
 	$(BIN)/gvz experiment run $(EXPERIMENTS) \
-	  --results runs/pipeline --scale 0.001 --jobs 2
+	  --results runs/pipeline --scale 0.0005 --jobs 2
 	$(BIN)/gvz report runs/pipeline --out runs/pipeline/report
 
 test-browser: install ## reports opened in headless Chromium (Debian: apt-get install chromium)
