@@ -29,7 +29,7 @@ class SegmentationNetwork(nn.Module):
     Two convolutions of stride 2 make the cells. Two more look at what is around each at half that resolution; what they
     find is added to the cells. A last 3x3 convolution and a dense layer answer. On 96x168 pixels these are 35 million
     multiplications: 2.1 ms of processor time for OpenCV (2-core AMD EPYC, both cores busy, 2026-11-24), where a network
-    with half to two thirds of the channels took 1.3 ms.
+    with half to three quarters of the channels took 1.3 ms.
 
     Source: the form is that of U-Net (Ronneberger, Fischer and Brox 2015), with one level and sums in place of
     concatenations.
