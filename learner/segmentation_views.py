@@ -44,7 +44,7 @@ def changed_view(
         other_frame: u8[H W 3], from another task of the scenario: things may stand before it.
         other_labels: u8[H W], its labels.
         style: of OUTLINES, that of the frame's things.
-        known_styles: of OUTLINES, those that some task has: half of all styles that are drawn.
+        known_styles: of OUTLINES, those that some task has; at least half of the styles that are drawn are of these.
 
     Returns:
         (u8[H W 3], u8[H W]).

@@ -188,8 +188,6 @@ def test_a_varied_task_may_have_attributes_but_none_of_textures():
     assert parse_task(task.id) == task == pickle.loads(pickle.dumps(task))
     graded = parse_task("defend_the_center/varied+gore=0.5")
     assert (graded.id, graded.severity("gore")) == ("defend_the_center/varied+gore=0.5", 0.5)
-    shadows = parse_task("seek_and_kill/varied+shadows+obstacles+resized+mixed")
-    assert shadows.name == "varied+mixed_enemies+obstacles+resized_enemies+shadows"
 
 
 def test_a_procedural_task_has_a_split_a_number_of_maps_and_strengths():

@@ -158,7 +158,7 @@ def test_render_styles_let_the_surroundings_show_through():
         assert not drawn
 
 
-def test_outlines_are_drawn_anew_before_other_surroundings():
+def test_outlines_show_the_surroundings_that_they_are_put_before():
     """A shadow is a darker copy of what is behind it, so it cannot be taken along from its own frame."""
     frame, labels = parted()
     other, other_labels = np.full_like(frame, 90), np.full_like(labels, LABEL_CLASSES.index("wall"))
