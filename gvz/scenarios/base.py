@@ -330,7 +330,9 @@ class Task:
             )
         found = [self.scenario.attribute(name) for name in self.attributes]
         if self.maps is not None and (drawn := [one.name for one in found if "textures" in one.groups]):
-            raise TaskError(f"{self.scenario.id}: got {self.maps.name} and {drawn[0]}, but textures are drawn")
+            raise TaskError(
+                f"{self.scenario.id}: got {self.maps.name} and {drawn[0]}, but textures are drawn; leave one out"
+            )
         taken: dict[str, str] = {}
         for attribute in found:
             for group in attribute.groups:
