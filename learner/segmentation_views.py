@@ -3,11 +3,16 @@
 Labels say which pixels are walls, floors or things, so each can be changed by itself, and things can stand before
 surroundings that they were never seen in. On the host, by numpy and OpenCV.
 
+Frames have the size that the engine renders: there each pixel is of one thing alone, so a cut-out thing takes nothing
+of its old surroundings along. A frame is shrunk for the network last.
+
 Source: Tobin et al. 2017 (domain randomization: looks at random, so that the real one is one more); Ghiasi et al. 2021
 (copy-paste of things between frames).
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,18 +23,29 @@ Frame = np.ndarray
 """f32[H W 3], 0..255 or beside it until its light is changed"""
 
 _THINGS = ("enemy", "projectile", "kit", "poison", "other", "key")
-_DECORATIONS = ("scenery", "effect")
-_PARTS = (("wall",), ("plane",), _THINGS, _DECORATIONS)
+DECORATIONS = ("scenery", "effect")
+_PARTS = (("wall",), ("plane",), _THINGS, DECORATIONS)
 """what has colours of its own"""
+
+
+class Shot(NamedTuple):
+    """A frame of a task, as the engine renders it, and what it shows."""
+
+    frame: np.ndarray
+    """u8[H W 3]"""
+    labels: np.ndarray
+    """u8[H W], numbers of LABEL_CLASSES"""
+    depth: np.ndarray
+    """u8[H W], the engine's depth buffer: 0 is the nearest"""
+    style: str | None = None
+    """of OUTLINES, the engine's render style of the task's things"""
 
 
 def changed_view(
     rng: np.random.Generator,
-    frame: np.ndarray,
-    labels: np.ndarray,
-    other_frame: np.ndarray,
-    other_labels: np.ndarray,
-    style: str | None = None,
+    shot: Shot,
+    surroundings: Shot,
+    decorations: Shot | None = None,
     known_styles: Sequence[str] = (),
 ) -> tuple[np.ndarray, np.ndarray]:
     """A frame as it might look elsewhere, and its labels.
@@ -37,36 +53,106 @@ def changed_view(
     Three of five keep colours, textures and light, and most of these have other surroundings: so looks meet that are
     known from different tasks. In the others, looks change as well.
 
+    What is put before other surroundings is hidden where their walls and things are nearer. The floor of all maps of a
+    scenario is at one height, so things stand on it as they do in the game: far ones before far walls.
+
     Args:
         rng: of every choice.
-        frame: u8[H W 3].
-        labels: u8[H W], numbers of LABEL_CLASSES.
-        other_frame: u8[H W 3], from another task of the scenario: things may stand before it.
-        other_labels: u8[H W], its labels.
-        style: of OUTLINES, that of the frame's things.
+        shot: whose things are to be seen, and whose decorations.
+        surroundings: of another task of the scenario: things may stand before it.
+        decorations: further ones, which then stand there as well.
         known_styles: of OUTLINES, those that some task has; at least half of the styles that are drawn are of these.
 
     Returns:
         (u8[H W 3], u8[H W]).
     """
-    view, surroundings = frame.astype(np.float32), other_frame.astype(np.float32)
+    view, labels = shot.frame.astype(np.float32), shot.labels
     elsewhere, other_looks = rng.random(2) < (0.7, 0.4)
     if elsewhere:
+        behind = _Scene.of(surroundings)
         if other_looks:
-            surroundings = _other_parts(rng, surroundings, other_labels)
+            behind.view = _other_parts(rng, behind.view, behind.labels)
             view = _other_colours(rng, view, 0.5)
-        before = cv2.copyTo(view, _is(labels, _DECORATIONS), surroundings)
-        if style is not None:
-            view = _STYLES[style](rng, view, before)
-        elif rng.random() < 0.5:
+        if decorations is not None:
+            behind.add(decorations.frame.astype(np.float32), decorations, DECORATIONS)
+        behind.add(view, shot, DECORATIONS)
+        style = shot.style
+        if style is None and rng.random() < 0.5:
             names = known_styles if known_styles and rng.random() < 0.5 else tuple(_STYLES)
-            view = _STYLES[names[int(rng.integers(len(names)))]](rng, view, before)
-        view = cv2.copyTo(view, _is(labels, _THINGS), before)
-        labels = cv2.copyTo(labels, _is(labels, _THINGS + _DECORATIONS), other_labels.copy())
+            style = names[int(rng.integers(len(names)))]
+        if style is not None:
+            view = _STYLES[style](rng, view, behind.view)
+        behind.add(view, shot, _THINGS)
+        view, labels = behind.view, behind.labels
     elif other_looks:
         view = _other_parts(rng, view, labels)
-    changed = _other_light(rng, view) if other_looks else np.clip(view, 0, 255).astype(np.uint8)
-    return _other_place(rng, changed, labels) if rng.random() < 0.7 else (changed, labels)
+    return _other_light(rng, view) if other_looks else np.clip(view, 0, 255).astype(np.uint8), labels
+
+
+def in_front(shot: Shot, labels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """u8[H W]: 1 where nothing of these labels and depths hides what the shot shows. Floors and ceilings hide nothing.
+
+    The engine draws a sprite whole that reaches below the floor.
+    """
+    return ((shot.depth <= depth) | (labels == LABEL_CLASSES.index("plane"))).astype(np.uint8)
+
+
+def num_things_in_front(shot: Shot, surroundings: Shot) -> int:
+    """Pixels of a shot's things and decorations that would be seen before these surroundings."""
+    seen = _is(shot.labels, _THINGS + DECORATIONS) * in_front(shot, surroundings.labels, surroundings.depth)
+    return int(np.count_nonzero(seen))
+
+
+@dataclass
+class _Scene:
+    """What has been put together so far."""
+
+    view: Frame
+    labels: np.ndarray
+    depth: np.ndarray
+
+    @classmethod
+    def of(cls, shot: Shot) -> "_Scene":
+        return cls(shot.frame.astype(np.float32), shot.labels.copy(), shot.depth.copy())
+
+    def add(self, view: Frame, shot: Shot, classes: tuple[str, ...]) -> None:
+        """Puts what a shot shows of these classes before the scene, with the looks that it has in `view`."""
+        seen = _is(shot.labels, classes) * in_front(shot, self.labels, self.depth)
+        for new, old in ((view, self.view), (shot.labels, self.labels), (shot.depth, self.depth)):
+            cv2.copyTo(new, seen, old)
+
+
+def shrunk(view: np.ndarray, labels: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """A frame u8[H W 3] and its labels u8[H W] in another size, as `network_input` shrinks a screen."""
+    size = (width, height)
+    return cv2.resize(view, size, interpolation=cv2.INTER_LINEAR), cv2.resize(
+        labels, size, interpolation=cv2.INTER_NEAREST
+    )
+
+
+def moved(
+    rng: np.random.Generator, view: np.ndarray, labels: np.ndarray, height: int, width: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `shrunk`, but larger or smaller by up to 1.4, wider or narrower by 1.2, and up to a tenth of the height aside.
+
+    Edges are mirrored.
+    """
+    ratio_y, ratio_x = height / labels.shape[0], width / labels.shape[1]
+    scale_y = np.exp(rng.uniform(-0.35, 0.35))
+    scale_x = scale_y * np.exp(rng.uniform(-0.2, 0.2))
+    x, y = rng.uniform(-height / 10, height / 10, 2)
+
+    def line(scale: float, ratio: float, size: int, offset: float) -> tuple[float, float]:
+        """(slope, start): where a pixel of the frame comes to lie; the middle stays, but for the offset."""
+        return scale * ratio, scale * (ratio - size) / 2 + (size - 1) / 2 + offset
+
+    (slope_x, start_x), (slope_y, start_y) = line(scale_x, ratio_x, width, x), line(scale_y, ratio_y, height, y)
+    move = np.array([[slope_x, 0, start_x], [0, slope_y, start_y]])
+
+    def warped(picture: np.ndarray, how: int) -> np.ndarray:
+        return cv2.warpAffine(picture, move, (width, height), flags=how, borderMode=cv2.BORDER_REFLECT)
+
+    return warped(view, cv2.INTER_LINEAR), warped(labels, cv2.INTER_NEAREST)
 
 
 def mirrored(rng: np.random.Generator, frame: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -156,19 +242,3 @@ def _other_light(rng: np.random.Generator, view: Frame) -> np.ndarray:
         levels = 255 * (np.arange(256) / 255) ** np.exp(rng.normal(0, 0.4))
         changed = cv2.LUT(changed, np.rint(levels).astype(np.uint8))
     return changed
-
-
-def _other_place(rng: np.random.Generator, view: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Larger or smaller by up to 1.4, wider or narrower by 1.2, moved by up to 10 pixels; edges are mirrored."""
-    height, width = labels.shape
-    scale_y = np.exp(rng.uniform(-0.35, 0.35))
-    scale_x = scale_y * np.exp(rng.uniform(-0.2, 0.2))
-    x, y = rng.uniform(-10, 10, 2)
-    move = np.array(
-        [[scale_x, 0, (width - 1) / 2 * (1 - scale_x) + x], [0, scale_y, (height - 1) / 2 * (1 - scale_y) + y]]
-    )
-
-    def moved(picture: np.ndarray, how: int) -> np.ndarray:
-        return cv2.warpAffine(picture, move, (width, height), flags=how, borderMode=cv2.BORDER_REFLECT)
-
-    return moved(view, cv2.INTER_LINEAR), moved(labels, cv2.INTER_NEAREST)

@@ -92,8 +92,8 @@ class TrainSegmenter:
             segment, scores = Segmenter(str(self.out)), {}
             for task in named_tasks(self.scenario, split="gate"):
                 show("tasks", len(scores), len(scores) + 1, f"scores on {task.id}")
-                frames, labels, _ = labelled_frames(task, self.gate_frames)
-                scores[task.id] = score(np.stack([segment(frame) for frame in frames]), labels)
+                gate = labelled_frames(task, self.gate_frames)
+                scores[task.id] = score(np.stack([segment(frame) for frame in gate.frames]), gate.labels)
         record = {
             "scenario": self.scenario,
             "tasks": [task.id for task in tasks],

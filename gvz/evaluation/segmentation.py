@@ -1,8 +1,10 @@
 """Frames with the engine's labels, to train a segmentation network on and to score it by."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from gvz.core.env_config import LABEL_CLASSES, SIGHT_CLASSES, EnvConfig
@@ -12,18 +14,34 @@ from gvz.evaluation.players import Player, RandomPlayer, ScriptedPlayer
 from gvz.scenarios.base import Task
 from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, network_input
 from learner.segmentation import CELL
-from learner.segmentation_views import OUTLINES, changed_view, mirrored
+from learner.segmentation_views import (
+    DECORATIONS,
+    OUTLINES,
+    Shot,
+    changed_view,
+    mirrored,
+    moved,
+    num_things_in_front,
+    shrunk,
+)
 
 
 class Labelled(NamedTuple):
-    """Frames of a task."""
+    """Frames of a task, as the engine renders them."""
 
     frames: np.ndarray
-    """u8[N INPUT_HEIGHT INPUT_WIDTH 3]"""
+    """u8[N H W 3]"""
     labels: np.ndarray
-    """u8[N INPUT_HEIGHT INPUT_WIDTH], numbers of LABEL_CLASSES"""
+    """u8[N H W], numbers of LABEL_CLASSES"""
+    depths: np.ndarray
+    """u8[N H W], the engine's depth buffer"""
     style: str | None = None
     """the engine's render style of the task's things, if it shows nothing of them but their outline"""
+
+    def shot(self, rng: np.random.Generator) -> Shot:
+        """One of the frames, drawn at random."""
+        number = rng.integers(len(self.frames))
+        return Shot(self.frames[number], self.labels[number], self.depths[number], self.style)
 
 
 CLASS_WEIGHTS = np.where(np.isin(LABEL_CLASSES, ("wall", "plane", "weapon")), 1.0, 8.0).astype(np.float32)
@@ -35,6 +53,11 @@ _DECISIONS_APART = 5
 _FRAMES_PER_EPISODE = 60
 _CLEAN_SHARE = 0.3
 """of a batch's frames that are only mirrored"""
+_MOVED_SHARE = 0.7
+_DECORATED_SHARE = 0.5
+"""of the other frames"""
+_TRIES = 3
+"""surroundings that are drawn; those are taken that hide least"""
 _MIN_CELLS = 100
 """that show a class, for a score of it"""
 
@@ -45,8 +68,9 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
     Raises:
         EngineError: the engine does not start, or dies.
     """
-    frames, labels, episode = [], [], 0
-    config = EnvConfig(frame_height=INPUT_HEIGHT, frame_width=INPUT_WIDTH, buffers=("labels",))
+    frames, labels, depths, episode = [], [], [], 0
+    height, width = EnvConfig().render_height, EnvConfig().render_width
+    config = EnvConfig(frame_height=height, frame_width=width, buffers=("depth", "labels"))
     env = DoomEnv(task, config)
     try:
         while len(frames) < num_frames:
@@ -59,6 +83,7 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
                 if decision % _DECISIONS_APART == 0:
                     frames.append(observation["screen"])
                     labels.append(observation["labels"][:, :, 0])
+                    depths.append(observation["depth"][:, :, 0])
                 observation, _, terminated, truncated, info = env.step(player.act())
                 player.observe(observation, info)
                 if terminated or truncated or len(frames) == num_frames:
@@ -67,29 +92,38 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
     finally:
         env.close()
     styles = (task.scenario.attribute(name).content.entity.get("RenderStyle") for name in task.attributes)
-    return Labelled(np.stack(frames), np.stack(labels), next((str(one) for one in styles if one in OUTLINES), None))
+    style = next((str(one) for one in styles if one in OUTLINES), None)
+    return Labelled(np.stack(frames), np.stack(labels), np.stack(depths), style)
 
 
 def training_batches(tasks: Sequence[Labelled], batch_size: int, seed: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Batches without end: (network inputs f32[B 3 H W], labels u8[B H W]), each frame of a task drawn at random."""
     rng = np.random.default_rng(seed)
     styles = sorted({task.style for task in tasks if task.style is not None})
+    decorated = [
+        task for task in tasks if np.isin(task.labels, [LABEL_CLASSES.index(name) for name in DECORATIONS]).any()
+    ]
+
+    def drawn(tasks: Sequence[Labelled]) -> Shot:
+        return tasks[int(rng.integers(len(tasks)))].shot(rng)
+
     while True:
         inputs, answers = [], []
         for _ in range(batch_size):
-            (frame, labels, style), (other, other_labels, _) = _drawn(rng, tasks), _drawn(rng, tasks)
-            if rng.random() >= _CLEAN_SHARE:
-                frame, labels = changed_view(rng, frame, labels, other, other_labels, style, styles)
+            shot = drawn(tasks)
+            frame, labels, is_changed = shot.frame, shot.labels, rng.random() >= _CLEAN_SHARE
+            if is_changed:
+                decorations = drawn(decorated) if decorated and rng.random() < _DECORATED_SHARE else None
+                surroundings = max((drawn(tasks) for _ in range(_TRIES)), key=partial(num_things_in_front, shot))
+                frame, labels = changed_view(rng, shot, surroundings, decorations, styles)
+            if is_changed and rng.random() < _MOVED_SHARE:
+                frame, labels = moved(rng, frame, labels, INPUT_HEIGHT, INPUT_WIDTH)
+            else:
+                frame, labels = shrunk(frame, labels, INPUT_HEIGHT, INPUT_WIDTH)
             frame, labels = mirrored(rng, frame, labels)
             inputs.append(network_input(np.ascontiguousarray(frame)))
             answers.append(labels)
         yield np.stack(inputs), np.stack(answers)
-
-
-def _drawn(rng: np.random.Generator, tasks: Sequence[Labelled]) -> Labelled:
-    frames, labels, style = tasks[int(rng.integers(len(tasks)))]
-    number = rng.integers(len(frames))
-    return Labelled(frames[number], labels[number], style)
 
 
 def score(probabilities: np.ndarray, labels: np.ndarray) -> Mapping[str, float]:
@@ -99,9 +133,11 @@ def score(probabilities: np.ndarray, labels: np.ndarray) -> Mapping[str, float]:
 
     Args:
         probabilities: f32[N h w C], C as LABEL_CLASSES.
-        labels: u8[N H W].
+        labels: u8[N H W], of any size.
     """
     n, h, w, _ = probabilities.shape
+    size = (w * CELL, h * CELL)
+    labels = np.stack([cv2.resize(one, size, interpolation=cv2.INTER_NEAREST) for one in labels])
     cells = labels.reshape(n, h, CELL, w, CELL).swapaxes(2, 3).reshape(n, h, w, CELL * CELL)
     found = {}
     for name in SIGHT_CLASSES:

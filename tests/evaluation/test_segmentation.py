@@ -1,11 +1,13 @@
 """Labelled frames of the real engine, batches of them, and scores of what a network says."""
 
 import itertools
+from contextlib import closing
 
 import numpy as np
 import pytest
 
 from gvz.core.env_config import LABEL_CLASSES
+from gvz.env import DoomEnv
 from gvz.evaluation import segmentation
 from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, network_input
 from gvz.tasks import parse_task
@@ -45,15 +47,37 @@ def test_a_cell_shows_a_class_if_an_eighth_of_its_pixels_do():
 @pytest.mark.engine
 def test_labelled_frames_are_the_same_each_time_and_show_what_the_task_has():
     task = parse_task("defend_the_center/gore")
-    frames, labels, style = segmentation.labelled_frames(task, 90)
-    assert style is None
-    assert frames.shape == (90, INPUT_HEIGHT, INPUT_WIDTH, 3)
-    assert labels.shape == (90, INPUT_HEIGHT, INPUT_WIDTH)
-    again, labels_again, _ = segmentation.labelled_frames(task, 90)
-    np.testing.assert_array_equal(frames, again)
-    np.testing.assert_array_equal(labels, labels_again)
-    assert {LABEL_CLASSES[n] for n in np.unique(labels)} >= {"wall", "plane", "weapon", "enemy", "scenery"}
-    assert len({frame.tobytes() for frame in frames}) > 80, "few frames are alike"
+    found, again = (segmentation.labelled_frames(task, 90) for _ in range(2))
+    assert found.style is None
+    assert found.frames.shape == (90, 144, 256, 3)
+    assert found.labels.shape == found.depths.shape == (90, 144, 256)
+    for one, other in zip(found[:3], again[:3], strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert {LABEL_CLASSES[n] for n in np.unique(found.labels)} >= {"wall", "plane", "weapon", "enemy", "scenery"}
+    assert len({frame.tobytes() for frame in found.frames}) > 80, "few frames are alike"
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("task", ["seek_and_kill/default", "seek_and_kill/shadows", "defend_the_center/fuzzy_enemies"])
+def test_depth_is_that_of_things_even_of_those_that_are_drawn_as_outlines(task: str):
+    """The composition of frames needs this. The enemies are taken away: what was behind them has more depth."""
+    with closing(DoomEnv(task, frame_height=144, frame_width=256, buffers=("depth", "labels"))) as env:
+        observation, _ = env.reset(options={"episode_seed": 1})
+        assert env._engine is not None
+        for _ in range(30):  # turns until one is in sight
+            if (observation["labels"] == ENEMY).sum() > 40:
+                break
+            observation, *_ = env.step(env.unwrapped.action_meanings.index(("TURN_LEFT",)))
+        depth, labels = observation["depth"][:, :, 0], observation["labels"][:, :, 0]
+        for kind in ("Demon", "MarineChainsawVzd"):
+            env._engine.command(f"remove {kind}")
+        env._engine.advance([False] * len(env.task.scenario.buttons), 1)
+        state = env._engine.state()
+        assert state is not None
+        assert (labels == ENEMY).sum() > 40
+        behind = state.depth_buffer[labels == ENEMY]
+        assert np.median(behind - depth[labels == ENEMY].astype(int)) > 0
+        assert not depth[labels == LABEL_CLASSES.index("weapon")].any(), "nothing is put before the weapon"
 
 
 @pytest.mark.engine
@@ -67,7 +91,9 @@ def test_batches_hold_network_inputs_and_labels_of_all_tasks():
     rng = np.random.default_rng(0)
     tasks = [
         segmentation.Labelled(
-            rng.integers(0, 256, (5, INPUT_HEIGHT, INPUT_WIDTH, 3), dtype=np.uint8), np.full((5, 96, 168), n, np.uint8)
+            rng.integers(0, 256, (5, 144, 256, 3), dtype=np.uint8),
+            np.full((5, 144, 256), n, np.uint8),
+            np.full((5, 144, 256), 9, np.uint8),
         )
         for n in (ENEMY, KIT)
     ]

@@ -85,14 +85,29 @@ def parted(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return np.random.default_rng(seed).integers(0, 256, (48, 60, 3), dtype=np.uint8), labels
 
 
+WALL, PLANE, ENEMY, SCENERY = (LABEL_CLASSES.index(name) for name in ("wall", "plane", "enemy", "scenery"))
+
+
+def shot(frame: np.ndarray, labels: np.ndarray, depth: int = 10, style: str | None = None) -> views.Shot:
+    return views.Shot(frame, labels, np.full_like(labels, depth), style)
+
+
+def filled(colour: int, label: int, depth: int = 20) -> views.Shot:
+    """A frame that shows one thing alone, behind all others."""
+    return shot(np.full((48, 60, 3), colour, np.uint8), np.full((48, 60), label, np.uint8), depth)
+
+
+def inner(found: np.ndarray, label: int) -> np.ndarray:
+    """The pixels of a label that are not at an edge."""
+    return cv2.erode(np.uint8(found == label), np.ones((5, 5)), borderValue=0) > 0
+
+
 def test_a_changed_view_has_the_things_of_one_frame_and_the_surroundings_of_either():
-    frame, labels = parted()
-    other, other_labels = np.zeros_like(frame), np.full_like(labels, LABEL_CLASSES.index("scenery"))
-    seen = set()
+    one, seen = shot(*parted()), set()
     for seed in range(200):
-        view, found = views.changed_view(np.random.default_rng(seed), frame, labels, other, other_labels)
-        assert (view.shape, view.dtype) == (frame.shape, np.uint8)
-        assert (found.shape, found.dtype) == (labels.shape, np.uint8)
+        view, found = views.changed_view(np.random.default_rng(seed), one, filled(0, SCENERY))
+        assert (view.shape, view.dtype) == (one.frame.shape, np.uint8)
+        assert (found.shape, found.dtype) == (one.labels.shape, np.uint8)
         names = {LABEL_CLASSES[number] for number in np.unique(found)}
         assert "enemy" in names
         seen.add(frozenset(names - {"enemy"}))
@@ -103,37 +118,98 @@ def test_a_changed_view_has_the_things_of_one_frame_and_the_surroundings_of_eith
 
 def test_things_stand_before_other_surroundings_that_keep_their_looks_in_every_fifth_view():
     frame, labels = parted()
-    frame[labels == LABEL_CLASSES.index("enemy")] = (200, 10, 10)
-    other, other_labels = np.full_like(frame, 90), np.full_like(labels, LABEL_CLASSES.index("wall"))
+    frame[labels == ENEMY] = (200, 10, 10)
     alike = 0
     for seed in range(400):
-        view, found = views.changed_view(np.random.default_rng(seed), frame, labels, other, other_labels)
-        inner = cv2.erode(np.uint8(found == LABEL_CLASSES.index("wall")), np.ones((5, 5)), borderValue=0) > 0
-        enemy = cv2.erode(np.uint8(found == LABEL_CLASSES.index("enemy")), np.ones((5, 5)), borderValue=0) > 0
-        alike += bool((view[inner] == 90).all() and enemy.any() and (view[enemy] == (200, 10, 10)).all())
+        view, found = views.changed_view(np.random.default_rng(seed), shot(frame, labels), filled(90, WALL))
+        wall, enemy = inner(found, WALL), inner(found, ENEMY)
+        alike += bool((view[wall] == 90).all() and enemy.any() and (view[enemy] == (200, 10, 10)).all())
     assert 60 <= alike <= 110, "400 * 0.7 * 0.6 * 0.5: elsewhere, no other looks, no render style"
+
+
+def test_things_are_hidden_where_the_surroundings_are_nearer():
+    """An enemy at depth 10 before a wall whose left half is at 5 and whose right half is at 15."""
+    one, behind = shot(*parted()), filled(90, WALL)
+    behind.depth[:, :30], behind.depth[:, 30:] = 5, 15
+    elsewhere = 0
+    for seed in range(60):
+        _, found = views.changed_view(np.random.default_rng(seed), one, behind)
+        if PLANE not in found:
+            elsewhere += 1
+            np.testing.assert_array_equal(found[:, :30], WALL)
+            np.testing.assert_array_equal(found[:, 30:40], ENEMY)
+    assert elsewhere > 20
+
+
+def test_floors_hide_nothing():
+    """The engine draws a sprite whole that reaches below the floor."""
+    near, far = filled(90, PLANE, 5), filled(90, WALL, 20)
+    near.labels[:, 30:] = WALL
+    one = shot(*parted())
+    assert views.num_things_in_front(one, far) == 48 * 20, "the enemy's columns, 20 to 39"
+    assert views.num_things_in_front(one, near) == 48 * 10
+    np.testing.assert_array_equal(views.in_front(one, near.labels, near.depth), near.labels == PLANE)
+
+
+def test_decorations_of_a_third_frame_stand_among_the_things_by_their_depth():
+    """At depth 15 they are before the wall at 20 and behind the enemy at 10; at depth 5 they hide it."""
+    for depth, before in ((15, ENEMY), (5, SCENERY)):
+        third, elsewhere = filled(30, SCENERY, depth), 0
+        for seed in range(60):
+            _, found = views.changed_view(np.random.default_rng(seed), shot(*parted()), filled(90, WALL), third)
+            if PLANE not in found:
+                elsewhere += 1
+                assert set(np.unique(found)) == {SCENERY, before}
+        assert elsewhere > 20
 
 
 def test_a_view_that_is_moved_takes_its_labels_along():
     """The picture shows the labels themselves, so that they can be compared after the move."""
     _, labels = parted()
-    picture = np.repeat(60.0 * labels[..., None], 3, axis=-1).astype(np.float32)
-    moved = 0
+    picture = np.repeat(60 * labels[..., None], 3, axis=-1)
+    middle = []
     for seed in range(30):
-        view, found = views._other_place(np.random.default_rng(seed), picture, labels)
-        inside = cv2.erode((found == np.roll(found, 1, axis=1)).astype(np.uint8), np.ones((1, 5))) > 0
-        np.testing.assert_allclose(view[inside][:, 0], 60.0 * found[inside], atol=1e-3)
-        moved += (found != labels).any()
-    assert moved == 30
+        view, found = views.moved(np.random.default_rng(seed), picture, labels, 32, 40)
+        assert (view.shape, found.shape) == ((32, 40, 3), (32, 40))
+        inside = cv2.erode((found == np.roll(found, 1, axis=1)).astype(np.uint8), np.ones((1, 7)), borderValue=0) > 0
+        np.testing.assert_allclose(view[inside][:, 0], 60.0 * found[inside], atol=1)
+        enemy = np.flatnonzero((found == LABEL_CLASSES.index("enemy")).any(axis=0))
+        middle.append((enemy.mean(), len(enemy)))
+    centres, widths = np.array(middle).T
+    assert 15 < centres.min() < 18, "the middle of 40 columns, moved by up to 3.2"
+    assert 21 < centres.max() < 24
+    assert widths.min() < 11 < 16 < widths.max(), "13.3 columns, by a factor of 0.58 to 1.73"
+
+
+def test_a_shrunk_frame_is_what_the_network_sees_of_a_screen():
+    """Labels are shrunk with it: on a screen that shows the labels themselves, only edges differ."""
+    _, labels = parted()
+    picture = np.repeat(60 * labels[..., None], 3, axis=-1)
+    view, found = views.shrunk(picture, labels, 32, 40)
+    np.testing.assert_array_equal(view, cv2.resize(picture, (40, 32), interpolation=cv2.INTER_LINEAR))
+    assert (view[..., 0] != 60 * found).mean() < 0.1
+
+
+def test_a_cut_out_thing_takes_nothing_of_its_old_surroundings_along():
+    """A white enemy from before a white wall, put before a black one: a pixel is white or black until it is shrunk."""
+    labels = np.zeros((48, 60), np.uint8)
+    cv2.circle(labels, (30, 24), 9, ENEMY, -1)
+    one, cut_out = shot(np.full((48, 60, 3), 255, np.uint8), labels), 0
+    for seed in range(60):
+        view, found = views.changed_view(np.random.default_rng(seed), one, filled(0, WALL))
+        enemy = found == ENEMY
+        if not view[~enemy].any() and view.any():  # before the black wall, and its light as it was
+            cut_out += 1
+            assert np.ptp(view[enemy], axis=0).max() == 0 or view[enemy].max() < 255, "or it has a render style"
+    assert cut_out > 10
 
 
 def test_decorations_go_along_with_the_things():
     frame, labels = parted()
-    labels[:24, :20] = LABEL_CLASSES.index("scenery")
-    other, other_labels = np.zeros_like(frame), np.full_like(labels, LABEL_CLASSES.index("plane"))
+    labels[:24, :20] = SCENERY
     for seed in range(60):
-        _, found = views.changed_view(np.random.default_rng(seed), frame, labels, other, other_labels)
-        assert LABEL_CLASSES.index("scenery") in found
+        _, found = views.changed_view(np.random.default_rng(seed), shot(frame, labels), filled(0, PLANE))
+        assert SCENERY in found
 
 
 def test_render_styles_let_the_surroundings_show_through():
@@ -160,15 +236,11 @@ def test_render_styles_let_the_surroundings_show_through():
 
 def test_outlines_show_the_surroundings_that_they_are_put_before():
     """A shadow is a darker copy of what is behind it, so it cannot be taken along from its own frame."""
-    frame, labels = parted()
-    other, other_labels = np.full_like(frame, 90), np.full_like(labels, LABEL_CLASSES.index("wall"))
-    shades = []
+    shades, one = [], shot(*parted(), style="STYLE_Shadow")
     for seed in range(100):
-        rng = np.random.default_rng(seed)
-        view, found = views.changed_view(rng, frame, labels, other, other_labels, "STYLE_Shadow", ["STYLE_Shadow"])
-        inner = cv2.erode(np.uint8(found == LABEL_CLASSES.index("wall")), np.ones((5, 5)), borderValue=0) > 0
-        enemy = cv2.erode(np.uint8(found == LABEL_CLASSES.index("enemy")), np.ones((5, 5)), borderValue=0) > 0
-        if (view[inner] == 90).all() and LABEL_CLASSES.index("plane") not in found and enemy.any():
+        view, found = views.changed_view(np.random.default_rng(seed), one, filled(90, WALL), None, ["STYLE_Shadow"])
+        enemy = inner(found, ENEMY)
+        if (view[inner(found, WALL)] == 90).all() and PLANE not in found and enemy.any():
             shades.append(view[enemy].mean() / 90)
     assert len(shades) > 20
     assert all(0.54 <= shade <= 0.76 for shade in shades)
@@ -176,14 +248,13 @@ def test_outlines_show_the_surroundings_that_they_are_put_before():
 
 def test_half_of_the_styles_that_are_drawn_are_known_ones():
     frame, labels = parted()
-    frame[labels == LABEL_CLASSES.index("enemy")] = (200, 10, 10)
-    other, other_labels = np.full_like(frame, 90), np.full_like(labels, LABEL_CLASSES.index("wall"))
+    frame[labels == ENEMY] = (200, 10, 10)
     shadows = {(): 0, ("STYLE_Shadow",): 0}
     for known in shadows:
         for seed in range(400):
             rng = np.random.default_rng(seed)
-            view, found = views.changed_view(rng, frame, labels, other, other_labels, None, known)
-            enemy = cv2.erode(np.uint8(found == LABEL_CLASSES.index("enemy")), np.ones((5, 5)), borderValue=0) > 0
+            view, found = views.changed_view(rng, shot(frame, labels), filled(90, WALL), None, known)
+            enemy = inner(found, ENEMY)
             shadows[known] += enemy.any() and np.ptp(view[enemy]) == 0 and 48 <= view[enemy].max() <= 69
     assert 5 <= shadows[()] <= 40, "400 * 0.7 * 0.6 * 0.5 / 4 = 21"
     assert 35 <= shadows["STYLE_Shadow",] <= 75, "400 * 0.7 * 0.6 * 0.5 * 5 / 8 = 53"

@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 
-from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, Segmenter, segmented_frame
-from learner.segmentation_views import changed_view
+from gvz.segmentation import Segmenter, segmented_frame
+from learner.segmentation_views import Shot, changed_view
 
 
 def test_a_segmented_frame_of_the_rendered_screen_on_one_thread(benchmark):
@@ -19,7 +19,14 @@ def test_a_segmented_frame_of_the_rendered_screen_on_one_thread(benchmark):
 
 def test_a_changed_view(benchmark):
     rng = np.random.default_rng(0)
-    frames = rng.integers(0, 256, (2, INPUT_HEIGHT, INPUT_WIDTH, 3), dtype=np.uint8)
-    labels = rng.integers(0, 11, (2, INPUT_HEIGHT, INPUT_WIDTH), dtype=np.uint8)
-    arguments = (frames[0], labels[0], frames[1], labels[1])
-    benchmark.pedantic(lambda: changed_view(rng, *arguments), rounds=200, warmup_rounds=5)
+    size = (144, 256)
+    shots = [
+        Shot(
+            *(
+                rng.integers(0, high, shape, dtype=np.uint8)
+                for high, shape in ((256, (*size, 3)), (11, size), (99, size))
+            )
+        )
+        for _ in range(3)
+    ]
+    benchmark.pedantic(lambda: changed_view(rng, *shots), rounds=200, warmup_rounds=5)
