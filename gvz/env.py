@@ -152,6 +152,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         self._state: GameState | None = None
         self._observation: Observation | None = None
         self._playing = False
+        self._held: list[bool] | None = None
+        """the buttons of the last decision"""
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -180,6 +182,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             self._stop_engine()
         engine, crash = self._begin()
         self._engine_episodes += 1
+        self._repeat_rng, self._held = np.random.default_rng(self._episode_seed), None
         self._screen = engine.screen
         self._start_tic = engine.tic()
         self._read(engine)
@@ -211,9 +214,11 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             action = int(np.ravel_multi_index(tuple(held), tuple(self.action_space.nvec)))
         elif not 0 <= action < len(self._actions):
             raise ValueError(f"DoomEnv.step: action {action!r}, want 0..{len(self._actions) - 1}")
+        if self._repeat_rng.random() >= self.config.repeat_action_probability or self._held is None:
+            self._held = self._actions[action]
         tics = min(self.config.frame_skip, self._timeout_frames - self._frames)
         try:
-            terminated = not engine.advance(self._actions[action], tics)
+            terminated = not engine.advance(self._held, tics)
         except EngineError as error:
             return self._crashed(error)
         self._read(engine)

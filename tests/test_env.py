@@ -5,7 +5,8 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ from gymnasium.error import ResetNeeded
 
 import gvz
 from gvz.core.errors import ConfigError, ResourceError, TaskError
+from gvz.engine.engine import Engine
 from gvz.env import DoomEnv, is_solved, make_env
 from gvz.tasks import parse_task
 from tests.episodes import TURN, fingerprint, idle_to_the_end, play
@@ -197,6 +199,33 @@ def test_steps_outside_an_episode_are_refused(shared: DoomEnv):
 
 
 # --------------------------------------------------------------------------------------------------- seeds
+
+
+def test_sticky_actions_hold_the_buttons_of_the_decision_before_with_their_probability(monkeypatch):
+    """What was held is read on its way to the engine, and played again without sticky actions: the same episode."""
+    held: list[list[bool]] = []
+    advance = Engine.advance
+    monkeypatch.setattr(
+        Engine, "advance", lambda self, buttons, tics: held.append(buttons) or advance(self, buttons, tics)
+    )
+
+    def played(actions: Sequence[int], probability: float) -> list[bytes]:
+        held.clear()
+        with closing(DoomEnv("dodge_projectiles/default", repeat_action_probability=probability)) as env:
+            env.reset(options={"episode_seed": 3})
+            return [env.step(action)[0].tobytes() for action in actions]
+
+    actions = np.random.default_rng(0).integers(3, size=80).tolist()
+    buttons = [[True, False, False], [False, True, False], [False, False, True]]
+    frames = played(actions, 0.25)
+    was_held = [buttons.index(each) for each in held]
+    assert was_held[0] == actions[0]
+    could_repeat = [n for n in range(1, 80) if actions[n] != was_held[n - 1]]
+    repeated = [n for n in could_repeat if was_held[n] == was_held[n - 1]]
+    assert all(was_held[n] == actions[n] for n in range(80) if n not in repeated)
+    assert 0.1 <= len(repeated) / len(could_repeat) <= 0.4
+    assert played(actions, 0.25) == frames, "an episode's seed decides what is repeated"
+    assert played(was_held, 0.0) == frames
 
 
 @pytest.mark.parametrize("task", ["defend_the_center/complete", "health_gathering/lava+supreme+short_agent"])

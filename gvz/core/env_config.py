@@ -52,6 +52,9 @@ class EnvConfig:
     segmenter trains one); default: that of the scenario's name"""
     frame_skip: int = 4
     """game tics an action is held; one decision = frame_skip frames"""
+    repeat_action_probability: float = 0.0
+    """sticky actions, for training: with this probability a decision's buttons stay those of the decision before.
+    Evaluations have none (Machado et al. 2018)"""
     render_width: int = 256
     """width the engine renders, pixels (must be a ViZDoom screen resolution with render_height)"""
     render_height: int = 144
@@ -94,6 +97,10 @@ class EnvConfig:
             if not low <= value <= high:
                 raise ConfigError(f"env.{name}: got {value}, want {low}..{high}")
 
+        if not 0.0 <= self.repeat_action_probability < 1.0:
+            raise ConfigError(
+                f"env.repeat_action_probability: got {self.repeat_action_probability}, want at least 0 and less than 1"
+            )
         if self.sight and self.frame_width < SIGHT_COLUMNS:
             raise ConfigError(f"env.frame_width: got {self.frame_width} with env.sight, want {SIGHT_COLUMNS} or more")
 

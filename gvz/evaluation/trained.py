@@ -4,6 +4,7 @@ Nothing that a run directory holds or names is executed or unpickled. Who wants 
 its own names that file.
 """
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -129,7 +130,7 @@ def trained_player(run_dir: Path, config: RunConfig, num_updates: int) -> Player
     }
     return PlayerSpec(
         make_player=partial(TrainedPlayer, run_dir, num_updates, config.agent_file),
-        env=config.env,
+        env=dataclasses.replace(config.env, repeat_action_probability=0.0),  # of training alone
         identity=row_identity(player, config.env),
     )
 

@@ -1,0 +1,19 @@
+"""A gate: does an agent dodge new missiles better if it learned with sticky actions?"""
+
+from gvz.experiments.gate import Gate
+
+EXPERIMENT = Gate(
+    name="gate_sticky",
+    title="Gate: sticky actions in training",
+    question="An agent whose actions may come late must move before a missile is near. Does it dodge faster ones?",
+    configs=("rainbow_segmented",),
+    variants={
+        "plain": {},
+        "sticky_25": {"env.repeat_action_probability": 0.25},
+        "sticky_50": {"env.repeat_action_probability": 0.5},
+    },
+    scenarios=("dodge_projectiles",),
+    trainings=("train8",),
+    max_processor_s=900.0,
+    notes=("Evaluations have no sticky actions.",),
+)
