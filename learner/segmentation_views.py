@@ -164,7 +164,7 @@ def _is(labels: np.ndarray, classes: tuple[str, ...]) -> np.ndarray:
     """u8[H W], 1 where the label is one of the classes."""
     chosen = np.zeros(256, np.uint8)
     chosen[[LABEL_CLASSES.index(name) for name in classes]] = 1
-    return chosen[labels]
+    return cv2.LUT(labels, chosen)
 
 
 def _other_colours(rng: np.random.Generator, view: Frame, strength: float) -> Frame:
