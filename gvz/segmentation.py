@@ -15,8 +15,8 @@ from gvz.core.env_config import LABEL_CLASSES, EnvConfig
 from gvz.core.errors import ConfigError, nearest
 
 SEGMENTERS = Path(__file__).parent / "segmenters"
-INPUT_HEIGHT, INPUT_WIDTH = 96, 168
-"""pixels of the screen that a network sees"""
+INPUT_HEIGHT, INPUT_WIDTH = 144, 252
+"""pixels of the screen that a new network sees: nearly all that the engine renders"""
 CLASS_COLOURS = {
     "wall": (0, 0, 0),
     "plane": (0, 0, 60),
@@ -39,8 +39,7 @@ class Segmenter:
 
     Args:
         name: of a network that comes with GViZDoom (`segmenter_names`), or the path of an ONNX file with one input,
-            float32 [1, 3, INPUT_HEIGHT, INPUT_WIDTH], and one output, the probabilities of LABEL_CLASSES
-            [1, 11, h, w].
+            float32 [1, 3, H, W], and one output, the probabilities of LABEL_CLASSES [1, 11, h, w].
 
     Raises:
         ConfigError: no such network, or not such a file.
@@ -55,8 +54,9 @@ class Segmenter:
         options.log_severity_level = 4  # what it logs comes as an exception, too
         try:
             self._network = onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])
-            self._input = self._network.get_inputs()[0].name
-            found = self(np.zeros((INPUT_HEIGHT, INPUT_WIDTH, 3), np.uint8)).shape
+            (frame,) = self._network.get_inputs()
+            self._input, (_, _, self._height, self._width) = frame.name, frame.shape
+            found = self(np.zeros((self._height, self._width, 3), np.uint8)).shape
         except Exception as error:  # its errors have no class in common
             raise ConfigError(f"env.segmenter: {file} is no segmentation network: {error}") from error
         if found[2] != len(LABEL_CLASSES):
@@ -66,13 +66,14 @@ class Segmenter:
 
     def __call__(self, screen: np.ndarray) -> np.ndarray:
         """The screen u8[H W 3] -> probabilities of LABEL_CLASSES f32[h w 11]."""
-        probabilities = np.asarray(self._network.run(None, {self._input: network_input(screen)[None]})[0])
+        frame = network_input(screen, self._height, self._width)
+        probabilities = np.asarray(self._network.run(None, {self._input: frame[None]})[0])
         return np.moveaxis(probabilities[0], 0, -1)
 
 
-def network_input(screen: np.ndarray) -> np.ndarray:
-    """The screen u8[H W 3] as a network sees it: f32[3 INPUT_HEIGHT INPUT_WIDTH], mean 0, deviation about 1."""
-    small = cv2.resize(screen, (INPUT_WIDTH, INPUT_HEIGHT), interpolation=cv2.INTER_LINEAR)
+def network_input(screen: np.ndarray, height: int = INPUT_HEIGHT, width: int = INPUT_WIDTH) -> np.ndarray:
+    """The screen u8[H W 3] as a network sees it: f32[3 height width], mean 0, deviation about 1."""
+    small = cv2.resize(screen, (width, height), interpolation=cv2.INTER_LINEAR)
     mean, deviation = cv2.meanStdDev(small.reshape(-1, 1))
     return (np.moveaxis(small, -1, 0) - np.float32(mean[0, 0])) / np.float32(deviation[0, 0] + 12.75)
 

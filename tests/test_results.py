@@ -183,6 +183,40 @@ def test_the_findings_say_how_well_segmentation_networks_find_things():
             assert f"| `{task}` | {' | '.join(cells)} |" in page
 
 
+def test_the_findings_say_what_putting_frames_together_gave():
+    page = (ROOT / "docs" / "FINDINGS.md").read_text()
+    record = json.loads((ROOT / "results" / "gates" / "segmenters" / "compositions.json").read_text())
+
+    def row(title: str, task: str, measure: str) -> str:
+        """Of every form of the networks: a number of the task, or a dash."""
+        cells = []
+        for form in ("before", "rendered_size", "by_depth", "144x252_pixels"):
+            found = record["networks"][form]["tasks"].get(task)
+            values = {} if found is None else found | found["average_precision"]
+            cells.append(f"{values[measure]:.2f}" if values else "-")
+        return f"| {title} | {' | '.join(cells)} |"
+
+    for title, task, measure in (
+        ("shadows before red walls: average precision", "seek_and_kill/red+shadows", "enemy"),
+        (
+            "decorations before a stone wall: mean probability of an enemy",
+            "defend_the_center/gore+stone_wall",
+            "enemy_at_scenery",
+        ),
+        ("enemies among these: average precision", "defend_the_center/gore+stone_wall", "enemy"),
+        (
+            "fuzzy enemies before mossy bricks: average precision",
+            "defend_the_center/fuzzy_enemies+mossy_bricks",
+            "enemy",
+        ),
+        ("mixed enemies before blue walls: average precision", "seek_and_kill/blue+mixed_enemies", "enemy"),
+    ):
+        assert row(title, task, measure) in page
+        assert task in {pair.id for pair in named_tasks(task.partition("/")[0], split="pairs")}
+    numbers = record["put_together"]["seek_and_kill/red+shadows"]
+    assert f"average precision of {numbers['put_together']:.2f}, and with {numbers['real']:.2f}" in page
+
+
 def test_the_findings_say_what_six_times_the_time_gave():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     for folder, seconds in (("general_short", "900 s"), ("general", "5,400 s")):

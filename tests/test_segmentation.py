@@ -19,7 +19,7 @@ from gvz.segmentation import (
     segmenter_names,
 )
 from gvz.tasks import scenarios
-from learner.segmentation import SegmentationNetwork, write_onnx
+from learner.segmentation import CELL, SegmentationNetwork, write_onnx
 
 
 def write_network(file: Path, num_classes: int = len(LABEL_CLASSES), height: int = INPUT_HEIGHT) -> Path:
@@ -93,7 +93,7 @@ def test_every_scenario_has_a_network_that_finds_what_the_labels_show(scenario: 
         env.reset(options={"episode_seed": seed})
         for _ in range(10):
             observation, _, terminated, *_ = env.step(1)
-            shown = (observation["labels"][:, :, 0] == number).reshape(24, 4, 42, 4).any(axis=(1, 3))
+            shown = (observation["labels"][:, :, 0] == number).reshape(24, CELL, 42, CELL).any(axis=(1, 3))
             sure = segment(observation["screen"])[..., number]
             if shown.any() and not terminated:
                 looked += 1
@@ -106,7 +106,7 @@ def test_every_scenario_has_a_network_that_finds_what_the_labels_show(scenario: 
 
 
 def test_input_has_the_shape_of_the_network_whatever_the_screen():
-    for height, width in ((144, 256), (480, 640), (96, 168)):
+    for height, width in ((144, 256), (480, 640), (120, 160)):
         assert network_input(np.zeros((height, width, 3), np.uint8)).shape == (3, INPUT_HEIGHT, INPUT_WIDTH)
     assert np.isfinite(network_input(np.zeros((144, 256, 3), np.uint8))).all(), "a black screen has no deviation"
 

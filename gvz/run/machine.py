@@ -13,7 +13,10 @@ import psutil
 
 ROOT = Path(__file__).parents[2]
 """of a checkout, or where the packages are installed"""
-PACKAGES = ("gvizdoom", "vizdoom", "gymnasium", "jax", "jaxlib", "flax", "optax", "numpy", "opencv-python-headless")
+PACKAGES = (
+    *("gvizdoom", "vizdoom", "gymnasium", "jax", "jaxlib", "flax", "optax"),
+    *("numpy", "opencv-python-headless", "onnxruntime"),
+)
 MEASURED = ("gvz", "actors", "learner", "configs")
 _GIT_TIMEOUT_S = 30
 _INSTRUCTION_SETS = {

@@ -15,7 +15,7 @@ from learner import segmentation_views as views
 from learner.segmentation import CELL, SegmentationNetwork, segmentation_loss, train_segmentation, write_onnx
 
 NUM_CLASSES = len(LABEL_CLASSES)
-H, W = 32, 40
+H, W = 36, 48
 
 
 def squares(seed: int, batch_size: int = 16) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -44,7 +44,7 @@ def test_the_loss_is_the_weighted_cross_entropy_of_every_pixel():
     np.testing.assert_allclose(found, total / weights, rtol=1e-5)
 
 
-@pytest.mark.parametrize(("height", "width"), [(96, 168), (32, 40), (40, 24)])
+@pytest.mark.parametrize(("height", "width"), [(144, 252), (36, 48), (48, 24)])
 def test_onnx_runtime_computes_what_the_network_does(tmp_path: Path, height: int, width: int):
     key, key_frames, key_biases = jax.random.split(jax.random.key(1), 3)
     network = SegmentationNetwork(NUM_CLASSES)
