@@ -190,7 +190,7 @@ def test_the_findings_say_what_putting_frames_together_gave():
     def row(title: str, task: str, measure: str) -> str:
         """Of every form of the networks: a number of the task, or a dash."""
         cells = []
-        for form in ("before", "rendered_size", "by_depth", "144x252_pixels"):
+        for form in ("before", "rendered_size", "by_depth", "144x252_pixels", "decorated"):
             found = record["networks"][form]["tasks"].get(task)
             values = {} if found is None else found | found["average_precision"]
             cells.append(f"{values[measure]:.2f}" if values else "-")

@@ -15,7 +15,6 @@ from gvz.scenarios.base import Task
 from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, network_input
 from learner.segmentation import CELL
 from learner.segmentation_views import (
-    DECORATIONS,
     OUTLINES,
     Shot,
     changed_view,
@@ -100,9 +99,7 @@ def training_batches(tasks: Sequence[Labelled], batch_size: int, seed: int) -> I
     """Batches without end: (network inputs f32[B 3 H W], labels u8[B H W]), each frame of a task drawn at random."""
     rng = np.random.default_rng(seed)
     styles = sorted({task.style for task in tasks if task.style is not None})
-    decorated = [
-        task for task in tasks if np.isin(task.labels, [LABEL_CLASSES.index(name) for name in DECORATIONS]).any()
-    ]
+    decorated = [task for task in tasks if (task.labels == LABEL_CLASSES.index("scenery")).any()]
 
     def drawn(tasks: Sequence[Labelled]) -> Shot:
         return tasks[int(rng.integers(len(tasks)))].shot(rng)

@@ -106,6 +106,21 @@ def test_batches_hold_network_inputs_and_labels_of_all_tasks():
         np.testing.assert_array_equal(labels, labels_again)
 
 
+def test_decorations_come_into_the_frames_of_tasks_that_have_none():
+    """One task of eight has decorations, and every fourth frame gets them: 0.7 changed, 0.7 elsewhere, half of these.
+
+    Puffs of shots, which every task has, are no decorations.
+    """
+    scenery, effect = LABEL_CLASSES.index("scenery"), LABEL_CLASSES.index("effect")
+    labels = np.zeros((8, 3, 144, 256), np.uint8)
+    labels[:, :, 40:60, 40:60], labels[0, :, 80:120, 100:140] = effect, scenery
+    frames = np.random.default_rng(0).integers(0, 256, (3, 144, 256, 3), dtype=np.uint8)
+    tasks = [segmentation.Labelled(frames, one, np.full((3, 144, 256), 9, np.uint8)) for one in labels]
+    batches = itertools.islice(segmentation.training_batches(tasks, 8, seed=0), 75)
+    shown = np.mean([(one == scenery).any() for _, answers in batches for one in answers])
+    assert 0.25 <= shown <= 0.45, "a quarter, and some of the 600 frames that are of this task"
+
+
 def test_a_network_sees_frames_of_mean_zero_whatever_their_light():
     rng = np.random.default_rng(0)
     screen = rng.integers(40, 120, (144, 256, 3), dtype=np.uint8)
