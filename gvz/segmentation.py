@@ -5,6 +5,9 @@ The network is an ONNX file, which ONNX Runtime runs on one thread: in 0.6 ms of
 labels; whoever plays needs none.
 """
 
+import dataclasses
+import shutil
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
@@ -15,6 +18,8 @@ from gvz.core.env_config import LABEL_CLASSES, EnvConfig
 from gvz.core.errors import ConfigError, nearest
 
 SEGMENTERS = Path(__file__).parent / "segmenters"
+KEPT_SEGMENTERS = "segmenters"
+"""directory of a run with the networks that it learns with"""
 INPUT_HEIGHT, INPUT_WIDTH = 144, 252
 """pixels of the screen that a new network sees: nearly all that the engine renders"""
 CLASS_COLOURS = {
@@ -38,15 +43,14 @@ class Segmenter:
     """A segmentation network.
 
     Args:
-        name: of a network that comes with GViZDoom (`segmenter_names`), or the path of an ONNX file with one input,
-            float32 [1, 3, H, W], and one output, the probabilities of LABEL_CLASSES [1, 11, h, w].
+        file: an ONNX file with one input, float32 [1, 3, H, W], and one output, the probabilities of LABEL_CLASSES
+            [1, 11, h, w].
 
     Raises:
-        ConfigError: no such network, or not such a file.
+        ConfigError: not such a file.
     """
 
-    def __init__(self, name: str):
-        file = segmenter_file(name)
+    def __init__(self, file: Path | str):
         import onnxruntime  # not before: it takes a third of a second, and most environments show the screen
 
         options = onnxruntime.SessionOptions()
@@ -89,33 +93,55 @@ def segmenter_names() -> list[str]:
     return sorted(file.stem for file in SEGMENTERS.glob("*.onnx"))
 
 
-def segmenter_file(name: str) -> Path:
-    """The file of a network.
+def segmenter_file(scenario: str, config: EnvConfig) -> Path:
+    """The file of a scenario's network: the configured one, or else that of the scenario's name.
 
     Raises:
-        ConfigError: there is none of this name.
+        ConfigError: there is none.
     """
-    file = Path(name) if name.endswith(".onnx") else SEGMENTERS / f"{name}.onnx"
+    name, known = config.segmenter or scenario, segmenter_names()
+    if name not in known and Path(name).is_dir():
+        kept = Path(name) / f"{scenario}.onnx"
+        file = kept if kept.is_file() else SEGMENTERS / kept.name
+    else:
+        file = Path(name) if name.endswith(".onnx") else SEGMENTERS / f"{name}.onnx"
     if not file.is_file():
-        known = segmenter_names()
         raise ConfigError(
-            f"env.segmenter: got {name!r}{nearest(name, known)}, want one of {', '.join(known) or 'none'}, or the path "
-            "of an .onnx file"
+            f"env.segmenter: got {name!r}{nearest(name, known)}, want one of {', '.join(known) or 'none'}, the path of "
+            "an .onnx file, or a directory of them"
         )
     return file
 
 
 def segmenter_of(scenario: str, config: EnvConfig) -> Segmenter:
-    """The network of segmented frames of a scenario: the configured one, or else that of the scenario's name.
-
-    One in a process serves all its games.
+    """A scenario's network. One in a process serves all its games.
 
     Raises:
         ConfigError: there is none.
     """
-    return _loaded(config.segmenter or scenario)
+    return _loaded(segmenter_file(scenario, config))
+
+
+def keep_segmenters(scenarios: Iterable[str], config: EnvConfig, directory: Path) -> None:
+    """Copies the networks of segmented frames into a directory, but those that it has.
+
+    A run keeps those that it has learned with: others would show its policies other frames.
+    """
+    if config.frames == "segmented":
+        directory.mkdir(exist_ok=True)
+        for scenario in scenarios:
+            kept = directory / f"{scenario}.onnx"
+            if not kept.exists():
+                unfinished = kept.with_suffix(".unfinished")
+                shutil.copyfile(segmenter_file(scenario, config), unfinished)
+                unfinished.replace(kept)
+
+
+def with_kept_segmenters(config: EnvConfig, directory: Path) -> EnvConfig:
+    """The configuration with the networks that `keep_segmenters` has put into a directory, if it has any."""
+    return dataclasses.replace(config, segmenter=str(directory)) if directory.is_dir() else config
 
 
 @cache
-def _loaded(name: str) -> Segmenter:
-    return Segmenter(name)
+def _loaded(file: Path) -> Segmenter:
+    return Segmenter(file)

@@ -14,9 +14,13 @@ from gvz.segmentation import (
     INPUT_HEIGHT,
     INPUT_WIDTH,
     Segmenter,
+    keep_segmenters,
     network_input,
     segmented_frame,
+    segmenter_file,
     segmenter_names,
+    segmenter_of,
+    with_kept_segmenters,
 )
 from gvz.tasks import scenarios
 from learner.segmentation import CELL, SegmentationNetwork, write_onnx
@@ -27,6 +31,10 @@ def write_network(file: Path, num_classes: int = len(LABEL_CLASSES), height: int
     network = SegmentationNetwork(num_classes)
     write_onnx(network.init(jax.random.key(0), np.zeros((1, height, INPUT_WIDTH, 3))), file, height, INPUT_WIDTH)
     return file
+
+
+def installed(scenario: str) -> Path:
+    return segmenter_file(scenario, EnvConfig(frames="segmented"))
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +94,7 @@ def test_every_scenario_has_a_network_that_finds_what_the_labels_show(scenario: 
     """
     kind = {"health_gathering": "kit"}.get(scenario, "enemy")
     assert scenario in segmenter_names()
-    segment, number = Segmenter(scenario), LABEL_CLASSES.index(kind)
+    segment, number = segmenter_of(scenario, EnvConfig()), LABEL_CLASSES.index(kind)
     env = DoomEnv(f"{scenario}/default", frame_height=INPUT_HEIGHT, frame_width=INPUT_WIDTH, buffers=("labels",))
     hits = looked = 0
     for seed in range(6):
@@ -111,11 +119,25 @@ def test_input_has_the_shape_of_the_network_whatever_the_screen():
     assert np.isfinite(network_input(np.zeros((144, 256, 3), np.uint8))).all(), "a black screen has no deviation"
 
 
+def test_kept_networks_stay_what_they_were(tmp_path: Path, network: str):
+    """Also where other networks are installed or configured later."""
+    directory, config = tmp_path / "segmenters", EnvConfig(frames="segmented", segmenter=network)
+    assert with_kept_segmenters(config, directory) == config
+    keep_segmenters(["seek_and_kill"], config, directory)
+    keep_segmenters(["seek_and_kill", "dodge_projectiles"], EnvConfig(frames="segmented"), directory)
+    kept = with_kept_segmenters(EnvConfig(frames="segmented"), directory)
+    assert segmenter_file("seek_and_kill", kept).read_bytes() == Path(network).read_bytes()
+    assert segmenter_file("dodge_projectiles", kept).read_bytes() == installed("dodge_projectiles").read_bytes()
+    assert segmenter_file("health_gathering", kept) == installed("health_gathering"), "of a scenario that it lacks"
+    keep_segmenters(["seek_and_kill"], EnvConfig(), tmp_path / "none")
+    assert not (tmp_path / "none").exists(), "frames of the screen need no network"
+
+
 def test_what_is_no_network_is_refused_by_name(tmp_path: Path):
     with pytest.raises(ConfigError, match=r"env\.segmenter: got 'seek_and_kil' \(did you mean 'seek_and_kill'\?\)"):
         DoomEnv("seek_and_kill/default", frames="segmented", segmenter="seek_and_kil")
     with pytest.raises(ConfigError, match=r"got '/nowhere/mine\.onnx', want one of .*seek_and_kill"):
-        Segmenter("/nowhere/mine.onnx")
+        segmenter_of("seek_and_kill", EnvConfig(frames="segmented", segmenter="/nowhere/mine.onnx"))
     (tmp_path / "text.onnx").write_text("no network")
     with pytest.raises(ConfigError, match=r"text\.onnx is no segmentation network"):
         Segmenter(str(tmp_path / "text.onnx"))

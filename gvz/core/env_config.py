@@ -49,7 +49,7 @@ class EnvConfig:
     what a network takes each pixel of the screen for"""
     segmenter: str = ""
     """the network of segmented frames: one that comes with GViZDoom, by its name, or the path of an ONNX file (gvz
-    segmenter trains one); default: that of the scenario's name"""
+    segmenter trains one), or of a directory with a file for each scenario; default: that of the scenario's name"""
     frame_skip: int = 4
     """game tics an action is held; one decision = frame_skip frames"""
     repeat_action_probability: float = 0.0

@@ -23,6 +23,7 @@ from gvz.evaluation.episode_log import row_identity
 from gvz.evaluation.play import PlayerSpec
 from gvz.run.config import RunConfig
 from gvz.run.config_files import config_from_dict
+from gvz.segmentation import KEPT_SEGMENTERS, segmenter_file, with_kept_segmenters
 from gvz.tasks import Task
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ class Values:
 
 
 def read_run_config(run_dir: Path, agent_file: Path | None = None) -> RunConfig:
-    """The configuration a run was trained with.
+    """The configuration a run was trained with. Segmented frames are of the networks that the run has kept.
 
     `agent_file` is the Python file of its agent, if that is none of learner/agents; playing executes it.
 
@@ -53,11 +54,12 @@ def read_run_config(run_dir: Path, agent_file: Path | None = None) -> RunConfig:
     """
     file = run_dir / "config.json"
     try:
-        return config_from_dict(json.loads(file.read_text()), agent_file)
+        config = config_from_dict(json.loads(file.read_text()), agent_file)
     except OSError as error:
         raise ConfigError(f"{run_dir} is not a run directory ({file.name}: {error.strerror})") from error
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{file} cannot be read: {error}") from error
+    return dataclasses.replace(config, env=with_kept_segmenters(config.env, run_dir / KEPT_SEGMENTERS))
 
 
 def check_tasks(config: RunConfig, tasks: Sequence[Task]) -> None:
@@ -120,6 +122,9 @@ def trained_player(run_dir: Path, config: RunConfig, num_updates: int) -> Player
     digest = hashlib.blake2b(digest_size=8)
     for leaf in jax.tree.leaves(params):
         digest.update(np.asarray(leaf, np.float32).tobytes())
+    if config.env.frames == "segmented":
+        for scenario in config.table.scenarios:
+            digest.update(segmenter_file(scenario.id, config.env).read_bytes())
     name = f"{config.name}/seed_{config.seed}"
     player = {
         "player": f"{name}@{num_updates}",

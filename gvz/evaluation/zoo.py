@@ -1,7 +1,8 @@
 """Trained policies that come with GViZDoom: one file each, which holds a run directory.
 
 Wherever a command takes a run directory, `zoo:NAME` stands for such a policy. Its file is a zip archive with the run's
-configuration, its newest policy, its records of training, and the evaluation episodes of this policy (its score card).
+configuration, its newest policy, the networks of its segmented frames, its records of training, and the evaluation
+episodes of this policy (its score card).
 """
 
 import contextlib
@@ -90,6 +91,7 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", agent_file: Path 
     from gvz.core import records
     from gvz.evaluation.trained import find_checkpoints, read_params, read_run_config, trained_player
     from gvz.run.config_files import config_to_dict
+    from gvz.segmentation import KEPT_SEGMENTERS, keep_segmenters
     from learner import checkpoint as checkpoints
 
     if not name.replace("_", "").replace("-", "").isalnum():
@@ -104,10 +106,12 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", agent_file: Path 
             if (run_dir / record).exists():
                 shutil.copy(run_dir / record, packed)
         _keep_some_rows(packed / "metrics.jsonl")
-        saved = config_to_dict(dataclasses.replace(config, run_dir=None))  # no path of this machine
+        keep_segmenters([scenario.id for scenario in config.table.scenarios], config.env, packed / KEPT_SEGMENTERS)
+        env = dataclasses.replace(config.env, segmenter="")
+        saved = config_to_dict(dataclasses.replace(config, env=env, run_dir=None))  # no path of this machine
         (packed / RECORDS[0]).write_text(json.dumps(saved, indent=2) + "\n")
         checkpoints.write(packed / "policies" / str(num_updates), _rounded(params), {"num_updates": num_updates})
-        player = trained_player(packed, config, num_updates)
+        player = trained_player(packed, read_run_config(packed, agent_file), num_updates)
         rows = [row for row in records.read_stored(run_dir / RECORDS[-1])[0] if player.identity.items() <= row.items()]
         (packed / RECORDS[-1]).write_text("".join(json.dumps(row) + "\n" for row in rows))
         file = Path(shutil.make_archive(str(packed), "zip", packed))

@@ -1,7 +1,7 @@
 """The run directory: its paths, its lock, its records. Reports read records, never checkpoints.
 
     config.json  checkpoints/  metrics.jsonl  episodes.jsonl  faults.jsonl  starts.jsonl  tensorboard/
-    work/ (logs of the actors)
+    segmenters/ (the networks of its segmented frames)  work/ (logs of the actors)
 
 The directory is private to its user. The lengths of its record files stand in every checkpoint: a resumed run moves to
 `discarded/` what a killed one wrote after its last checkpoint.

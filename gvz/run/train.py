@@ -28,6 +28,7 @@ from gvz.run.restore import note_start, restore, state_checked
 from gvz.run.rundir import RunDir
 from gvz.run.saver import Saver, Snapshot
 from gvz.run.telemetry import Telemetry
+from gvz.segmentation import KEPT_SEGMENTERS, keep_segmenters, with_kept_segmenters
 from gvz.transport.messages import EpisodeStats, Fault, ParamsHeader
 from learner.checkpoint import Restored
 from learner.memory import keep_freed_memory
@@ -205,6 +206,17 @@ class Trainer:
         return Snapshot({**self._learner.arrays(), "acting": self._published_params}, self._learner.params, host)
 
 
+def with_own_segmenters(config: RunConfig, run: RunDir) -> RunConfig:
+    """The configuration with the run's own copies of its segmentation networks: a later version of GViZDoom may have
+    others. Other hosts have no copies; there, games use the networks that are installed.
+    """
+    own = run.path / KEPT_SEGMENTERS
+    keep_segmenters([scenario.id for scenario in config.table.scenarios], config.env, own)
+    if config.cluster.hosts:
+        return config
+    return dataclasses.replace(config, env=with_kept_segmenters(config.env, own))
+
+
 def train(config: RunConfig, run: RunDir, stop: StopRequest) -> int:
     """Trains, resuming if the run directory holds a checkpoint.
 
@@ -223,7 +235,7 @@ def train(config: RunConfig, run: RunDir, stop: StopRequest) -> int:
         for line in janitor.clean_dead_instances():
             progress.say(f"removed what a dead run left: {line}")
         group = join(config, progress.say)
-        parts = assemble(config, run.work)
+        parts = assemble(with_own_segmenters(config, run), run.work)
         progress.say("\n".join(parts.footprint.lines()))
         footprint.check(parts.footprint)
         acting = jax.ShapeDtypeStruct((parts.pool_config.num_params,), jnp.float32)

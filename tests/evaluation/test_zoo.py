@@ -1,17 +1,22 @@
 """Policies of the zoo: packed, unpacked, played."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 
 from gvz import cli
+from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError
 from gvz.evaluation import zoo
 from gvz.evaluation.episode_log import read_rows
-from gvz.evaluation.trained import read_params, read_run_config
+from gvz.evaluation.trained import read_params, read_run_config, trained_player
 from gvz.evaluation.zoo import pack, run_directory, zoo_names
-from tests.evaluation.policies import CONFIG
+from gvz.run.rundir import RunDir
+from gvz.segmentation import segmenter_file
+from tests.evaluation.policies import CONFIG, write_policy
+from tests.test_segmentation import write_network
 
 
 @pytest.fixture(autouse=True)
@@ -36,6 +41,28 @@ def test_a_packed_policy_is_the_runs_rounded(run):
     pack(directory, "one")
     _, twice = read_params(run_directory("zoo:one"), CONFIG, 20)
     assert all(np.array_equal(*pair) for pair in zip(jax.tree.leaves(after), jax.tree.leaves(twice), strict=True))
+
+
+def test_a_packed_policy_has_the_network_of_its_segmented_frames(tmp_path):
+    network = write_network(tmp_path / "fresh.onnx")
+    env = EnvConfig(frames="segmented", segmenter=str(network), frame_height=24, frame_width=42)
+    config, run = dataclasses.replace(CONFIG, env=env), tmp_path / "run"
+    with RunDir(run) as directory:
+        directory.write_config(config)
+    write_policy(run, config, 20)
+    pack(run, "one")
+    network.unlink()
+    packed = run_directory("zoo:one")
+    found = read_run_config(packed)
+    kept = segmenter_file("defend_the_center", found.env)
+    assert kept.is_relative_to(packed)
+    assert str(tmp_path / "fresh.onnx") not in (packed / "config.json").read_text(), "no path of this machine"
+    identity = trained_player(packed, found, 20).identity
+    pack(packed, "two")
+    again = read_run_config(run_directory("zoo:two"))
+    assert trained_player(run_directory("zoo:two"), again, 20).identity == identity
+    kept.write_bytes(kept.read_bytes() + b"another network")
+    assert trained_player(packed, found, 20).identity != identity, "these would be episodes of another player"
 
 
 @pytest.mark.parametrize("num_rows", [0, 3, 201, 1001])

@@ -3,13 +3,14 @@
 import cv2
 import numpy as np
 
-from gvz.segmentation import Segmenter, segmented_frame
+from gvz.core.env_config import EnvConfig
+from gvz.segmentation import segmented_frame, segmenter_of
 from learner.segmentation_views import Shot, changed_view
 
 
 def test_a_segmented_frame_of_the_rendered_screen_on_one_thread(benchmark):
     screen = np.random.default_rng(0).integers(0, 256, (144, 256, 3), dtype=np.uint8)
-    segment, threads = Segmenter("seek_and_kill"), cv2.getNumThreads()
+    segment, threads = segmenter_of("seek_and_kill", EnvConfig()), cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
         benchmark.pedantic(lambda: segmented_frame(segment(screen), 42, 24), rounds=200, warmup_rounds=5)

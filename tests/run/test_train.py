@@ -9,19 +9,21 @@ import numpy as np
 import pytest
 
 from actors.config import ActorsConfig
+from gvz.cluster.config import ClusterConfig
 from gvz.core import records
 from gvz.core.env_config import EnvConfig
 from gvz.core.stop import StopRequest
 from gvz.run.config import LogConfig, RunConfig
 from gvz.run.curriculum_config import CurriculumConfig
 from gvz.run.rundir import RunDir
-from gvz.run.train import train
+from gvz.run.train import train, with_own_segmenters
 from learner.agents.configs.dqn import DQNConfig
 from learner.agents.configs.ppo import PPOConfig
 from learner.agents.configs.pqn import PQNConfig
 from learner.agents.configs.rainbow import RainbowConfig
 from learner.config import LearnerConfig, OnPolicyConfig, ReplayConfig
 from tests.e2e.command import arrays_of
+from tests.test_segmentation import write_network
 
 pytestmark = pytest.mark.engine
 
@@ -49,6 +51,24 @@ def go_on(path: Path, config: RunConfig, total_updates: int) -> None:
     config = replace(config, learner=replace(config.learner, total_updates=total_updates))
     with RunDir(path) as run:
         assert train(config, run, StopRequest()) == 0
+
+
+def test_a_run_keeps_the_network_of_its_segmented_frames_and_goes_on_with_it(tmp_path):
+    network, path = write_network(tmp_path / "fresh.onnx"), tmp_path / "run"
+    env = EnvConfig(frames="segmented", segmenter=str(network), frame_height=24, frame_width=32)
+    config, first = replace(DQN, env=env), network.read_bytes()
+    go_on(path, config, 20)
+    network.write_text("no network")
+    go_on(path, config, 40)
+    assert (path / "segmenters" / "defend_the_center.onnx").read_bytes() == first
+    with RunDir(path) as run:
+        saved = run.saved_config()
+        assert saved is not None
+        assert saved.env.segmenter == str(network), "what was asked for"
+        on_hosts = replace(
+            config, cluster=ClusterConfig(address="127.0.0.1:6379", hosts=2), mode="async", replay=ReplayConfig()
+        )
+        assert with_own_segmenters(on_hosts, run).env == env, "another host has no copies"
 
 
 def test_a_run_ends_when_its_processor_time_is_used_up_and_is_then_done_until_it_gets_more(tmp_path):
