@@ -302,8 +302,10 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             return self._observation
         if self.config.frames == "segmented":
             assert self._segmenter is not None
-            probabilities = self._segmenter(engine.screen)
-            self._observation = segmented_frame(probabilities, self.config.frame_width, self.config.frame_height)
+            config = self.config
+            self._observation = segmented_frame(
+                self._segmenter(engine.screen), config.frame_width, config.frame_height, config.segmenter_temperature
+            )
             return self._observation
         self._observation = observe_screen(engine.screen, self.config)
         if self.config.buffers:

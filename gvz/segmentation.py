@@ -1,7 +1,7 @@
 """Frames that show what a network takes each pixel of the screen for: classes of things, from the screen alone.
 
 The network is an ONNX file, which ONNX Runtime runs on one thread: in 0.6 ms of processor time, where OpenCV's takes
-1.4 (`seek_and_kill`, 2-core Intel Xeon with AVX-512, 2026-11-25). `learner/segmentation.py` trains it with the engine's
+1.4 (96x168 pixels, 2-core Intel Xeon with AVX-512, 2026-11-25). `learner/segmentation.py` trains it with the engine's
 labels; whoever plays needs none.
 """
 
@@ -82,8 +82,14 @@ def network_input(screen: np.ndarray, height: int = INPUT_HEIGHT, width: int = I
     return (np.moveaxis(small, -1, 0) - np.float32(mean[0, 0])) / np.float32(deviation[0, 0] + 12.75)
 
 
-def segmented_frame(probabilities: np.ndarray, width: int, height: int) -> np.ndarray:
-    """The mean of CLASS_COLOURS by probability, f32[h w 11] -> u8[height width 3]."""
+def segmented_frame(probabilities: np.ndarray, width: int, height: int, temperature: float = 1.0) -> np.ndarray:
+    """The mean of CLASS_COLOURS by probability, f32[h w 11] -> u8[height width 3].
+
+    Probabilities are first raised to 1 / temperature, and divided by their sum.
+    """
+    if temperature != 1.0:
+        probabilities = probabilities ** np.float32(1 / temperature)
+        probabilities /= probabilities.sum(axis=-1, keepdims=True)
     colours = np.rint(probabilities @ _COLOURS).astype(np.uint8)
     return cv2.resize(colours, (width, height), interpolation=cv2.INTER_LINEAR)
 

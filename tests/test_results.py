@@ -245,13 +245,13 @@ def test_the_findings_say_what_the_first_loss_of_sight_gave():
 def test_the_findings_say_what_the_gates_records_give():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     results = results_of("gates")
-    world, reward, sight, ammo, defend, colour, augmented, replay, horizon, sticky = results.asked
+    world, reward, sight, ammo, defend, colour, augmented, replay, horizon, sticky, warm = results.asked
     for trained, title in ((False, "gate tasks"), (True, "training tasks")):
         for scenario, _, *cells in result_table(results, world, trained=trained).rows[:-1]:
             assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
         for scenario, _, *cells in result_table(results, sight, trained=trained).rows[:-1]:
             assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
-        for gate in (reward, ammo, defend, colour, replay, horizon, sticky):
+        for gate in (reward, ammo, defend, colour, replay, horizon, sticky, warm):
             _, _, *cells = result_table(results, gate, trained=trained).rows[0]
             assert f"| {title} | {' | '.join(cell.text for cell in cells)} |" in page
         _, _, *cells = result_table(results, augmented, trained=trained).rows[1]

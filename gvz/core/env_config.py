@@ -50,6 +50,9 @@ class EnvConfig:
     segmenter: str = ""
     """the network of segmented frames: one that comes with GViZDoom, by its name, or the path of an ONNX file (gvz
     segmenter trains one), or of a directory with a file for each scenario; default: that of the scenario's name"""
+    segmenter_temperature: float = 1.0
+    """segmented frames are of the network's probabilities to the power of 1/this: above 1, what it holds for unlikely
+    is seen better (Guo et al. 2017)"""
     frame_skip: int = 4
     """game tics an action is held; one decision = frame_skip frames"""
     repeat_action_probability: float = 0.0
@@ -86,12 +89,17 @@ class EnvConfig:
             raise ConfigError(f"env.buffers: got {' '.join(self.buffers)} with env.frames {self.frames}, want none")
         if self.segmenter and self.frames != "segmented":
             raise ConfigError(f"env.segmenter: got {self.segmenter} with env.frames {self.frames}, want segmented")
+        if self.segmenter_temperature != 1.0 and self.frames != "segmented":
+            raise ConfigError(
+                f"env.segmenter_temperature: got {self.segmenter_temperature} with env.frames {self.frames}, want 1"
+            )
         for name, low, high in (
             ("frame_height", 8, 1080),
             ("frame_width", 8, 1920),
             ("frame_skip", 1, 35),
             ("render_width", 160, 1920),
             ("render_height", 120, 1200),
+            ("segmenter_temperature", 0.1, 10),
         ):
             value = getattr(self, name)
             if not low <= value <= high:

@@ -1,0 +1,17 @@
+"""A gate: does an agent play better where looks are new if it sees what the network holds for unlikely?"""
+
+from gvz.experiments.gate import Gate
+
+EXPERIMENT = Gate(
+    name="gate_temperature",
+    title="Gate: the temperature of segmented frames",
+    question="On new looks the network is less sure of enemies. Does it play better if weak signs are seen better?",
+    configs=("rainbow_segmented",),
+    variants={
+        "temperature_1": {"env.segmenter_temperature": 1.0},
+        "temperature_2": {"env.segmenter_temperature": 2.0},
+    },
+    scenarios=("seek_and_kill", "health_gathering"),
+    trainings=("train8",),
+    max_processor_s=900.0,
+)
