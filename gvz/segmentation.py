@@ -100,7 +100,8 @@ def segmenter_names() -> list[str]:
 
 
 def segmenter_file(scenario: str, config: EnvConfig) -> Path:
-    """The file of a scenario's network: the configured one, or else that of the scenario's name.
+    """The file of a scenario's network: the configured one, or else that of the scenario's name. So it is, too, where a
+    directory is configured that has no file for the scenario.
 
     Raises:
         ConfigError: there is none.
@@ -129,9 +130,11 @@ def segmenter_of(scenario: str, config: EnvConfig) -> Segmenter:
 
 
 def keep_segmenters(scenarios: Iterable[str], config: EnvConfig, directory: Path) -> None:
-    """Copies the networks of segmented frames into a directory, but those that it has.
+    """Copies the networks of segmented frames into a directory. One that is there already stays: a run's policies fit
+    the networks that they learned with.
 
-    A run keeps those that it has learned with: others would show its policies other frames.
+    Raises:
+        ConfigError: a scenario has none.
     """
     if config.frames == "segmented":
         directory.mkdir(exist_ok=True)

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gvz.evaluation.statistics import bootstrap, bootstrap_runs
+from gvz.evaluation.statistics import bootstrap, bootstrap_runs, difference
 from gvz.reports.experiment_section import comparison_table, result_table
 from gvz.reports.joint_section import joint_sections
 from gvz.reports.results import Results, read_results
-from gvz.reports.scores import agent_scores, estimate
+from gvz.reports.scores import agent_scores, estimate, estimate_groups
 from gvz.tasks import TaskSet, named_tasks, scenario_named, scenarios
 
 ROOT = Path(__file__).parent.parent
@@ -210,6 +210,7 @@ def test_the_findings_say_what_putting_frames_together_gave():
             "enemy",
         ),
         ("mixed enemies before blue walls: average precision", "seek_and_kill/blue+mixed_enemies", "enemy"),
+        ("invulnerable enemies before red walls: average precision", "seek_and_kill/invulnerable+red", "enemy"),
     ):
         assert row(title, task, measure) in page
         assert task in {pair.id for pair in named_tasks(task.partition("/")[0], split="pairs")}
@@ -245,13 +246,13 @@ def test_the_findings_say_what_the_first_loss_of_sight_gave():
 def test_the_findings_say_what_the_gates_records_give():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     results = results_of("gates")
-    world, reward, sight, ammo, defend, colour, augmented, replay, horizon, sticky, warm = results.asked
+    world, reward, sight, ammo, defend, colour, augmented, replay, horizon, sticky, temperature = results.asked
     for trained, title in ((False, "gate tasks"), (True, "training tasks")):
         for scenario, _, *cells in result_table(results, world, trained=trained).rows[:-1]:
             assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
         for scenario, _, *cells in result_table(results, sight, trained=trained).rows[:-1]:
             assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
-        for gate in (reward, ammo, defend, colour, replay, horizon, sticky, warm):
+        for gate in (reward, ammo, defend, colour, replay, horizon, sticky, temperature):
             _, _, *cells = result_table(results, gate, trained=trained).rows[0]
             assert f"| {title} | {' | '.join(cell.text for cell in cells)} |" in page
         _, _, *cells = result_table(results, augmented, trained=trained).rows[1]
@@ -303,10 +304,17 @@ def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     summary = page.partition("## In short")[2].partition("\n## ")[0]
     named = set(re.findall(r"-?\d+\.\d \[-?\d+\.\d, -?\d+\.\d\]", summary))
-    results = results_of("gates")
+    results, episodes = results_of("gates"), results_of("general_short").episodes
     gains = {row[2].text for gate in results.asked for row in comparison_table(results, gate).rows}
+    of_segmented = []
+    for name in scenarios():
+        tasks, mine = [task.id for task in named_tasks(name, split="gate")], episodes.filter(scenario=name)
+        agents = [agent_scores(mine, agent) for agent in ("rainbow_segmented", "rainbow_general (8 tasks)")]
+        of_segmented.append(estimate_groups([(scores, tasks) for scores in agents], difference).text)
     assert len(named) > 10
-    assert named <= gains
+    assert named <= gains | set(of_segmented[:1])
+    one_seed = [gain.split()[0] for gain in of_segmented[1:]]
+    assert f"game variables | {' | '.join(of_segmented[:1] + one_seed)} | no: `rainbow_segmented` |" in summary
 
 
 def test_the_readme_says_how_fast_the_records_are():

@@ -99,7 +99,7 @@ def test_an_environment_shows_what_the_network_says_of_the_screen(network: str):
 def test_every_scenario_has_a_network_that_finds_what_the_labels_show(scenario: str):
     """Cells where the network is surest of a class are where the engine's labels have it, on the default task.
 
-    Of these six episodes all sightings, 40 to 60. Of ten such sets the lowest are 33 of 44 in Seek and Kill, 44 of 45
+    Of these six episodes all sightings, 40 to 60. Of ten other sets the lowest are 33 of 44 in Seek and Kill, 44 of 45
     elsewhere.
     """
     kind = {"health_gathering": "kit"}.get(scenario, "enemy")
@@ -120,7 +120,7 @@ def test_every_scenario_has_a_network_that_finds_what_the_labels_show(scenario: 
                 break
     env.close()
     assert looked >= 20
-    assert hits > 0.65 * looked
+    assert hits > 0.75 * looked
 
 
 def test_input_has_the_shape_of_the_network_whatever_the_screen():

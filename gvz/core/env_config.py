@@ -51,8 +51,8 @@ class EnvConfig:
     """the network of segmented frames: one that comes with GViZDoom, by its name, or the path of an ONNX file (gvz
     segmenter trains one), or of a directory with a file for each scenario; default: that of the scenario's name"""
     segmenter_temperature: float = 1.0
-    """segmented frames are of the network's probabilities to the power of 1/this: above 1, what it holds for unlikely
-    is seen better (Guo et al. 2017)"""
+    """the network's probabilities are raised to the power of 1 / this before they become colours: above 1, unlikely
+    classes are seen better (temperature scaling, Guo et al. 2017)"""
     frame_skip: int = 4
     """game tics an action is held; one decision = frame_skip frames"""
     repeat_action_probability: float = 0.0

@@ -45,7 +45,7 @@ class Values:
 
 
 def read_run_config(run_dir: Path, agent_file: Path | None = None) -> RunConfig:
-    """The configuration a run was trained with. Segmented frames are of the networks that the run has kept.
+    """The configuration a run was trained with, and the segmentation networks that the run has kept.
 
     `agent_file` is the Python file of its agent, if that is none of learner/agents; playing executes it.
 

@@ -1,11 +1,11 @@
-"""A gate: does an agent play better where looks are new if it sees what the network holds for unlikely?"""
+"""A gate: does an agent play better where looks are new if it sees weak signs of enemies better?"""
 
 from gvz.experiments.gate import Gate
 
 EXPERIMENT = Gate(
     name="gate_temperature",
     title="Gate: the temperature of segmented frames",
-    question="On new looks the network is less sure of enemies. Does it play better if weak signs are seen better?",
+    question="The network is less sure of enemies with new looks. Does an agent play better if it sees weak signs?",
     configs=("rainbow_segmented",),
     variants={
         "temperature_1": {"env.segmenter_temperature": 1.0},

@@ -207,8 +207,8 @@ class Trainer:
 
 
 def with_own_segmenters(config: RunConfig, run: RunDir) -> RunConfig:
-    """The configuration with the run's own copies of its segmentation networks: a later version of GViZDoom may have
-    others. Other hosts have no copies; there, games use the networks that are installed.
+    """The configuration with the run's own copies of its segmentation networks. Other hosts have no copies; games there
+    use the networks that are installed.
     """
     own = run.path / KEPT_SEGMENTERS
     keep_segmenters([scenario.id for scenario in config.table.scenarios], config.env, own)
