@@ -180,6 +180,7 @@ import os, sys, time, psutil, gvz
 envs = gvz.make_vec("defend_the_center/default", 2, num_workers=2)
 envs.reset(seed=1)
 print(*(process.pid for process in psutil.Process().children(recursive=True)), flush=True)
+sys.stdin.readline()
 if sys.argv[1] == "raises":
     raise RuntimeError("this program was meant to fail")
 if sys.argv[1] == "closes":
@@ -199,16 +200,20 @@ def test_nothing_is_left_after_the_programs_end(tmp_path: Path, end: str | signa
         [sys.executable, "program.py", end if isinstance(end, str) else "plays"],
         cwd=tmp_path,
         env={**os.environ, "TMPDIR": str(places[0]), "XDG_RUNTIME_DIR": str(places[1])},
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )
+    assert process.stdin is not None
     assert process.stdout is not None
     pids = [int(word) for word in process.stdout.readline().split()]
     assert len(pids) == 4, "two workers and their engines"
     files = {name for pid in pids for name in shared_memory_of(pid)}
+    assert files
+    process.stdin.write(b"\n")  # only now it goes on, so nothing has ended while its memory is looked at
+    process.stdin.flush()
     if isinstance(end, signal.Signals):
         time.sleep(0.2)  # it plays
-        assert files
         process.send_signal(end)
     _, errors = process.communicate(timeout=60)
     code = {"ends": 0, "closes": 0, "raises": 1}.get(str(end), -int(end) if isinstance(end, signal.Signals) else 0)
@@ -224,8 +229,5 @@ def test_nothing_is_left_after_the_programs_end(tmp_path: Path, end: str | signa
 
 def shared_memory_of(pid: int) -> set[str]:
     """Files of /dev/shm that a process has mapped."""
-    try:
-        maps = Path(f"/proc/{pid}/maps").read_text()
-    except FileNotFoundError:
-        return set()
+    maps = Path(f"/proc/{pid}/maps").read_text()
     return {line.split()[-1] for line in maps.splitlines() if " /dev/shm/" in line}
