@@ -117,7 +117,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         self.action_meanings = action_buttons(scenario, config.action_set)
         self._actions = [[button in held for button in scenario.buttons] for held in self.action_meanings]
         bookkeeping = {name: user for name, user in BOOKKEEPING.items() if name != "MAP_MAGIC"}
-        own = tuple(dict.fromkeys((*scenario.game_variables, "KILLCOUNT")))
+        own = tuple(dict.fromkeys((*scenario.game_variables, "KILLCOUNT", "POSITION_X", "POSITION_Y")))
         self._names = (*own, *bookkeeping)
         self._engine_config = EngineConfig(
             wad=self._compiled.wad_path,

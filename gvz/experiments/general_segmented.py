@@ -16,7 +16,7 @@ EXPERIMENT = dataclasses.replace(
     notes=(
         "The networks come with GViZDoom. Each learned from the engine's labels, on the eight training tasks of its "
         "scenario, for 700 to 720 seconds of processor time, which come to the time of these runs. Agents need no "
-        "labels. They also observe the scenario's game variables, and have a discount of 0.95. Other agents here see "
-        "frames alone, and have 0.99.",
+        "labels. They also observe the scenario's game variables, and have a discount of 0.95. In Dodge Projectiles "
+        "they get a reward for moving in training. Other agents here see frames alone, and have 0.99.",
     ),
 )

@@ -19,7 +19,7 @@ from functools import partial
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Value, Variety, words
 from gvz.scenarios.layout import Layout, ring, vary
 from gvz.scenarios.parts import retextured, things_at
-from gvz.scenarios.rewards import Fell, Pace, Reward, living
+from gvz.scenarios.rewards import HISTORY_STEPS, Fell, Pace, Reward, living, moved
 from gvz.wad.udmf import UdmfMap
 
 WAD = "defend_the_line.wad"
@@ -230,5 +230,7 @@ SCENARIO = Scenario(
             paces=(Pace(tics=2, times=3), Pace(tics=10, times=10), Pace(tics=16, times=12)),
             levdoom_paces=(Pace(tics=2, times=4), Pace(tics=10, times=16), Pace(tics=14, times=16)),
         ),
+        # Map units a tic, each counted by five decisions: sidewards at a run.
+        "moved": Reward(event=moved, weight=0.0, levdoom=0.0, paces=(Pace(amount=HISTORY_STEPS * 14),), adds_up=True),
     },
 )

@@ -73,6 +73,9 @@ def test_distance_is_counted_over_five_decisions():
 def test_dodge_projectiles_is_equation_3_6():
     assert sum(one_step("dodge_projectiles", {}).values()) == pytest.approx(0.01)
     assert sum(one_step("dodge_projectiles", {"HEALTH": 90}).values()) == pytest.approx(-0.99)
+    walked = {"POSITION_Y": 32}
+    assert one_step("dodge_projectiles", walked)["moved"] == 0, "a configuration may reward it"
+    assert one_step("dodge_projectiles", walked, weights={"moved": 0.0005})["moved"] == pytest.approx(0.016)
 
 
 def test_profile_levdoom_has_the_dense_rewards_of_its_package():

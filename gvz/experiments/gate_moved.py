@@ -1,0 +1,19 @@
+"""A gate: does an agent dodge new missiles better if it gets a reward for moving?"""
+
+from gvz.experiments.gate import Gate
+
+EXPERIMENT = Gate(
+    name="gate_moved",
+    title="Gate: a reward for moving in Dodge Projectiles",
+    question="New enemies hit the sweep less than agents; it walks from side to side. Does a small reward for moving "
+    "make agents dodge better?",
+    configs=("rainbow_segmented",),
+    variants={
+        "plain": {"env.reward_weights": [["dodge_projectiles.moved", 0.0]]},
+        "moved": {"env.reward_weights": [["dodge_projectiles.moved", 0.0002]]},
+        "moved_more": {"env.reward_weights": [["dodge_projectiles.moved", 0.0005]]},
+    },
+    scenarios=("dodge_projectiles",),
+    trainings=("train8",),
+    max_processor_s=900.0,
+)
