@@ -230,7 +230,7 @@ SCENARIO = Scenario(
             paces=(Pace(tics=2, times=3), Pace(tics=10, times=10), Pace(tics=16, times=12)),
             levdoom_paces=(Pace(tics=2, times=4), Pace(tics=10, times=16), Pace(tics=14, times=16)),
         ),
-        # Map units a tic, each counted by five decisions: sidewards at a run.
+        # No part of eq. 3.6. Map units a tic, each counted by five decisions: sidewards at a run.
         "moved": Reward(event=moved, weight=0.0, levdoom=0.0, paces=(Pace(amount=HISTORY_STEPS * 14),), adds_up=True),
     },
 )
