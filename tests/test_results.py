@@ -224,6 +224,59 @@ def test_the_findings_say_what_putting_frames_together_gave():
         assert f" s | {cells} |" in page
     numbers = record["put_together"]["seek_and_kill/red+shadows"]
     assert f"average precision of {numbers['put_together']:.2f}, and with {numbers['real']:.2f}" in page
+    trials = record["put_together"]["of_trials"]
+    last, second = (trials[form].values() for form in ("direct", "few_own_things"))
+    said = (
+        f"{' and '.join(f'{x:.2f}' for x in last)} for the last network, {' and '.join(f'{x:.2f}' for x in second)} for"
+    )
+    assert said in " ".join(page.split())
+
+
+def test_the_findings_say_what_segmented_agents_have_on_single_tasks():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    episodes = results_of("general_short").episodes
+
+    def score(task: str, agent: str = "rainbow_segmented") -> str:
+        scores = episodes.filter(agent=agent, task=task)["normalized_score"].to_numpy()
+        assert len(scores) == (150 if agent == "rainbow_segmented" else 50)
+        return f"{scores.mean():.0f}"
+
+    center, gathering, dodging = "defend_the_center", "health_gathering", "dodge_projectiles"
+    assert f"`gore+mossy_bricks` has {score(f'{center}/gore+mossy_bricks')} instead of 53" in page
+    assert f"`fuzzy_enemies+gore+stone_wall` {score(f'{center}/fuzzy_enemies+gore+stone_wall')} instead of 35" in page
+    assert f"`complete` {score(f'{center}/complete')} instead of 43" in page
+    assert f"on `short_agent+water`, where agents have {score(f'{gathering}/short_agent+water')} instead of" in page
+    trained = [score(f"{gathering}/{name}") for name in ("supreme", "poison")]
+    assert f"`supreme` and `poison`, training tasks, stand at {' and '.join(trained)}, and" in page
+    classes = score(f"{gathering}/poison+supreme", "rainbow_general+classes")
+    assert f"`poison+supreme` at {score(f'{gathering}/poison+supreme')} (classes: {classes})" in page
+    at_random = score(f"{gathering}/complete", "random")
+    assert f"`complete` has {score(f'{gathering}/complete')}; a random player has {at_random}." in page
+    arachnotron, complete = (score(f"{dodging}/{name}") for name in ("arachnotron+city", "complete"))
+    assert f"`arachnotron+city` has {arachnotron} and `complete` {complete}, where the sweep" in page
+    assert f"`revenants`, whose missiles turn, has {score(f'{dodging}/revenants')}." in page
+
+
+def test_the_findings_say_how_much_agents_of_the_gate_moved_and_what_it_gave_by_task():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    moved, by_task = [], {"arachnotron": [], "mancubus+resized_agent": []}
+    for variant in ("plain", "moved", "moved_more"):
+        folder = ROOT / "results" / "gates" / "runs" / f"rainbow_segmented+{variant}"
+        played = [gzip.decompress(file.read_bytes()) for file in sorted(folder.glob("**/evaluation.jsonl.gz"))]
+        rows = [json.loads(line) for lines in played for line in lines.splitlines()]
+        for name, means in by_task.items():
+            scores = [row["normalized_score"] for row in rows if row["task"] == f"dodge_projectiles/{name}"]
+            assert len(scores) == 40
+            means.append(f"{np.mean(scores):.0f}")
+        trained = [
+            gzip.decompress(file.read_bytes()).splitlines()[-60:] for file in folder.glob("**/episodes.jsonl.gz")
+        ]
+        last = [json.loads(line) for lines in trained for line in lines]
+        assert len(last) == 120
+        moved.append(np.mean([row["reward_components"].get("moved", 0.0) / row["length_steps"] for row in last]))
+    assert f"agents got {moved[0]:.0f}, {moved[1]:.3f} or {moved[2]:.3f} a decision for it" in page
+    assert "`arachnotron` has {}, {} and {} by weight".format(*by_task["arachnotron"]) in page
+    assert "`mancubus+resized_agent` has {}, {} and {}".format(*by_task["mancubus+resized_agent"]) in page
 
 
 def test_the_findings_say_what_six_times_the_time_gave():

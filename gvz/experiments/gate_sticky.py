@@ -2,7 +2,7 @@
 
 from gvz.experiments.gate import Gate
 
-_SETTINGS = {"env.reward_weights": [["dodge_projectiles.moved", 0.0]]}
+_BEFORE = {"env.reward_weights": [["dodge_projectiles.moved", 0.0]]}
 """of `rainbow_segmented` until `gate_moved`"""
 
 EXPERIMENT = Gate(
@@ -11,9 +11,9 @@ EXPERIMENT = Gate(
     question="An agent whose actions may come late must move before a missile is near. Does it dodge faster ones?",
     configs=("rainbow_segmented",),
     variants={
-        "plain": _SETTINGS,
-        "sticky_25": {**_SETTINGS, "env.repeat_action_probability": 0.25},
-        "sticky_50": {**_SETTINGS, "env.repeat_action_probability": 0.5},
+        "plain": _BEFORE,
+        "sticky_25": {"env.repeat_action_probability": 0.25, **_BEFORE},
+        "sticky_50": {"env.repeat_action_probability": 0.5, **_BEFORE},
     },
     scenarios=("dodge_projectiles",),
     trainings=("train8",),
