@@ -46,11 +46,12 @@ def changed_view(
     shot: Shot,
     surroundings: Shot,
     decorations: Shot | None = None,
+    others: Sequence[Shot] = (),
     known_styles: Sequence[str] = (),
 ) -> tuple[np.ndarray, np.ndarray]:
     """A frame as it might look elsewhere, and its labels.
 
-    Three of five keep colours, textures and light, and most of these have other surroundings: so looks meet that are
+    Three of four keep colours, textures and light, and most of these have other surroundings: so looks meet that are
     known from different tasks. In the others, looks change as well.
 
     What is put before other surroundings is hidden where their walls and things are nearer. The floor of all maps of a
@@ -61,28 +62,30 @@ def changed_view(
         shot: whose things are to be seen, and whose decorations.
         surroundings: of another task of the scenario: things may stand before it.
         decorations: further ones, which then stand there as well.
-        known_styles: of OUTLINES, those that some task has; at least half of the styles that are drawn are of these.
+        others: whose things then stand there as well.
+        known_styles: of OUTLINES, those that some task has; three of four styles that are drawn are of these.
 
     Returns:
         (u8[H W 3], u8[H W]).
     """
     view, labels = shot.frame.astype(np.float32), shot.labels
-    elsewhere, other_looks = rng.random(2) < (0.7, 0.4)
+    elsewhere, other_looks = rng.random(2) < (0.85, 0.25)
     if elsewhere:
         behind = _Scene.of(surroundings)
         if other_looks:
             behind.view = _other_parts(rng, behind.view, behind.labels)
-            view = _other_colours(rng, view, 0.5)
         if decorations is not None:
             behind.add(decorations.frame.astype(np.float32), decorations, DECORATIONS)
-        behind.add(view, shot, DECORATIONS)
-        style = shot.style
-        if style is None and rng.random() < 0.5:
-            names = known_styles if known_styles and rng.random() < 0.5 else tuple(_STYLES)
-            style = names[int(rng.integers(len(names)))]
-        if style is not None:
-            view = _STYLES[style](rng, view, behind.view)
-        behind.add(view, shot, _THINGS)
+        for one in (shot, *others):
+            things = one.frame.astype(np.float32)
+            if other_looks:
+                things = _other_colours(rng, things, 0.5)
+            if one is shot:
+                behind.add(things, shot, DECORATIONS)
+            style = _drawn_style(rng, known_styles) if one.style is None else one.style
+            if style is not None:
+                things = _STYLES[style](rng, things, behind.view)
+            behind.add(things, one, _THINGS)
         view, labels = behind.view, behind.labels
     elif other_looks:
         view = _other_parts(rng, view, labels)
@@ -97,10 +100,14 @@ def in_front(shot: Shot, labels: np.ndarray, depth: np.ndarray) -> np.ndarray:
     return ((shot.depth <= depth) | (labels == LABEL_CLASSES.index("plane"))).astype(np.uint8)
 
 
-def num_things_in_front(shot: Shot, surroundings: Shot) -> int:
-    """Pixels of a shot's things and decorations that would be seen before these surroundings."""
-    seen = _is(shot.labels, _THINGS + DECORATIONS) * in_front(shot, surroundings.labels, surroundings.depth)
-    return int(np.count_nonzero(seen))
+def num_pixels_gained(shots: Sequence[Shot], surroundings: Shot) -> int:
+    """Pixels of these shots' things that would be seen before surroundings, less those of the surroundings' own."""
+
+    def seen(shot: Shot) -> np.ndarray:
+        return _is(shot.labels, _THINGS + DECORATIONS) * in_front(shot, surroundings.labels, surroundings.depth)
+
+    gained = sum(np.count_nonzero(seen(shot)) for shot in shots)
+    return int(gained - np.count_nonzero(_is(surroundings.labels, _THINGS)))
 
 
 @dataclass
@@ -165,6 +172,14 @@ def _is(labels: np.ndarray, classes: tuple[str, ...]) -> np.ndarray:
     chosen = np.zeros(256, np.uint8)
     chosen[[LABEL_CLASSES.index(name) for name in classes]] = 1
     return cv2.LUT(labels, chosen)
+
+
+def _drawn_style(rng: np.random.Generator, known_styles: Sequence[str]) -> str | None:
+    """A render style for things that have none of OUTLINES, or none."""
+    if rng.random() >= 0.6:
+        return None
+    names = known_styles if known_styles and rng.random() < 0.75 else tuple(_STYLES)
+    return names[int(rng.integers(len(names)))]
 
 
 def _other_colours(rng: np.random.Generator, view: Frame, strength: float) -> Frame:

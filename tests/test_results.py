@@ -214,21 +214,24 @@ def test_the_findings_say_what_putting_frames_together_gave():
     ):
         assert row(title, task, measure) in page
         assert task in {pair.id for pair in named_tasks(task.partition("/")[0], split="pairs")}
-    for form in ("decorated", "few_own_things", "logarithm", "looks", "direct"):
-        found = dict(record["networks"][form]["tasks"])
-        if form == "decorated":  # its scores on the gate tasks are beside the network
-            scores = json.loads((ROOT / "gvz" / "segmenters" / "seek_and_kill.json").read_text())["average_precision"]
-            found |= {task: {"average_precision": one} for task, one in scores.items()}
-        tasks = ["seek_and_kill/red+shadows", *(task.id for task in named_tasks("seek_and_kill", split="gate"))]
+    gate_tasks = [task.id for task in named_tasks("seek_and_kill", split="gate")]
+    for form in ("decorated", "few_own_things", "logarithm", "looks", "direct", "three_frames", "three_frames_more"):
+        found = record["networks"][form]["tasks"]
+        tasks = ["seek_and_kill/red+shadows", *gate_tasks]
         cells = " | ".join(f"{found[task]['average_precision']['enemy']:.2f}" for task in tasks)
         assert f" s | {cells} |" in page
+    used = json.loads((ROOT / "gvz" / "segmenters" / "seek_and_kill.json").read_text())["average_precision"]
+    assert used == {task: found[task]["average_precision"] for task in gate_tasks}
+    count = record["put_together"]["enemies_per_frame"]
+    assert f"too few enemies**: {count['one_frame']:.1f} a frame before red walls" in page
+    assert f"have {count['real']:.1f}. Near walls hide far things. With things of three frames they hold" in page
+    assert f"they hold {count['three_frames']:.1f}." in page
     numbers = record["put_together"]["seek_and_kill/red+shadows"]
     assert f"average precision of {numbers['put_together']:.2f}, and with {numbers['real']:.2f}" in page
     trials = record["put_together"]["of_trials"]
     last, second = (trials[form].values() for form in ("direct", "few_own_things"))
-    said = (
-        f"{' and '.join(f'{x:.2f}' for x in last)} for the last network, {' and '.join(f'{x:.2f}' for x in second)} for"
-    )
+    last, second = (" and ".join(f"{x:.2f}" for x in one) for one in (last, second))
+    said = f"{last} for the fifth network, {second} for the second"
     assert said in " ".join(page.split())
 
 

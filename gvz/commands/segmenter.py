@@ -35,7 +35,7 @@ class TrainSegmenter:
     """labelled frames of each training task"""
     gate_frames: int = 300
     """of each gate task, for the scores"""
-    processor_s: float = 720.0
+    processor_s: float = 1_600.0
     """seconds of processor time, of games and learning together, after which training ends"""
     seed: int = 1111
     """of the first parameters and of the changes of frames"""

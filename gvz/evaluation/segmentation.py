@@ -11,7 +11,8 @@ from gvz.core.env_config import LABEL_CLASSES, SIGHT_CLASSES, EnvConfig
 from gvz.env import DoomEnv
 from gvz.evaluation.play import episode_seed
 from gvz.evaluation.players import Player, RandomPlayer, ScriptedPlayer
-from gvz.scenarios.base import Task
+from gvz.scenarios.base import Task, Textures
+from gvz.scenarios.compiler import task_content
 from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, network_input
 from learner.segmentation import CELL
 from learner.segmentation_views import (
@@ -20,7 +21,7 @@ from learner.segmentation_views import (
     changed_view,
     mirrored,
     moved,
-    num_things_in_front,
+    num_pixels_gained,
     shrunk,
 )
 
@@ -36,6 +37,8 @@ class Labelled(NamedTuple):
     """u8[N H W], the engine's depth buffer"""
     style: str | None = None
     """the engine's render style of the task's things, if it shows nothing of them but their outline"""
+    textures: Textures | None = None
+    """of the task's walls, floors and ceilings"""
 
     def shot(self, rng: np.random.Generator) -> Shot:
         """One of the frames, drawn at random."""
@@ -50,13 +53,15 @@ _BASE_SEED = 7
 _DECISIONS_APART = 5
 """between frames of an episode, which hardly differ otherwise"""
 _FRAMES_PER_EPISODE = 60
-_CLEAN_SHARE = 0.3
+_CLEAN_SHARE = 0.15
 """of a batch's frames that are only mirrored"""
 _MOVED_SHARE = 0.7
 _DECORATED_SHARE = 0.5
 """of the other frames"""
+_NUM_OTHERS = 2
+"""frames whose things stand there, too: a frame of a task shows few"""
 _TRIES = 3
-"""surroundings that are drawn; those are taken that hide least"""
+"""surroundings that are drawn; those are taken that hide least and show least of their own"""
 _MIN_CELLS = 100
 """that show a class, for a score of it"""
 
@@ -92,7 +97,8 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
         env.close()
     styles = (task.scenario.attribute(name).content.entity.get("RenderStyle") for name in task.attributes)
     style = next((str(one) for one in styles if one in OUTLINES), None)
-    return Labelled(np.stack(frames), np.stack(labels), np.stack(depths), style)
+    textures = task_content(task, "thesis").textures
+    return Labelled(np.stack(frames), np.stack(labels), np.stack(depths), style, textures)
 
 
 def training_batches(tasks: Sequence[Labelled], batch_size: int, seed: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -100,9 +106,15 @@ def training_batches(tasks: Sequence[Labelled], batch_size: int, seed: int) -> I
     rng = np.random.default_rng(seed)
     styles = sorted({task.style for task in tasks if task.style is not None})
     decorated = [task for task in tasks if (task.labels == LABEL_CLASSES.index("scenery")).any()]
+    by_textures = {task.textures: [one for one in tasks if one.textures == task.textures] for task in tasks}
+    alike = list(by_textures.values())
 
     def drawn(tasks: Sequence[Labelled]) -> Shot:
         return tasks[int(rng.integers(len(tasks)))].shot(rng)
+
+    def drawn_surroundings() -> Shot:
+        """Textures that few tasks have are drawn as often as others."""
+        return drawn(alike[int(rng.integers(len(alike)))])
 
     while True:
         inputs, answers = [], []
@@ -111,8 +123,10 @@ def training_batches(tasks: Sequence[Labelled], batch_size: int, seed: int) -> I
             frame, labels, is_changed = shot.frame, shot.labels, rng.random() >= _CLEAN_SHARE
             if is_changed:
                 decorations = drawn(decorated) if decorated and rng.random() < _DECORATED_SHARE else None
-                surroundings = max((drawn(tasks) for _ in range(_TRIES)), key=partial(num_things_in_front, shot))
-                frame, labels = changed_view(rng, shot, surroundings, decorations, styles)
+                others = [drawn(tasks) for _ in range(_NUM_OTHERS)]
+                gained = partial(num_pixels_gained, (shot, *others))
+                surroundings = max((drawn_surroundings() for _ in range(_TRIES)), key=gained)
+                frame, labels = changed_view(rng, shot, surroundings, decorations, others, styles)
             if is_changed and rng.random() < _MOVED_SHARE:
                 frame, labels = moved(rng, frame, labels, INPUT_HEIGHT, INPUT_WIDTH)
             else:

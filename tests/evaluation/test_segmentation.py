@@ -9,6 +9,7 @@ import pytest
 from gvz.core.env_config import LABEL_CLASSES
 from gvz.env import DoomEnv
 from gvz.evaluation import segmentation
+from gvz.scenarios.base import Textures
 from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, network_input
 from gvz.tasks import parse_task
 
@@ -107,7 +108,7 @@ def test_batches_hold_network_inputs_and_labels_of_all_tasks():
 
 
 def test_decorations_come_into_the_frames_of_tasks_that_have_none():
-    """One task of eight has decorations, and every fourth frame gets them: 0.7 changed, 0.7 elsewhere, half of these.
+    """One task of eight has decorations, and every third frame gets them: 0.85 changed, 0.85 elsewhere, half of these.
 
     Puffs of shots, which every task has, are no decorations.
     """
@@ -118,7 +119,25 @@ def test_decorations_come_into_the_frames_of_tasks_that_have_none():
     tasks = [segmentation.Labelled(frames, one, np.full((3, 144, 256), 9, np.uint8)) for one in labels]
     batches = itertools.islice(segmentation.training_batches(tasks, 8, seed=0), 75)
     shown = np.mean([(one == scenery).any() for _, answers in batches for one in answers])
-    assert 0.25 <= shown <= 0.45, "a quarter, and some of the 600 frames that are of this task"
+    assert 0.33 <= shown <= 0.53, "0.36, and some of the 600 frames that are of this task"
+
+
+def test_surroundings_of_each_look_are_drawn_as_often():
+    """Seven tasks have one look, and the eighth has another. None shows a thing, so all surroundings are as good.
+
+    Of a hundred frames, 28 keep their own surroundings, an eighth of these the eighth task's. 72 get others, half of
+    these the eighth task's. It would be an eighth of all if tasks were drawn.
+    """
+    rng = np.random.default_rng(0)
+    grey, red = Textures("A", "A", "A"), Textures("B", "B", "B")
+    wall, plane = LABEL_CLASSES.index("wall"), LABEL_CLASSES.index("plane")
+    frames = rng.integers(0, 256, (3, 144, 256, 3), dtype=np.uint8)
+    labels = [np.full((3, 144, 256), plane if n < 7 else wall, np.uint8) for n in range(8)]
+    depths = np.full((3, 144, 256), 9, np.uint8)
+    tasks = [segmentation.Labelled(frames, one, depths, None, grey if n < 7 else red) for n, one in enumerate(labels)]
+    batches = itertools.islice(segmentation.training_batches(tasks, 8, seed=0), 75)
+    shown = np.mean([(one == wall).any() for _, answers in batches for one in answers])
+    assert 0.31 <= shown <= 0.48, "0.28 / 8 + 0.72 / 2 = 0.40; 0.125 if tasks were drawn"
 
 
 def test_a_network_sees_frames_of_mean_zero_whatever_their_light():
