@@ -246,9 +246,11 @@ def test_the_findings_say_what_segmented_agents_have_on_single_tasks():
         return f"{scores.mean():.0f}"
 
     center, gathering, dodging = "defend_the_center", "health_gathering", "dodge_projectiles"
-    assert f"`gore+mossy_bricks` has {score(f'{center}/gore+mossy_bricks')} instead of 53" in page
-    assert f"`fuzzy_enemies+gore+stone_wall` {score(f'{center}/fuzzy_enemies+gore+stone_wall')} instead of 35" in page
-    assert f"`complete` {score(f'{center}/complete')} instead of 43" in page
+    assert f"`gore+mossy_bricks` {score(f'{center}/gore+mossy_bricks')} instead of 81" in page
+    assert (
+        f"`fuzzy_enemies+gore+stone_wall` has {score(f'{center}/fuzzy_enemies+gore+stone_wall')} instead of 54" in page
+    )
+    assert f"`complete` {score(f'{center}/complete')} instead of 47" in page
     assert f"on `short_agent+water`, where agents have {score(f'{gathering}/short_agent+water')} instead of" in page
     trained = [score(f"{gathering}/{name}") for name in ("supreme", "poison")]
     assert f"`supreme` and `poison`, training tasks, stand at {' and '.join(trained)}, and" in page

@@ -15,9 +15,9 @@ EXPERIMENT = dataclasses.replace(
     published={},
     notes=(
         "The networks come with GViZDoom. Each learned from the engine's labels, on the eight training tasks of its "
-        "scenario, for 700 to 720 seconds of processor time, in Seek and Kill 1,500, which come to the time of these "
-        "runs. Agents need no labels. They also observe the scenario's game variables, and have a discount of 0.95. "
-        "In Dodge Projectiles they get a reward for moving in training. Other agents here see frames alone, and have "
-        "0.99.",
+        "scenario, for 700 seconds of processor time, in Defend the Center and Seek and Kill 1,500, which come to the "
+        "time of these runs. Agents need no labels. They also observe the scenario's game variables, and have a "
+        "discount of 0.95. In Dodge Projectiles they get a reward for moving in training. Other agents here see "
+        "frames alone, and have 0.99.",
     ),
 )
