@@ -101,7 +101,10 @@ def in_front(shot: Shot, labels: np.ndarray, depth: np.ndarray) -> np.ndarray:
 
 
 def num_pixels_gained(shots: Sequence[Shot], surroundings: Shot) -> int:
-    """Pixels of these shots' things that would be seen before surroundings, less those of the surroundings' own."""
+    """Pixels of these shots' things and decorations that would be seen before surroundings, less those of own things.
+
+    Own things are those that the surroundings show themselves.
+    """
 
     def seen(shot: Shot) -> np.ndarray:
         return _is(shot.labels, _THINGS + DECORATIONS) * in_front(shot, surroundings.labels, surroundings.depth)

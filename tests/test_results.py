@@ -170,72 +170,6 @@ def test_the_findings_compare_the_general_agents_as_their_records_do(words, othe
         assert f"| {scenario_named(name).title} | {called} | {cells} |" in page
 
 
-def test_the_findings_say_how_well_segmentation_networks_find_things():
-    page = (ROOT / "docs" / "FINDINGS.md").read_text()
-    for name in scenarios():
-        record = json.loads((ROOT / "gvz" / "segmenters" / f"{name}.json").read_text())
-        assert record["tasks"] == [task.id for task in named_tasks(name, split="train8")], "no gate or test task"
-        assert list(record["average_precision"]) == [task.id for task in named_tasks(name, split="gate")]
-        for task, found in record["average_precision"].items():
-            cells = (
-                f"{found[kind]:.2f}" if kind in found else "-" for kind in ("enemy", "projectile", "kit", "poison")
-            )
-            assert f"| `{task}` | {' | '.join(cells)} |" in page
-
-
-def test_the_findings_say_what_putting_frames_together_gave():
-    page = (ROOT / "docs" / "FINDINGS.md").read_text()
-    record = json.loads((ROOT / "results" / "gates" / "segmenters" / "compositions.json").read_text())
-
-    def row(title: str, task: str, measure: str) -> str:
-        """Of every form of the networks: a number of the task, or a dash."""
-        cells = []
-        for form in ("before", "rendered_size", "by_depth", "144x252_pixels", "decorated", "three_frames_more"):
-            found = record["networks"][form]["tasks"].get(task)
-            values = {} if found is None else found | found["average_precision"]
-            cells.append(f"{values[measure]:.2f}" if values else "-")
-        return f"| {title} | {' | '.join(cells)} |"
-
-    for title, task, measure in (
-        ("shadows before red walls: average precision", "seek_and_kill/red+shadows", "enemy"),
-        (
-            "decorations before a stone wall: mean probability of an enemy",
-            "defend_the_center/gore+stone_wall",
-            "enemy_at_scenery",
-        ),
-        ("enemies among these: average precision", "defend_the_center/gore+stone_wall", "enemy"),
-        (
-            "fuzzy enemies before mossy bricks: average precision",
-            "defend_the_center/fuzzy_enemies+mossy_bricks",
-            "enemy",
-        ),
-        ("mixed enemies before blue walls: average precision", "seek_and_kill/blue+mixed_enemies", "enemy"),
-        ("invulnerable enemies before red walls: average precision", "seek_and_kill/invulnerable+red", "enemy"),
-    ):
-        assert row(title, task, measure) in page
-        assert task in {pair.id for pair in named_tasks(task.partition("/")[0], split="pairs")}
-    gate_tasks = [task.id for task in named_tasks("seek_and_kill", split="gate")]
-    for form in ("decorated", "few_own_things", "logarithm", "looks", "direct", "three_frames", "three_frames_more"):
-        found = record["networks"][form]["tasks"]
-        tasks = ["seek_and_kill/red+shadows", *gate_tasks]
-        cells = " | ".join(f"{found[task]['average_precision']['enemy']:.2f}" for task in tasks)
-        assert f" s | {cells} |" in page
-    for name in ("defend_the_center", "seek_and_kill"):  # which have networks of the last form
-        used = json.loads((ROOT / "gvz" / "segmenters" / f"{name}.json").read_text())["average_precision"]
-        assert used == {task: found[task]["average_precision"] for task in used}
-    count = record["put_together"]["enemies_per_frame"]
-    assert f"too few enemies**: {count['one_frame']:.1f} a frame before red walls" in page
-    assert f"have {count['real']:.1f}. Near walls hide far things. With things of three frames they hold" in page
-    assert f"they hold {count['three_frames']:.1f}." in page
-    numbers = record["put_together"]["seek_and_kill/red+shadows"]
-    assert f"average precision of {numbers['put_together']:.2f}, and with {numbers['real']:.2f}" in page
-    trials = record["put_together"]["of_trials"]
-    last, second = (trials[form].values() for form in ("direct", "few_own_things"))
-    last, second = (" and ".join(f"{x:.2f}" for x in one) for one in (last, second))
-    said = f"{last} for the fifth network, {second} for the second"
-    assert said in " ".join(page.split())
-
-
 def test_the_findings_say_what_segmented_agents_have_on_single_tasks():
     page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     episodes = results_of("general_short").episodes
@@ -268,6 +202,13 @@ def test_the_findings_say_what_segmented_agents_have_on_single_tasks():
     )
     assert f"`blue+shadows` has {shadows} instead of 14, `complete` {hard} instead of 18." in page
     assert f"Frames of classes have {' and '.join(of_classes)}." in page
+    learning = []
+    for file in (ROOT / "results" / "general_short" / "runs" / "rainbow_segmented" / "seek_and_kill").glob(
+        "**/episodes.jsonl.gz"
+    ):
+        rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+        learning += [row["normalized_score"] for row in rows if 8_000 <= row["num_updates"] < 10_000]
+    assert f"training episodes had {np.mean(learning):.0f} points at 8,000 to 10,000 gradient steps" in page
     level_4 = [score(f"{name}/complete") for name in scenarios()]
     assert f"{', '.join(level_4[:3])} and {level_4[3]} on the four tasks `complete`" in page
 

@@ -97,7 +97,7 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
         env.close()
     styles = (task.scenario.attribute(name).content.entity.get("RenderStyle") for name in task.attributes)
     style = next((str(one) for one in styles if one in OUTLINES), None)
-    textures = task_content(task, "thesis").textures
+    textures = task_content(task, config.profile).textures
     return Labelled(np.stack(frames), np.stack(labels), np.stack(depths), style, textures)
 
 

@@ -88,6 +88,17 @@ def test_frames_know_the_render_style_of_which_only_outlines_are_seen():
     assert styles == ["STYLE_Shadow", "STYLE_Fuzzy", None]
 
 
+@pytest.mark.engine
+def test_frames_know_the_textures_of_their_task():
+    names = ("default", "shadows", "red", "red+shadows")
+    default, shadows, red, both = (
+        segmentation.labelled_frames(parse_task(f"seek_and_kill/{name}"), 1).textures for name in names
+    )
+    assert default is not None
+    assert shadows == default
+    assert both == red != default
+
+
 def test_batches_hold_network_inputs_and_labels_of_all_tasks():
     rng = np.random.default_rng(0)
     tasks = [
@@ -119,7 +130,7 @@ def test_decorations_come_into_the_frames_of_tasks_that_have_none():
     tasks = [segmentation.Labelled(frames, one, np.full((3, 144, 256), 9, np.uint8)) for one in labels]
     batches = itertools.islice(segmentation.training_batches(tasks, 8, seed=0), 75)
     shown = np.mean([(one == scenery).any() for _, answers in batches for one in answers])
-    assert 0.33 <= shown <= 0.53, "0.36, and some of the 600 frames that are of this task"
+    assert 0.39 <= shown <= 0.57, "0.36, and some of the 600 frames that are of this task; ten seeds: 0.45 to 0.52"
 
 
 def test_surroundings_of_each_look_are_drawn_as_often():

@@ -274,6 +274,7 @@ def test_outlines_show_the_surroundings_that_they_are_put_before():
 
 
 def test_most_styles_that_are_drawn_are_known_ones():
+    """Ten sets of seeds: 38 to 55 shadows if none is known, 126 to 153 if they are."""
     frame, labels = parted()
     frame[labels == ENEMY] = (200, 10, 10)
     shadows = {(): 0, ("STYLE_Shadow",): 0}
@@ -284,7 +285,7 @@ def test_most_styles_that_are_drawn_are_known_ones():
             enemy = inner(found, ENEMY)
             shadows[known] += enemy.any() and np.ptp(view[enemy]) == 0 and 48 <= view[enemy].max() <= 69
     assert 18 <= shadows[()] <= 60, "400 * 0.85 * 0.75 * 0.6 / 4 = 38"
-    assert 95 <= shadows["STYLE_Shadow",] <= 155, "400 * 0.85 * 0.75 * 0.6 * 13 / 16 = 124"
+    assert 110 <= shadows["STYLE_Shadow",] <= 168, "400 * 0.85 * 0.75 * 0.6 * 13 / 16 = 124, and some of other looks"
 
 
 def test_other_colours_are_a_contrast_a_tint_and_a_brightness():
