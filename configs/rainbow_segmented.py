@@ -19,7 +19,7 @@ CONFIG = dataclasses.replace(
         frame_height=24,
         frame_width=42,
         grayscale=False,
-        reward_weights=(*GENERAL.env.reward_weights, ("dodge_projectiles.moved", 0.0005)),
+        reward_weights=(*GENERAL.env.reward_weights, ("dodge_projectiles.moved", 0.002)),
     ),
     agent=dataclasses.replace(
         GENERAL.agent, conv_kernels=(4, 4), conv_strides=(2, 2), discount=0.95, game_variables=True

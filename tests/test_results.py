@@ -216,7 +216,7 @@ def test_the_findings_say_what_segmented_agents_have_on_single_tasks():
 def test_the_findings_say_how_much_agents_of_the_gate_moved_and_what_it_gave_by_task():
     page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     moved, by_task = [], {"arachnotron": [], "mancubus+resized_agent": []}
-    for variant in ("plain", "moved", "moved_more"):
+    for variant in ("plain", "moved", "moved_more", "moved_most"):
         folder = ROOT / "results" / "gates" / "runs" / f"rainbow_segmented+{variant}"
         played = [gzip.decompress(file.read_bytes()) for file in sorted(folder.glob("**/evaluation.jsonl.gz"))]
         rows = [json.loads(line) for lines in played for line in lines.splitlines()]
@@ -230,9 +230,10 @@ def test_the_findings_say_how_much_agents_of_the_gate_moved_and_what_it_gave_by_
         last = [json.loads(line) for lines in trained for line in lines]
         assert len(last) == 120
         moved.append(np.mean([row["reward_components"].get("moved", 0.0) / row["length_steps"] for row in last]))
-    assert f"agents got {moved[0]:.0f}, {moved[1]:.3f} or {moved[2]:.3f} a decision for it" in page
-    assert "`arachnotron` has {}, {} and {} by weight".format(*by_task["arachnotron"]) in page
-    assert "`mancubus+resized_agent` has {}, {} and {}".format(*by_task["mancubus+resized_agent"]) in page
+    assert f"agents got {moved[0]:.0f}, {moved[1]:.3f}, {moved[2]:.3f} or {moved[3]:.3f} a decision for it" in page
+    assert f"with both, {moved[2] / 0.0005:.0f} and {moved[3] / 0.002:.0f} map units in five decisions" in page
+    assert "`arachnotron` has {}, {}, {} and {} by weight".format(*by_task["arachnotron"]) in page
+    assert "`mancubus+resized_agent` has {}, {}, {} and {}".format(*by_task["mancubus+resized_agent"]) in page
 
 
 def test_the_findings_say_what_six_times_the_time_gave():

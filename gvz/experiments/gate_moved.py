@@ -12,7 +12,6 @@ EXPERIMENT = Gate(
         "plain": {"env.reward_weights": [["dodge_projectiles.moved", 0.0]]},
         "moved": {"env.reward_weights": [["dodge_projectiles.moved", 0.0002]]},
         "moved_more": {"env.reward_weights": [["dodge_projectiles.moved", 0.0005]]},
-        "moved_much": {"env.reward_weights": [["dodge_projectiles.moved", 0.001]]},
         "moved_most": {"env.reward_weights": [["dodge_projectiles.moved", 0.002]]},
     },
     scenarios=("dodge_projectiles",),
