@@ -186,10 +186,12 @@ def test_the_findings_say_what_segmented_agents_have_on_single_tasks():
     )
     assert f"`complete` {score(f'{center}/complete')} instead of 47" in page
     assert f"on `short_agent+water`, where agents have {score(f'{gathering}/short_agent+water')} instead of" in page
+    water, classes = f"{gathering}/short_agent+water", "rainbow_general+classes"
+    assert f"frames of classes have {score(water, classes)} there, segmented ones {score(water)}." in page
     trained = [score(f"{gathering}/{name}") for name in ("supreme", "poison")]
     assert f"`supreme` and `poison`, training tasks, stand at {' and '.join(trained)}, and" in page
-    classes = score(f"{gathering}/poison+supreme", "rainbow_general+classes")
-    assert f"`poison+supreme` at {score(f'{gathering}/poison+supreme')} (classes: {classes})" in page
+    both = f"{gathering}/poison+supreme"
+    assert f"`poison+supreme` at {score(both)} (classes: {score(both, classes)})" in page
     at_random = score(f"{gathering}/complete", "random")
     assert f"`complete` has {score(f'{gathering}/complete')}; a random player has {at_random}." in page
     arachnotron, complete = (score(f"{dodging}/{name}") for name in ("arachnotron+city", "complete"))

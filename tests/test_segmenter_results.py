@@ -73,3 +73,15 @@ def test_the_findings_say_what_putting_frames_together_gave():
     last, second = (" and ".join(f"{x:.2f}" for x in one) for one in (last, second))
     said = f"{last} for the fifth network, {second} for the second"
     assert said in " ".join(page.split())
+
+
+def test_the_findings_say_what_the_trials_of_health_gathering_found():
+    page = (ROOT / "docs" / "FINDINGS.md").read_text()
+    trials = json.loads((ROOT / "results" / "gates" / "segmenters" / "health_gathering_trials.json").read_text())
+    used = json.loads((ROOT / "gvz" / "segmenters" / "health_gathering.json").read_text())
+    for network in (used, *trials["networks"].values()):
+        found = network["average_precision"]
+        assert list(found) == [task.id for task in named_tasks("health_gathering", split="gate")]
+        cells = [f"{scores['kit']:.2f}" for scores in found.values()]
+        poison = found["health_gathering/poison+stimpacks"]["poison"]
+        assert f"| {network['processor_s']:,.0f} s | {' | '.join(cells)} | {poison:.2f} |" in page
