@@ -5,8 +5,7 @@ from gvz.experiments.gate import Gate
 EXPERIMENT = Gate(
     name="gate_discount",
     title="Gate: a longer horizon in Health Gathering",
-    question="On the map of `supreme` the next kit may be behind a wall, some 20 decisions away. Does a larger discount "
-    "help?",
+    question="On the map of `supreme` the next kit may be behind a wall. Does it help to look further ahead?",
     configs=("rainbow_segmented",),
     variants={"near": {"agent.discount": 0.95}, "far": {"agent.discount": 0.98}},
     scenarios=("health_gathering",),
