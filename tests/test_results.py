@@ -238,6 +238,19 @@ def test_the_findings_say_how_much_agents_of_the_gate_moved_and_what_it_gave_by_
     assert "`mancubus+resized_agent` has {}, {}, {} and {}".format(*by_task["mancubus+resized_agent"]) in page
 
 
+def test_the_findings_say_what_a_longer_horizon_gave_in_health_gathering():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    episodes = results_of("gates").episodes
+
+    def score(variant: str, name: str) -> str:
+        rows = episodes.filter(agent=f"rainbow_segmented+{variant}", task=f"health_gathering/{name}")
+        assert len(rows) == 40
+        return f"{rows['normalized_score'].mean():.0f}"
+
+    assert f"`poison` has {score('far', 'poison')} instead of {score('near', 'poison')}" in page
+    assert f"`supreme` {score('far', 'supreme')} instead of {score('near', 'supreme')}" in page
+
+
 def test_the_findings_say_what_six_times_the_time_gave():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     for folder, seconds in (("general_short", "900 s"), ("general", "5,400 s")):
@@ -266,13 +279,13 @@ def test_the_findings_say_what_the_first_loss_of_sight_gave():
 def test_the_findings_say_what_the_gates_records_give():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     results = results_of("gates")
-    world, reward, sight, ammo, defend, colour, augmented, replay, horizon, sticky, temperature, moved = results.asked
+    world, reward, sight, ammo, defend, colour, augmented, replay, horizon, sticky, temperature, *new = results.asked
     for trained, title in ((False, "gate tasks"), (True, "training tasks")):
         for scenario, _, *cells in result_table(results, world, trained=trained).rows[:-1]:
             assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
         for scenario, _, *cells in result_table(results, sight, trained=trained).rows[:-1]:
             assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
-        for gate in (reward, ammo, defend, colour, replay, horizon, sticky, temperature, moved):
+        for gate in (reward, ammo, defend, colour, replay, horizon, sticky, temperature, *new):
             _, _, *cells = result_table(results, gate, trained=trained).rows[0]
             assert f"| {title} | {' | '.join(cell.text for cell in cells)} |" in page
         _, _, *cells = result_table(results, augmented, trained=trained).rows[1]
