@@ -247,8 +247,8 @@ def test_the_findings_say_what_a_longer_horizon_gave_in_health_gathering():
         assert len(rows) == 40
         return f"{rows['normalized_score'].mean():.0f}"
 
-    assert f"`poison` has {score('far', 'poison')} instead of {score('near', 'poison')}" in page
-    assert f"`supreme` {score('far', 'supreme')} instead of {score('near', 'supreme')}" in page
+    assert f"`poison` has {score('far', 'poison')} instead of {score('near', 'poison')}, and" in page
+    assert f"and `supreme` {score('far', 'supreme')} instead of {score('near', 'supreme')}" in page
 
 
 def test_the_findings_say_what_six_times_the_time_gave():
@@ -279,13 +279,13 @@ def test_the_findings_say_what_the_first_loss_of_sight_gave():
 def test_the_findings_say_what_the_gates_records_give():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     results = results_of("gates")
-    world, reward, sight, ammo, defend, colour, augmented, replay, horizon, sticky, temperature, *new = results.asked
+    world, reward, sight, ammo, defend, colour, augmented, *later = results.asked
     for trained, title in ((False, "gate tasks"), (True, "training tasks")):
         for scenario, _, *cells in result_table(results, world, trained=trained).rows[:-1]:
             assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
         for scenario, _, *cells in result_table(results, sight, trained=trained).rows[:-1]:
             assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
-        for gate in (reward, ammo, defend, colour, replay, horizon, sticky, temperature, *new):
+        for gate in (reward, ammo, defend, colour, *later):
             _, _, *cells = result_table(results, gate, trained=trained).rows[0]
             assert f"| {title} | {' | '.join(cell.text for cell in cells)} |" in page
         _, _, *cells = result_table(results, augmented, trained=trained).rows[1]

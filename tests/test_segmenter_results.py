@@ -79,9 +79,20 @@ def test_the_findings_say_what_the_trials_of_health_gathering_found():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     trials = json.loads((ROOT / "results" / "gates" / "segmenters" / "health_gathering_trials.json").read_text())
     used = json.loads((ROOT / "gvz" / "segmenters" / "health_gathering.json").read_text())
-    for network in (used, *trials["networks"].values()):
+    forms = {
+        "base": "three frames: things of three in each",
+        "tint": "three frames, surfaces in shades of a drawn colour",
+        "texture": "three frames, surfaces with a drawn texture",
+        "both": "three frames, some surfaces of either kind",
+        "varied": "three frames, and frames of varied maps",
+        "base_1500": "three frames",
+        "texture_1500": "three frames, surfaces with a drawn texture",
+    }
+    assert list(trials["networks"]) == list(forms)
+    rows = [("used: things of one frame", used), *((forms[form], one) for form, one in trials["networks"].items())]
+    for title, network in rows:
         found = network["average_precision"]
         assert list(found) == [task.id for task in named_tasks("health_gathering", split="gate")]
         cells = [f"{scores['kit']:.2f}" for scores in found.values()]
         poison = found["health_gathering/poison+stimpacks"]["poison"]
-        assert f"| {network['processor_s']:,.0f} s | {' | '.join(cells)} | {poison:.2f} |" in page
+        assert f"| {title} | {network['processor_s']:,.0f} s | {' | '.join(cells)} | {poison:.2f} |" in page
