@@ -253,13 +253,61 @@ def test_the_findings_say_what_a_longer_horizon_gave_in_health_gathering():
 
 def test_the_findings_say_what_six_times_the_time_gave():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
+    agents = {"rainbow_general+sight_loss": "loss of sight", "rainbow_segmented": "segmented"}
     for folder, seconds in (("general_short", "900 s"), ("general", "5,400 s")):
         episodes = results_of(folder).episodes
-        for name in ("defend_the_center", "seek_and_kill"):
-            scores = agent_scores(episodes.filter(scenario=name), "rainbow_general+sight_loss")
+        for name, (agent, called) in itertools.product(("defend_the_center", "seek_and_kill"), agents.items()):
+            scores = agent_scores(episodes.filter(scenario=name), agent)
             sets = [named_tasks(name, split=split) for split in ("train8", "gate", "test")]
             cells = [estimate(scores, [t.id for t in tasks]).text for tasks in (*sets, named_tasks(name, level=4))]
-            assert f"| {scenario_named(name).title} | {seconds} | {' | '.join(cells)} |" in page
+            assert f"| {scenario_named(name).title} | {called} | {seconds} | {' | '.join(cells)} |" in page
+
+
+def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    short, long = (results_of(name).episodes.filter(agent="rainbow_segmented") for name in ("general_short", "general"))
+
+    def means(episodes, name: str, split: TaskSet) -> list[float]:
+        """Mean over the tasks, of each training seed."""
+        tasks, seeds = [task.id for task in named_tasks(name, split=split)], sorted(episodes["run_seed"].unique())
+        rows = [[episodes.filter(run_seed=seed, task=task) for task in tasks] for seed in seeds]
+        return [float(np.mean([found["normalized_score"].mean() for found in of_seed])) for of_seed in rows]
+
+    gains = {}
+    for name, split in itertools.product(("defend_the_center", "seek_and_kill"), ("train8", "gate", "test")):
+        before, (after,) = means(short, name, split), means(long, name, split)
+        assert len(before) == 3
+        assert (after > max(before)) == ((name, split) != ("seek_and_kill", "test"))
+        gains[name, split] = f"{after - np.mean(before):.1f}"
+    center, kill = (
+        [gains[name, split] for split in ("train8", "gate")] for name in ("defend_the_center", "seek_and_kill")
+    )
+    assert (
+        f"In Defend the Center they gain {' and '.join(center)} points, in Seek and Kill {' and '.join(kill)}." in page
+    )
+    assert f"test tasks gain {gains['defend_the_center', 'test']} points in Defend the Center" in page
+    assert f"beside segmented frames | {center[1]} | | | {kill[1]} | as you like" in page
+
+    said = []
+    for task in ("seek_and_kill/blue+shadows", "seek_and_kill/blue+mixed_enemies+resized_enemies"):
+        said += [f"{episodes.filter(task=task)['normalized_score'].mean():.0f}" for episodes in (long, short)]
+    assert (
+        "`blue+shadows` has {} instead of {}, and `blue+mixed_enemies+resized_enemies` {} instead of {}.".format(*said)
+        in page
+    )
+
+    learning = []
+    for name in ("defend_the_center", "seek_and_kill"):
+        file = ROOT / f"results/general/runs/rainbow_segmented/{name}/train8/seed_1111/episodes.jsonl.gz"
+        rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+        last = rows[-1]["num_updates"]
+        for low, high in ((30_000, 40_000), (60_000, 70_000), (last - 10_000, last + 1)):
+            scores = [row["normalized_score"] for row in rows if low <= row["num_updates"] < high]
+            learning.append(f"{np.mean(scores):.0f}")
+    assert (
+        "{} points at 30,000 to 40,000 gradient steps, {} at 60,000 to 70,000, and {} in the last 10,000. "
+        "Seek and Kill had {}, {} and {}."
+    ).format(*learning) in page
 
 
 def test_the_findings_say_what_the_first_loss_of_sight_gave():
