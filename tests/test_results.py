@@ -251,6 +251,17 @@ def test_the_findings_say_what_a_longer_horizon_gave_in_health_gathering():
     assert f"and `supreme` {score('far', 'supreme')} instead of {score('near', 'supreme')}" in page
 
 
+def test_the_findings_say_what_shifted_frames_gave_in_dodge_projectiles():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    episodes, said = results_of("gates").episodes, []
+    for task in ("arachnotron", "mancubus+resized_agent"):
+        for variant in ("shift", "moved_most"):
+            rows = episodes.filter(agent=f"rainbow_segmented+{variant}", task=f"dodge_projectiles/{task}")
+            assert len(rows) == 40
+            said.append(f"{rows['normalized_score'].mean():.0f}")
+    assert "`arachnotron` has {} instead of {}, `mancubus+resized_agent` {} instead of {}.".format(*said) in page
+
+
 def test_the_findings_say_what_six_times_the_time_gave():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     agents = {"rainbow_general+sight_loss": "loss of sight", "rainbow_segmented": "segmented"}
