@@ -1,0 +1,281 @@
+"""What the findings say is what the records of gates and of general agents give."""
+
+import gzip
+import itertools
+import json
+import re
+
+import numpy as np
+import pytest
+
+from gvz.evaluation.statistics import difference
+from gvz.reports.experiment_section import comparison_table, result_table
+from gvz.reports.scores import agent_scores, estimate, estimate_groups
+from gvz.tasks import TaskSet, named_tasks, scenario_named, scenarios
+from tests.test_results import ROOT, results_of
+
+
+@pytest.mark.parametrize(
+    ("words", "other", "words_of_other"),
+    [
+        ("8 tasks", "rainbow_general (8 tasks and pairs)", "8 tasks and pairs"),
+        ("screen", "rainbow_general+classes", "classes"),
+        ("no loss of sight", "rainbow_general+sight_loss", "loss of sight"),
+        ("screen", "rainbow_segmented", "segmented"),
+    ],
+)
+def test_the_findings_compare_the_general_agents_as_their_records_do(words, other, words_of_other):
+    page = (ROOT / "docs" / "FINDINGS.md").read_text()
+    episodes = results_of("general_short").episodes
+    names = episodes.filter(agent=other)["scenario"].unique(maintain_order=True)
+    assert len(names) > 1
+    agents = {"rainbow_general (8 tasks)": words, other: words_of_other}
+    for name, (agent, called) in itertools.product(names, agents.items()):
+        scores = agent_scores(episodes.filter(scenario=name), agent)
+        sets = [[task.id for task in named_tasks(name, split=split)] for split in ("train8", "gate", "test")]
+        cells = " | ".join(estimate(scores, tasks).text for tasks in sets)
+        assert f"| {scenario_named(name).title} | {called} | {cells} |" in page
+
+
+def test_the_findings_say_what_segmented_agents_have_on_single_tasks():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    episodes = results_of("general_short").episodes
+
+    def score(task: str, agent: str = "rainbow_segmented") -> str:
+        scores = episodes.filter(agent=agent, task=task)["normalized_score"].to_numpy()
+        assert len(scores) == (150 if agent == "rainbow_segmented" else 50)
+        return f"{scores.mean():.0f}"
+
+    center, gathering, dodging = "defend_the_center", "health_gathering", "dodge_projectiles"
+    assert f"`gore+mossy_bricks` {score(f'{center}/gore+mossy_bricks')} instead of 81" in page
+    assert (
+        f"`fuzzy_enemies+gore+stone_wall` has {score(f'{center}/fuzzy_enemies+gore+stone_wall')} instead of 54" in page
+    )
+    assert f"`complete` {score(f'{center}/complete')} instead of 47" in page
+    assert f"on `short_agent+water`, where agents have {score(f'{gathering}/short_agent+water')} instead of" in page
+    water, classes = f"{gathering}/short_agent+water", "rainbow_general+classes"
+    assert f"frames of classes have {score(water, classes)} there, segmented ones {score(water)}." in page
+    trained = [score(f"{gathering}/{name}") for name in ("supreme", "poison")]
+    assert f"`supreme` and `poison`, training tasks, stand at {' and '.join(trained)}, and" in page
+    both = f"{gathering}/poison+supreme"
+    assert f"`poison+supreme` at {score(both)} (classes: {score(both, classes)})" in page
+    at_random = score(f"{gathering}/complete", "random")
+    assert f"`complete` has {score(f'{gathering}/complete')}; a random player has {at_random}." in page
+    arachnotron, complete = (score(f"{dodging}/{name}") for name in ("arachnotron+city", "complete"))
+    assert f"`arachnotron+city` has {arachnotron} and `complete` {complete}, where the sweep" in page
+    assert f"`revenants`, whose missiles turn, has {score(f'{dodging}/revenants')}." in page
+    shadows, hard, *of_classes = (
+        score(f"seek_and_kill/{name}", agent)
+        for agent in ("rainbow_segmented", "rainbow_general+classes")
+        for name in ("blue+shadows", "complete")
+    )
+    assert f"`blue+shadows` has {shadows} instead of 14, `complete` {hard} instead of 18." in page
+    assert f"Frames of classes have {' and '.join(of_classes)}." in page
+    learning = []
+    for file in (ROOT / "results" / "general_short" / "runs" / "rainbow_segmented" / "seek_and_kill").glob(
+        "**/episodes.jsonl.gz"
+    ):
+        rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+        learning += [row["normalized_score"] for row in rows if 8_000 <= row["num_updates"] < 10_000]
+    assert f"training episodes had {np.mean(learning):.0f} points at 8,000 to 10,000 gradient steps" in page
+    level_4 = [score(f"{name}/complete") for name in scenarios()]
+    assert f"{', '.join(level_4[:3])} and {level_4[3]} on the four tasks `complete`" in page
+
+
+def test_the_findings_say_how_much_agents_of_the_gate_moved_and_what_it_gave_by_task():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    moved, by_task = [], {"arachnotron": [], "mancubus+resized_agent": []}
+    for variant in ("plain", "moved", "moved_more", "moved_most"):
+        folder = ROOT / "results" / "gates" / "runs" / f"rainbow_segmented+{variant}"
+        played = [gzip.decompress(file.read_bytes()) for file in sorted(folder.glob("**/evaluation.jsonl.gz"))]
+        rows = [json.loads(line) for lines in played for line in lines.splitlines()]
+        for name, means in by_task.items():
+            scores = [row["normalized_score"] for row in rows if row["task"] == f"dodge_projectiles/{name}"]
+            assert len(scores) == 40
+            means.append(f"{np.mean(scores):.0f}")
+        trained = [
+            gzip.decompress(file.read_bytes()).splitlines()[-60:] for file in folder.glob("**/episodes.jsonl.gz")
+        ]
+        last = [json.loads(line) for lines in trained for line in lines]
+        assert len(last) == 120
+        moved.append(np.mean([row["reward_components"].get("moved", 0.0) / row["length_steps"] for row in last]))
+    assert f"agents got {moved[0]:.0f}, {moved[1]:.3f}, {moved[2]:.3f} or {moved[3]:.3f} a decision for it" in page
+    assert f"with both, {moved[2] / 0.0005:.0f} and {moved[3] / 0.002:.0f} map units in five decisions" in page
+    assert "`arachnotron` has {}, {}, {} and {} by weight".format(*by_task["arachnotron"]) in page
+    assert "`mancubus+resized_agent` has {}, {}, {} and {}".format(*by_task["mancubus+resized_agent"]) in page
+
+
+def test_the_findings_say_what_a_longer_horizon_gave_in_health_gathering():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    episodes = results_of("gates").episodes
+
+    def score(variant: str, name: str) -> str:
+        rows = episodes.filter(agent=f"rainbow_segmented+{variant}", task=f"health_gathering/{name}")
+        assert len(rows) == 40
+        return f"{rows['normalized_score'].mean():.0f}"
+
+    assert f"`poison` has {score('far', 'poison')} instead of {score('near', 'poison')}, and" in page
+    assert f"and `supreme` {score('far', 'supreme')} instead of {score('near', 'supreme')}" in page
+
+
+def test_the_findings_say_what_shifted_frames_gave_in_dodge_projectiles():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    episodes, said = results_of("gates").episodes, []
+    for task in ("arachnotron", "mancubus+resized_agent"):
+        for variant in ("shift", "moved_most"):
+            rows = episodes.filter(agent=f"rainbow_segmented+{variant}", task=f"dodge_projectiles/{task}")
+            assert len(rows) == 40
+            said.append(f"{rows['normalized_score'].mean():.0f}")
+    assert "`arachnotron` has {} instead of {}, `mancubus+resized_agent` {} instead of {}.".format(*said) in page
+
+
+def test_the_findings_say_what_six_times_the_time_gave():
+    page = (ROOT / "docs" / "FINDINGS.md").read_text()
+    agents = {"rainbow_general+sight_loss": "loss of sight", "rainbow_segmented": "segmented"}
+    for folder, seconds in (("general_short", "900 s"), ("general", "5,400 s")):
+        episodes = results_of(folder).episodes
+        for name, (agent, called) in itertools.product(("defend_the_center", "seek_and_kill"), agents.items()):
+            scores = agent_scores(episodes.filter(scenario=name), agent)
+            sets = [named_tasks(name, split=split) for split in ("train8", "gate", "test")]
+            cells = [estimate(scores, [t.id for t in tasks]).text for tasks in (*sets, named_tasks(name, level=4))]
+            assert f"| {scenario_named(name).title} | {called} | {seconds} | {' | '.join(cells)} |" in page
+
+
+def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    short, long = (results_of(name).episodes.filter(agent="rainbow_segmented") for name in ("general_short", "general"))
+
+    def means(episodes, name: str, split: TaskSet) -> list[float]:
+        """Mean over the tasks, of each training seed."""
+        tasks, seeds = [task.id for task in named_tasks(name, split=split)], sorted(episodes["run_seed"].unique())
+        rows = [[episodes.filter(run_seed=seed, task=task) for task in tasks] for seed in seeds]
+        return [float(np.mean([found["normalized_score"].mean() for found in of_seed])) for of_seed in rows]
+
+    gains = {}
+    for name, split in itertools.product(("defend_the_center", "seek_and_kill"), ("train8", "gate", "test")):
+        before, (after,) = means(short, name, split), means(long, name, split)
+        assert len(before) == 3
+        assert (after > max(before)) == ((name, split) != ("seek_and_kill", "test"))
+        gains[name, split] = f"{after - np.mean(before):.1f}"
+    for name in ("defend_the_center", "seek_and_kill"):
+        of_seeds, (of_long,) = (
+            [episodes.filter(run_seed=seed, task=f"{name}/complete")["normalized_score"].mean() for seed in seeds]
+            for episodes, seeds in ((short, (1111, 2222, 3333)), (long, (1111,)))
+        )
+        assert min(of_seeds) <= of_long <= max(of_seeds), "level 4 gains nothing"
+    center, kill = (
+        [gains[name, split] for split in ("train8", "gate")] for name in ("defend_the_center", "seek_and_kill")
+    )
+    assert (
+        f"In Defend the Center they gain {' and '.join(center)} points, in Seek and Kill {' and '.join(kill)}." in page
+    )
+    assert f"test tasks gain {gains['defend_the_center', 'test']} points in Defend the Center" in page
+    assert f"beside segmented frames | {center[1]} | | | {kill[1]} | as you like" in page
+
+    said = []
+    for task in ("seek_and_kill/blue+shadows", "seek_and_kill/blue+mixed_enemies+resized_enemies"):
+        said += [f"{episodes.filter(task=task)['normalized_score'].mean():.0f}" for episodes in (long, short)]
+    assert (
+        "`blue+shadows` has {} instead of {}, and `blue+mixed_enemies+resized_enemies` {} instead of {}.".format(*said)
+        in page
+    )
+
+    learning = []
+    for name in ("defend_the_center", "seek_and_kill"):
+        file = ROOT / f"results/general/runs/rainbow_segmented/{name}/train8/seed_1111/episodes.jsonl.gz"
+        rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+        last = rows[-1]["num_updates"]
+        for low, high in ((30_000, 40_000), (60_000, 70_000), (last - 10_000, last + 1)):
+            scores = [row["normalized_score"] for row in rows if low <= row["num_updates"] < high]
+            learning.append(f"{np.mean(scores):.0f}")
+    assert (
+        "{} points at 30,000 to 40,000 gradient steps, {} at 60,000 to 70,000, and {} in the last 10,000. "
+        "Seek and Kill had {}, {} and {}."
+    ).format(*learning) in page
+
+
+def test_the_findings_say_what_the_first_loss_of_sight_gave():
+    page = (ROOT / "docs" / "FINDINGS.md").read_text()
+    episodes = results_of("gates").episodes
+    agents = {"rainbow_general+plain": "none", "rainbow_general+sight_loss": "first form"}
+    for name, (agent, called) in itertools.product(("defend_the_center", "seek_and_kill"), agents.items()):
+        scores = agent_scores(episodes.filter(scenario=name), agent)
+        sets = [[task.id for task in named_tasks(name, split=split)] for split in ("train8", "gate")]
+        cells = " | ".join(estimate(scores, tasks).text for tasks in sets)
+        (line,) = [
+            line for line in page.splitlines() if line.startswith(f"| {scenario_named(name).title} | {called} |")
+        ]
+        assert line.endswith(f" | {cells} |")
+
+
+def test_the_findings_say_what_the_gates_records_give():
+    page = (ROOT / "docs" / "FINDINGS.md").read_text()
+    results = results_of("gates")
+    world, reward, sight, ammo, defend, colour, augmented, *later = results.asked
+    for trained, title in ((False, "gate tasks"), (True, "training tasks")):
+        for scenario, _, *cells in result_table(results, world, trained=trained).rows[:-1]:
+            assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
+        for scenario, _, *cells in result_table(results, sight, trained=trained).rows[:-1]:
+            assert f"| {scenario.text} | {' | '.join(cell.text for cell in cells)} |" in page
+        for gate in (reward, ammo, defend, colour, *later):
+            _, _, *cells = result_table(results, gate, trained=trained).rows[0]
+            assert f"| {title} | {' | '.join(cell.text for cell in cells)} |" in page
+        _, _, *cells = result_table(results, augmented, trained=trained).rows[1]
+        assert [cell.text for cell in cells[:1]] == ["-"], "its run is that of general_sight_loss"
+        assert f" | {' | '.join(cell.text for cell in cells[1:])} |" in page
+    for _, compared, gain, _ in comparison_table(results, world).rows[:2]:
+        value, _, interval = gain.text.partition(" ")
+        assert compared.text == "8 tasks against 4 tasks"
+        assert value in page
+        assert interval in page
+    pooled = {row[0].text: row[2].text for row in comparison_table(results, sight).rows[:3]}
+    assert list(pooled) == ["Dodge Projectiles", "Health Gathering", "Defend the Center"]
+    assert all(gain in page for gain in pooled.values())
+
+
+def test_the_findings_say_how_training_went_on_in_the_gates_of_the_replay_and_the_horizon():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+
+    def scores_of_training(variant: str) -> np.ndarray:
+        """Of each run: the mean score of episodes at 6,000 to 8,000 gradient steps, and in the last 2,000."""
+        runs = (ROOT / "results" / "gates" / "runs" / f"rainbow_segmented+{variant}").glob("**/episodes.jsonl.gz")
+        found = []
+        for file in runs:
+            rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+            last = max(row["num_updates"] for row in rows) - 2_000
+            early = [row["normalized_score"] for row in rows if 6_000 <= row["num_updates"] < 8_000]
+            late = [row["normalized_score"] for row in rows if row["num_updates"] >= last]
+            found.append((np.mean(early), np.mean(late)))
+        return np.array(found)
+
+    small, large = scores_of_training("replay_100k"), scores_of_training("replay_400k")
+    assert len(small) == len(large) == 2
+    (early, late), (early_of_large, late_of_large) = small.mean(axis=0), large.mean(axis=0)
+    falls = [*(small[:, 0] - small[:, 1]), *(large[:, 0] - large[:, 1])]
+    assert f"had {early:.0f} points with a replay of 100,000" in page
+    assert f"those of the last 2,000 steps had {late:.0f}." in page
+    assert f"they had {early_of_large:.0f} and {late_of_large:.0f} (means over both seeds)" in page
+    assert f"by {min(falls):.0f} to {max(falls):.0f} points a run" in page
+    assert f"had {early:.0f} points at 6,000 to 8,000 gradient steps and {late:.0f} in the last 2,000" in page
+    means = [scores_of_training(variant).mean(axis=0) for variant in ("discount_95", "game_variables", "both")]
+    words = (
+        f"{early:.0f} and {late:.0f} ({name})"
+        for (early, late), name in zip(means, ("discount", "game variables", "both"), strict=True)
+    )
+    assert f"Now they have {', '.join(words)}" in page
+
+
+def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
+    page = (ROOT / "docs" / "FINDINGS.md").read_text()
+    summary = page.partition("## In short")[2].partition("\n## ")[0]
+    named = set(re.findall(r"-?\d+\.\d \[-?\d+\.\d, -?\d+\.\d\]", summary))
+    results, episodes = results_of("gates"), results_of("general_short").episodes
+    gains = {row[2].text for gate in results.asked for row in comparison_table(results, gate).rows}
+    of_segmented = []
+    for name in scenarios():
+        tasks, mine = [task.id for task in named_tasks(name, split="gate")], episodes.filter(scenario=name)
+        agents = [agent_scores(mine, agent) for agent in ("rainbow_segmented", "rainbow_general (8 tasks)")]
+        of_segmented.append(estimate_groups([(scores, tasks) for scores in agents], difference).text)
+    assert len(named) > 10
+    assert named <= gains | set(of_segmented)
+    assert f"game variables | {' | '.join(of_segmented)} | no: `rainbow_segmented` |" in summary
