@@ -5,7 +5,7 @@ from gvz.experiments.gate_moved import EXPERIMENT as MOVED
 
 EXPERIMENT = Gate(
     name="gate_shift",
-    title="Gate: shifted segmented frames in Dodge Projectiles",
+    title="Gate: shifted segmented frames",
     question="Enemies of another size, and eyes at another height, are elsewhere on the frame. Do agents play better "
     "with them if half of a batch is shifted by up to two pixels of 24 and 42?",
     configs=("rainbow_segmented",),
@@ -13,7 +13,7 @@ EXPERIMENT = Gate(
         "moved_most": MOVED.variants["moved_most"],
         "shift": {"agent.augmentations": ["shift"], "agent.augmentation_strength": 0.5},
     },
-    scenarios=("dodge_projectiles",),
+    scenarios=("dodge_projectiles", "defend_the_center", "health_gathering", "seek_and_kill"),
     trainings=("train8",),
     max_processor_s=900.0,
     notes=("`moved_most` is `rainbow_segmented` as it is.",),
