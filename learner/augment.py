@@ -77,8 +77,19 @@ def shift(key: PRNGKeyArray, frames: Frames, strength: Strength) -> Frames:
 
     Source: Kostrikov et al. 2021 (DrQ), section 3.1.
     """
+    return _shifted(frames, strength, jax.random.uniform(key, (len(frames), 2)))
+
+
+def vertical_shift(key: PRNGKeyArray, frames: Frames, strength: Strength) -> Frames:
+    """`shift`, only up or down: other heights of the eye do this to a view. Sideways is another direction to aim in."""
+    rows = jax.random.uniform(key, (len(frames), 1))
+    return _shifted(frames, strength, jnp.concatenate([rows, jnp.full_like(rows, 0.5)], axis=1))
+
+
+def _shifted(frames: Frames, strength: Strength, share: Float[Array, "B 2"]) -> Frames:
+    """Moved by `share` of the way from -reach to reach, down and to the right; share 0.5 is no move."""
     reach = jnp.round(strength * SHIFT_PIXELS)[:, None]  # [B, 1]
-    offset = jnp.floor(jax.random.uniform(key, (len(frames), 2)) * (2 * reach + 1)) - reach
+    offset = jnp.floor(share * (2 * reach + 1)) - reach
     pad = (SHIFT_PIXELS, SHIFT_PIXELS)
     padded = jnp.pad(frames, ((0, 0), pad, pad, (0, 0), (0, 0)), mode="edge")
 
@@ -171,7 +182,7 @@ def grey(key: PRNGKeyArray, frames: Frames, strength: Strength) -> Frames:
 # shift 0.2 and 0.4, random_conv 0.5 and 5.8, contrast 0.2 and 2.3, gamma 0.5 and 5.2, inversion 0.2 and 0.6,
 # cutout 0.2 and 0.4, grey 0 and 2.8. `tests/perf/test_augment_speed.py` measures them.
 AUGMENTATIONS: dict[str, Callable[[PRNGKeyArray, Frames, Strength], Frames]] = {
-    f.__name__: f for f in (shift, random_conv, contrast, gamma, inversion, cutout, grey)
+    f.__name__: f for f in (shift, vertical_shift, random_conv, contrast, gamma, inversion, cutout, grey)
 }
 
 

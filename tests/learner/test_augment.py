@@ -52,14 +52,15 @@ def test_frames_of_a_stack_share_their_noise_and_samples_have_their_own(name: st
     for s in range(1, S):
         np.testing.assert_array_equal(augmented[:, :, :, s], augmented[:, :, :, 0])
     distinct = {sample.tobytes() for sample in augmented}
-    assert len(distinct) == 2 if name == "inversion" else len(distinct) > 10
+    fewest, most = {"inversion": (2, 2), "vertical_shift": (5, 2 * SHIFT_PIXELS + 1)}.get(name, (11, 20))
+    assert fewest <= len(distinct) <= most
 
 
 @pytest.mark.parametrize(("name", "channels"), KINDS)
 def test_the_share_of_clean_samples_is_exact_and_they_are_drawn_at_random(name: str, channels: int):
     frames = stacks(20, channels)
     clean = [(run(name, frames, channels, 1.0, 0.75, seed) == frames).all((1, 2, 3)) for seed in (1, 2)]
-    # shift, inversion and grey may leave a sample as it is by chance; the others do not
+    # shifts, inversion and grey may leave a sample as it is by chance; the others do not
     assert all(mask.sum() >= 15 for mask in clean)
     if name in ("random_conv", "contrast", "gamma"):
         assert all(mask.sum() == 15 for mask in clean)
@@ -94,7 +95,7 @@ def test_strength_and_share_are_traced_and_all_work_together():
 
 
 def test_an_unknown_name_is_refused_with_the_nearest():
-    with pytest.raises(ConfigError, match=r"augment: got 'shfit' \(did you mean 'shift'\?\), want some of shift, rand"):
+    with pytest.raises(ConfigError, match=r"augment: got 'shfit' \(did you mean 'shift'\?\), want some of shift, vert"):
         run("shfit", stacks(1, 1), 1)
 
 
@@ -106,12 +107,14 @@ def test_stacks_of_another_number_of_channels_are_refused():
 # --- each of them -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("name", ["shift", "vertical_shift"])
 @pytest.mark.parametrize(("strength", "reach"), [(1.0, SHIFT_PIXELS), (0.5, SHIFT_PIXELS // 2)])
-def test_shift_is_a_crop_of_the_padded_image_and_reaches_every_offset(strength: float, reach: int):
+def test_shift_is_a_crop_of_the_padded_image_and_reaches_every_offset(name: str, strength: float, reach: int):
     frames = stacks(600, 1)
-    shifted = run("shift", frames, 1, strength)
+    shifted = run(name, frames, 1, strength)
     padded = np.pad(frames, ((0, 0), (reach, reach), (reach, reach), (0, 0)), mode="edge")
-    offsets = [(i, j) for i in range(2 * reach + 1) for j in range(2 * reach + 1)]
+    columns = range(2 * reach + 1) if name == "shift" else [reach]
+    offsets = [(i, j) for i in range(2 * reach + 1) for j in columns]
     found = np.array([(padded[:, i : i + H, j : j + W] == shifted).all((1, 2, 3)) for i, j in offsets])
     np.testing.assert_array_equal(found.sum(0), 1)  # each sample is one of the crops
     assert found.sum(1).min() > 0, "some offset never comes"
