@@ -137,8 +137,8 @@ class ValueConfig(EpsilonConfig):
     n_steps: Annotated[int, Range(1, 64)] = 1
     """n of the n-step return (eq. 4.15); 1 switches it off"""
     augmentations: tuple[str, ...] = ()
-    """random changes of the online network's frames in training (learner/augment.py), in this order: shift vertical_shift
-    random_conv contrast gamma inversion cutout grey. Targets see clean frames"""
+    """random changes of the online network's frames in training (learner/augment.py), in this order: shift
+    vertical_shift random_conv contrast gamma inversion cutout grey. Targets see clean frames"""
     augmentation_strength: Share = 1.0
     """0..1, of every augmentation"""
     augmentation_clean_share: Share = 0.5
