@@ -14,7 +14,7 @@ EXPERIMENT = Gate(
         "shift": {"agent.augmentations": ["shift"], "agent.augmentation_strength": 0.5},
         "vertical": {"agent.augmentations": ["vertical_shift"], "agent.augmentation_strength": 0.5},
     },
-    scenarios=("dodge_projectiles", "defend_the_center", "health_gathering", "seek_and_kill"),
+    scenarios=("dodge_projectiles", "defend_the_center", "health_gathering"),
     trainings=("train8",),
     max_processor_s=900.0,
     notes=("`moved_most` is `rainbow_segmented` as it is.",),
