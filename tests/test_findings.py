@@ -86,7 +86,7 @@ def test_the_findings_say_how_much_agents_of_the_gate_moved_and_what_it_gave_by_
     page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     moved, by_task = [], {"arachnotron": [], "mancubus+resized_agent": []}
     for variant in ("plain", "moved", "moved_more", "moved_most"):
-        folder = ROOT / "results" / "gates" / "runs" / f"rainbow_segmented+{variant}"
+        folder = ROOT / "results" / "gates" / "runs" / f"rainbow_segmented+{variant}" / "dodge_projectiles"
         played = [gzip.decompress(file.read_bytes()) for file in sorted(folder.glob("**/evaluation.jsonl.gz"))]
         rows = [json.loads(line) for lines in played for line in lines.splitlines()]
         for name, means in by_task.items():
@@ -118,7 +118,7 @@ def test_the_findings_say_what_a_longer_horizon_gave_in_health_gathering():
     assert f"and `supreme` {score('far', 'supreme')} instead of {score('near', 'supreme')}" in page
 
 
-def test_the_findings_say_what_shifted_frames_gave_in_dodge_projectiles():
+def test_the_findings_say_what_shifted_frames_gave():
     page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     episodes, said = results_of("gates").episodes, []
     for task in ("arachnotron", "mancubus+resized_agent"):
@@ -127,6 +127,17 @@ def test_the_findings_say_what_shifted_frames_gave_in_dodge_projectiles():
             assert len(rows) == 40
             said.append(f"{rows['normalized_score'].mean():.0f}")
     assert "`arachnotron` has {} instead of {}, `mancubus+resized_agent` {} instead of {}.".format(*said) in page
+    tasks = [task.id for task in named_tasks("defend_the_center", split="train8")]
+    of_tasks = episodes.filter(episodes["task"].is_in(tasks))
+    plain, everywhere, vertical = (
+        of_tasks.filter(agent=f"rainbow_segmented+{name}")["normalized_score"].mean()
+        for name in ("moved_most", "shift", "vertical")
+    )
+    assert f"points on the gate tasks and {plain - everywhere:.0f} on the training tasks. Two of 42" in page
+    assert f"training tasks, which lose {plain - vertical:.0f} point, but the gate tasks lose no less" in page
+    (gate,) = [asked for asked in results_of("gates").asked if asked.experiment.name == "gate_shift"]
+    gains = [row[2].text for row in comparison_table(results_of("gates"), gate).rows]
+    assert all(gain in page for gain in gains[:5])
 
 
 def test_the_findings_say_what_six_times_the_time_gave():
