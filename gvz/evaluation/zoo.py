@@ -28,8 +28,8 @@ PREFIX = "zoo:"
 MAX_BYTES = 2_000_000
 """of a file"""
 RECORDS = ("config.json", "metrics.jsonl", "episodes.jsonl", "starts.jsonl", "evaluation.jsonl")
-MAX_METRICS_ROWS = 200
-"""that are kept of a run's metrics, at equal distances, the last one among them"""
+MAX_ROWS = {"metrics.jsonl": 200, "episodes.jsonl": 4_000}
+"""that are kept of a run's records of training, at equal distances, the last one among them"""
 
 
 def zoo_names() -> list[str]:
@@ -105,7 +105,8 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", agent_file: Path 
         for record in RECORDS[1:-1]:
             if (run_dir / record).exists():
                 shutil.copy(run_dir / record, packed)
-        _keep_some_rows(packed / "metrics.jsonl")
+        for record, most in MAX_ROWS.items():
+            _keep_some_rows(packed / record, most)
         keep_segmenters([scenario.id for scenario in config.table.scenarios], config.env, packed / KEPT_SEGMENTERS)
         env = dataclasses.replace(config.env, segmenter="")
         saved = config_to_dict(dataclasses.replace(config, env=env, run_dir=None))  # no path of this machine
@@ -135,8 +136,8 @@ def _rounded(params: object) -> object:
     return jax.tree.map(rounded, params)
 
 
-def _keep_some_rows(metrics: Path) -> None:
-    if metrics.exists():
-        rows = metrics.read_text().splitlines(keepends=True)
-        distance = max(1, math.ceil(len(rows) / MAX_METRICS_ROWS))
-        metrics.write_text("".join(rows[::-distance][::-1]))
+def _keep_some_rows(record: Path, most: int) -> None:
+    if record.exists():
+        rows = record.read_text().splitlines(keepends=True)
+        distance = max(1, math.ceil(len(rows) / most))
+        record.write_text("".join(rows[::-distance][::-1]))

@@ -65,15 +65,17 @@ def test_a_packed_policy_has_the_network_of_its_segmented_frames(tmp_path):
     assert trained_player(packed, found, 20).identity != identity, "these would be episodes of another player"
 
 
-@pytest.mark.parametrize("num_rows", [0, 3, 201, 1001])
-def test_a_packed_policy_has_few_rows_of_metrics_and_the_last_one(run, num_rows):
-    (run / "metrics.jsonl").write_text("".join(f'{{"num_updates": {n}}}\n' for n in range(num_rows)))
+@pytest.mark.parametrize(("record", "most"), [("metrics.jsonl", 200), ("episodes.jsonl", 4_000)])
+@pytest.mark.parametrize("share", [0.0, 0.015, 1.005, 5.005])
+def test_a_packed_policy_has_few_rows_of_training_and_the_last_one(run, record, most, share):
+    num_rows = int(share * most)
+    (run / record).write_text("".join(f'{{"num_updates": {n}}}\n' for n in range(num_rows)))
     pack(run, "one")
-    text = (run_directory("zoo:one") / "metrics.jsonl").read_text()
+    text = (run_directory("zoo:one") / record).read_text()
     rows = [json.loads(line)["num_updates"] for line in text.splitlines()]
     assert rows[-1:] == list(range(num_rows))[-1:]
     assert len(set(np.diff(rows))) < 2
-    assert min(num_rows, 100) <= len(rows) <= 200
+    assert min(num_rows, most // 2) <= len(rows) <= most
 
 
 @pytest.mark.engine
