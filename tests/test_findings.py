@@ -127,6 +127,9 @@ def test_the_findings_say_what_shifted_frames_gave():
             assert len(rows) == 40
             said.append(f"{rows['normalized_score'].mean():.0f}")
     assert "`arachnotron` has {} instead of {}, `mancubus+resized_agent` {} instead of {}.".format(*said) in page
+    gate_tasks = [task.id for task in named_tasks("dodge_projectiles", split="gate")]
+    in_zoo = episodes.filter(episodes["task"].is_in(gate_tasks), agent="rainbow_segmented+shift", run_seed=2222)
+    assert f"seed 2222, which has {in_zoo['normalized_score'].mean():.1f} on the gate tasks, is in the zoo" in page
     tasks = [task.id for task in named_tasks("defend_the_center", split="train8")]
     of_tasks = episodes.filter(episodes["task"].is_in(tasks))
     plain, everywhere, vertical = (
