@@ -143,6 +143,24 @@ def test_the_findings_say_what_shifted_frames_gave():
     assert all(gain in page for gain in gains[:5])
 
 
+def test_the_findings_say_what_more_decisions_for_each_gradient_step_take():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    said = []
+    for number in (4, 16):
+        folder = ROOT / "results" / "gates" / "runs" / f"rainbow_4task+decisions_{number}" / "defend_the_center"
+        files = sorted(folder.glob("**/metrics.jsonl.gz"))
+        assert len(files) == 2
+        runs = [[json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()] for file in files]
+        waits = [row["actors/wait_share"] for rows in runs for row in rows if "actors/wait_share" in row]
+        updates = np.mean([rows[-1]["num_updates"] for rows in runs])
+        decisions = np.mean([rows[-1]["actors/env_steps"] for rows in runs])
+        said.append((f"{updates:,.0f}", f"{decisions:,.0f}"[:-3] + "000", f"{100 * np.mean(waits):.0f}"))
+    (updates, decisions, wait), (updates_16, decisions_16, wait_16) = said
+    assert f"took {updates_16} gradient steps with 16 decisions and {updates} with 4, but {decisions_16}" in page
+    assert f"decisions instead of {decisions}. With 4, the actors wait" in page
+    assert f"{wait} percent of their time, with 16 still {wait_16}." in page
+
+
 def test_the_findings_say_what_six_times_the_time_gave():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     agents = {"rainbow_general+sight_loss": "loss of sight", "rainbow_segmented": "segmented"}
