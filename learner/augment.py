@@ -81,13 +81,13 @@ def shift(key: PRNGKeyArray, frames: Frames, strength: Strength) -> Frames:
 
 
 def vertical_shift(key: PRNGKeyArray, frames: Frames, strength: Strength) -> Frames:
-    """`shift`, only up or down: other heights of the eye do this to a view. Sideways is another direction to aim in."""
+    """`shift`, but only up or down. A thing stays in its columns: an agent aims by them."""
     rows = jax.random.uniform(key, (len(frames), 1))
     return _shifted(frames, strength, jnp.concatenate([rows, jnp.full_like(rows, 0.5)], axis=1))
 
 
 def _shifted(frames: Frames, strength: Strength, share: Float[Array, "B 2"]) -> Frames:
-    """Moved by `share` of the way from -reach to reach, down and to the right; share 0.5 is no move."""
+    """Moved by `share` of the way from -reach to reach, up and to the left; share 0.5 is no move."""
     reach = jnp.round(strength * SHIFT_PIXELS)[:, None]  # [B, 1]
     offset = jnp.floor(share * (2 * reach + 1)) - reach
     pad = (SHIFT_PIXELS, SHIFT_PIXELS)
