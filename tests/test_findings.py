@@ -146,7 +146,7 @@ def test_the_findings_say_what_shifted_frames_gave():
 def test_the_findings_say_what_more_decisions_for_each_gradient_step_take():
     page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     said = []
-    for number in (4, 16):
+    for number in (4, 16, 64):
         folder = ROOT / "results" / "gates" / "runs" / f"rainbow_4task+decisions_{number}" / "defend_the_center"
         files = sorted(folder.glob("**/metrics.jsonl.gz"))
         assert len(files) == 2
@@ -155,8 +155,9 @@ def test_the_findings_say_what_more_decisions_for_each_gradient_step_take():
         updates = np.mean([rows[-1]["num_updates"] for rows in runs])
         decisions = np.mean([rows[-1]["actors/env_steps"] for rows in runs])
         said.append((f"{updates:,.0f}", f"{decisions:,.0f}"[:-3] + "000", f"{100 * np.mean(waits):.0f}"))
-    (updates, decisions, wait), (updates_16, decisions_16, wait_16) = said
+    (updates, decisions, wait), (updates_16, decisions_16, wait_16), (updates_64, *_) = said
     assert f"took {updates_16} gradient steps with 16 decisions and {updates} with 4, but {decisions_16}" in page
+    assert f"points against 4. The runs took {updates_64} gradient steps." in page
     assert f"decisions instead of {decisions}. With 4, the actors wait" in page
     assert f"{wait} percent of their time, with 16 still {wait_16}." in page
 
