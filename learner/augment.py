@@ -86,19 +86,6 @@ def vertical_shift(key: PRNGKeyArray, frames: Frames, strength: Strength) -> Fra
     return _shifted(frames, strength, jnp.concatenate([rows, jnp.full_like(rows, 0.5)], axis=1))
 
 
-def _shifted(frames: Frames, strength: Strength, share: Float[Array, "B 2"]) -> Frames:
-    """Moved by `share` of the way from -reach to reach, up and to the left; share 0.5 is no move."""
-    reach = jnp.round(strength * SHIFT_PIXELS)[:, None]  # [B, 1]
-    offset = jnp.floor(share * (2 * reach + 1)) - reach
-    pad = (SHIFT_PIXELS, SHIFT_PIXELS)
-    padded = jnp.pad(frames, ((0, 0), pad, pad, (0, 0), (0, 0)), mode="edge")
-
-    def crop(image: UInt8[Array, "h w S C"], start: Int[Array, "2"]) -> UInt8[Array, "H W S C"]:
-        return jax.lax.dynamic_slice(image, (start[0], start[1], 0, 0), frames.shape[1:])
-
-    return jax.vmap(crop)(padded, SHIFT_PIXELS + offset.astype(jnp.int32))
-
-
 def random_conv(key: PRNGKeyArray, frames: Frames, strength: Strength) -> Frames:
     """(1 - strength) * image + strength * sigmoid(image convolved with N(0, 1) weights, 3x3, over all channels).
 
@@ -184,6 +171,19 @@ def grey(key: PRNGKeyArray, frames: Frames, strength: Strength) -> Frames:
 AUGMENTATIONS: dict[str, Callable[[PRNGKeyArray, Frames, Strength], Frames]] = {
     f.__name__: f for f in (shift, vertical_shift, random_conv, contrast, gamma, inversion, cutout, grey)
 }
+
+
+def _shifted(frames: Frames, strength: Strength, share: Float[Array, "B 2"]) -> Frames:
+    """Moved by `share` of the way from -reach to reach, up and to the left; share 0.5 is no move."""
+    reach = jnp.round(strength * SHIFT_PIXELS)[:, None]  # [B, 1]
+    offset = jnp.floor(share * (2 * reach + 1)) - reach
+    pad = (SHIFT_PIXELS, SHIFT_PIXELS)
+    padded = jnp.pad(frames, ((0, 0), pad, pad, (0, 0), (0, 0)), mode="edge")
+
+    def crop(image: UInt8[Array, "h w S C"], start: Int[Array, "2"]) -> UInt8[Array, "H W S C"]:
+        return jax.lax.dynamic_slice(image, (start[0], start[1], 0, 0), frames.shape[1:])
+
+    return jax.vmap(crop)(padded, SHIFT_PIXELS + offset.astype(jnp.int32))
 
 
 def _per_sample(x: Shaped[Array, "B"]) -> Shaped[Array, "B 1 1 1 1"]:

@@ -41,9 +41,15 @@ def test_a_policy_is_small_readable_and_has_its_score_card(name, tmp_path, monke
     title = config.table.scenarios[0].title
     (line,) = [line for line in PAGE.read_text().splitlines() if line.startswith(f"| {title} | {num_updates:,} | ")]
     assert f"{np.mean(means):.1f} [" in line
-    if name == "dodge_projectiles":
-        said = f"It has {np.mean(means):.1f} on the test tasks, and {means[-1]:.0f} on `complete`, where plain"
-        assert said in " ".join(PAGE.read_text().split())
+
+
+def test_the_findings_say_what_the_agent_with_shifted_frames_has(tmp_path, monkeypatch):
+    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path))
+    directory = run_directory(Path("zoo:dodge_projectiles"))
+    assert read_run_config(directory).agent.augmentations == ("shift",)
+    means = scores_of(read_rows(directory / "evaluation.jsonl"), "dodge_projectiles")
+    said = f"It has {np.mean(means):.1f} on the test tasks, and {means[-1]:.0f} on `complete`."
+    assert said in " ".join(PAGE.read_text().split())
 
 
 @pytest.mark.parametrize(
