@@ -29,7 +29,6 @@ CONFIG = RunConfig(
     replay=ReplayConfig(capacity=160_000, importance_sampling_exponent_end=0.4, equal_shares=True),
     learner=LearnerConfig(
         total_updates=60_000,
-        env_steps_per_update=16.0,
         warmup_steps=8_000,
         learning_rate=5e-4,
         target_period_updates=1_000,

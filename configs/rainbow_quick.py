@@ -1,8 +1,8 @@
 """Rainbow on Defend the Center's default task, small enough for two CPU cores to learn it within five minutes.
 
-Against `rainbow_4task`: grey frames of 48x84, two small convolutions, 128 hidden units, a higher learning rate, 16
-decisions for each gradient step instead of 4, importance weights with an exponent of 0.4 throughout, a moving average
-of the parameters for evaluation, and a replay, warm-up and target period that fit 15,000 gradient steps.
+Against `rainbow_4task`: grey frames of 48x84, two small convolutions, 128 hidden units, a higher learning rate,
+importance weights with an exponent of 0.4 throughout, a moving average of the parameters for evaluation, and a replay,
+warm-up and target period that fit 15,000 gradient steps.
 """
 
 from gvz.core.env_config import EnvConfig
@@ -19,7 +19,6 @@ CONFIG = RunConfig(
     replay=ReplayConfig(capacity=50_000, importance_sampling_exponent_end=0.4),
     learner=LearnerConfig(
         total_updates=15_000,
-        env_steps_per_update=16.0,
         warmup_steps=2_000,
         learning_rate=5e-4,
         target_period_updates=1_000,

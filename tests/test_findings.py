@@ -156,7 +156,7 @@ def test_the_findings_say_what_more_decisions_for_each_gradient_step_take():
         decisions = np.mean([rows[-1]["actors/env_steps"] for rows in runs])
         said.append((f"{updates:,.0f}", f"{round(decisions, -3):,.0f}", f"{100 * np.mean(waits):.0f}"))
     (updates, decisions, wait), (updates_16, decisions_16, wait_16), (updates_64, *_) = said
-    assert f"took {updates_16} gradient steps with 16 decisions and {updates} with 4, but {decisions_16}" in page
+    assert f"Center took {updates_16} gradient steps with 16 decisions and {updates} with 4, but {decisions_16}" in page
     assert f"points against 4. The runs took {updates_64} gradient steps." in page
     assert f"decisions instead of {decisions}. With 4, the actors wait" in page
     assert f"{wait} percent of their time, with 16 still {wait_16}." in page

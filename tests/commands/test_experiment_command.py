@@ -60,12 +60,12 @@ def test_plan_prints_runs_steps_episodes_and_hours_and_counts_shared_runs_once(r
     arguments += ["--results", str(results)]
     assert main([*arguments, "--scenario", "defend_the_center"]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    # 18 tasks x 100 episodes x 20 checkpoints; (200,000 + 10,000 / 4) / 10 s and 36,000 x 1100 / 4 / 1000 s
-    run = ["rainbow_4task/defend_the_center/train4/seed_1111", "200,000", "810,000", "36,000", "5.62", "2.75"]
+    # 18 tasks x 100 episodes x 20 checkpoints; (200,000 + 10,000 / 16) / 10 s and 36,000 x 1100 / 4 / 1000 s
+    run = ["rainbow_4task/defend_the_center/train4/seed_1111", "200,000", "3,210,000", "36,000", "5.57", "2.75"]
     assert run in lines
-    assert ["rainbow_evaluation:", "3", "runs", "600,000", "2,430,000", "108,000", "16.88", "8.25"] in lines
+    assert ["rainbow_evaluation:", "3", "runs", "600,000", "9,630,000", "108,000", "16.72", "8.25"] in lines
     assert lines[-4][:6] == ["together,", "shared", "runs", "once:", "9", "runs"]
-    assert lines[-4][6:9] == ["1,800,000", "7,290,000", "192,000"]  # 3 x 36,000 + 6 x 7 x 100 x 20
+    assert lines[-4][6:9] == ["1,800,000", "28,890,000", "192,000"]  # 3 x 36,000 + 6 x 7 x 100 x 20
     seeds = [cells[0] for cells in lines if cells and cells[0].startswith("rainbow_4task/")]
     assert len(seeds) == 5  # of nine runs, every other one
     assert lines[-1][:4] == ["rainbow_4task:", "10.00", "updates/s,", "1000.00"]
@@ -75,7 +75,7 @@ def test_plan_prints_runs_steps_episodes_and_hours_and_counts_shared_runs_once(r
     row = rows["rainbow_4task/defend_the_center/train4/seed_1111"]
     assert row["experiments"] == ["rainbow_evaluation", "training_set_size"]
     assert (row["updates"], row["episodes"]) == (200_000, 36_000)
-    assert (row["training_hours"], row["evaluation_hours"]) == (5.625, 2.75)
+    assert (row["training_hours"], row["evaluation_hours"]) == pytest.approx((200_625 / 36_000, 2.75))
 
 
 def test_a_gate_s_hours_follow_from_its_processor_time_and_its_variants_have_rates_of_their_own(results, capsys):

@@ -359,5 +359,5 @@ def test_an_agent_with_another_agents_learner_is_refused(fields, message):
 
 
 def test_decisions_for_a_gradient_step_follow_from_the_learner():
-    assert load_config("rainbow_4task").env_steps_per_update == 4.0
+    assert load_config("rainbow_4task").env_steps_per_update == 16.0
     assert load_config("ppo_quick").env_steps_per_update == 8 * 32 / (3 * 4)
