@@ -10,6 +10,7 @@ import pytest
 
 from gvz.evaluation.statistics import difference
 from gvz.reports.experiment_section import comparison_table, result_table
+from gvz.reports.results import read_results
 from gvz.reports.scores import agent_scores, estimate, estimate_groups
 from gvz.tasks import TaskSet, named_tasks, scenario_named, scenarios
 from tests.test_results import ROOT, results_of
@@ -141,6 +142,50 @@ def test_the_findings_say_what_shifted_frames_gave():
     (gate,) = [asked for asked in results_of("gates").asked if asked.experiment.name == "gate_shift"]
     gains = [row[2].text for row in comparison_table(results_of("gates"), gate).rows]
     assert all(gain in page for gain in gains[:5])
+
+
+def test_the_findings_say_what_anyone_reaches_on_level_4():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    agents = results_of("general_short").episodes
+    script = read_results([ROOT / "results" / "reference" / "scripted.jsonl.gz"]).episodes
+    found = []
+    for episodes, agent, num_seeds in (
+        (agents, "rainbow_segmented", 3),
+        (agents, "rainbow_general+classes", 1),
+        (script, "scripted", 1),
+    ):
+        rows = [episodes.filter(agent=agent, task=task.id) for task in named_tasks(level=4)]
+        assert all(rows_of["run_seed"].n_unique() == num_seeds for rows_of in rows)
+        found.append([rows_of["normalized_score"].mean() for rows_of in rows])
+    words = ["{:.0f}, {:.0f}, {:.0f} and {:.0f}".format(*scores) for scores in found]
+    means = [f"{np.mean(scores):.1f}" for scores in found]
+    assert f"{words[0]} on the four tasks `complete`, {means[0]} in the mean." in page
+    assert f"frames of classes have {words[1]}, which is {means[1]}. The script, which reads names and places" in page
+    assert f"has {words[2]}, which is {means[2]}. The best of the three" in page
+    assert f"on each task would be {np.max(found, axis=0).mean():.1f}." in page
+
+
+def test_the_findings_say_what_pairs_gave_beside_segmented_frames():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    episodes, said = results_of("gates").episodes, []
+    for task in (
+        "dodge_projectiles/arachnotron",
+        "health_gathering/short_agent+water",
+        "health_gathering/supreme",
+        "health_gathering/poison",
+    ):
+        for agent, num_episodes in (("rainbow_segmented (8 tasks and pairs)", 20), ("rainbow_segmented (8 tasks)", 40)):
+            rows = episodes.filter(agent=agent, task=task)
+            assert len(rows) == num_episodes
+            said.append(f"{rows['normalized_score'].mean():.0f}")
+    assert "`arachnotron` has {} instead of {}, and `short_agent+water` {} instead of {}.".format(*said[:4]) in page
+    assert "`supreme` has {} instead of {}, and `poison` {} instead of {}.".format(*said[4:]) in page
+    pairs, eight = ([task.id for task in named_tasks("health_gathering", split=s)] for s in ("pairs", "train8"))
+    rare = [sum("poison" in task or "supreme" in task for task in tasks) for tasks in (pairs, eight)]
+    assert (rare, len(pairs)) == ([11, 2], 24)
+    (gate,) = [asked for asked in results_of("gates").asked if asked.experiment.name == "gate_pairs"]
+    gains = [row[2].text for row in comparison_table(results_of("gates"), gate).rows]
+    assert all(gain in page for gain in gains[1:3])
 
 
 def test_the_findings_say_what_more_decisions_for_each_gradient_step_take():
