@@ -14,6 +14,7 @@ from gvz.evaluation.statistics import bootstrap, bootstrap_runs
 from gvz.reports.experiment_section import result_table
 from gvz.reports.joint_section import joint_sections
 from gvz.reports.results import Results, read_results
+from gvz.reports.scores import agent_scores, estimate
 from gvz.tasks import TaskSet, named_tasks, scenarios
 
 ROOT = Path(__file__).parent.parent
@@ -100,6 +101,33 @@ def test_the_joint_run_says_what_its_records_give():
     report = (folder / "report" / "report.md").read_text()
     assert "P_norm, 43.6 [42.8, 44.4]" in readme
     assert "| rainbow_all | 47.7 [46.8, 48.8] | 41.4 [40.2, 42.7] |" in report
+
+
+def test_the_hour_of_the_main_job_says_what_its_records_give():
+    folder = ROOT / "results" / "rainbow_4task"
+    page, guide = (" ".join(file.read_text().split()) for file in (folder / "README.md", ROOT / "docs/how-to/train.md"))
+    lines = gzip.decompress((folder / "seed_1111" / "metrics.jsonl.gz").read_bytes()).splitlines()
+    last = json.loads(lines[-1])
+    updates, decisions = f"{last['num_updates']:,} gradient steps", f"{round(last['actors/env_steps'], -3):,} decisions"
+    assert f"{updates}, {decisions} and {last['run/processor_s']:,.0f} seconds of processor time" in page
+    random = read_results([ROOT / "results" / "reference" / "random.jsonl.gz"]).episodes
+    said = []
+    for split, title in (("train4", "4 training tasks"), ("test", "7 test tasks")):
+        tasks = [task.id for task in named_tasks("defend_the_center", split=split)]
+        found = [(results_of("rainbow_4task").episodes, "rainbow_4task"), (random, "random")]
+        said.append([estimate(agent_scores(episodes, agent), tasks).text for episodes, agent in found])
+        assert f"| {title} | {' | '.join(said[-1])} |" in page
+    (trained, _), (unseen, chance) = said
+    assert f"after {updates}, it has {trained} on its four training tasks and {unseen} on the" in guide
+    assert f"(random: {chance.split()[0]};" in guide
+    lines = gzip.decompress((folder / "seed_1111" / "episodes.jsonl.gz").read_bytes()).splitlines()
+    rows, learning = [json.loads(line) for line in lines], []
+    for low, high in ((0, 5_000), (15_000, 20_000), (40_000, 44_091)):
+        scores = [row["normalized_score"] for row in rows if low <= row["num_updates"] < high]
+        learning.append(f"{np.mean(scores):.0f}")
+    assert (
+        "{} percent of the bound in the first 5,000 gradient steps, {} at 15,000 to 20,000, and {} in the last 4,090."
+    ).format(*learning) in page
 
 
 @pytest.mark.parametrize(
