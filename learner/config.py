@@ -206,7 +206,8 @@ class LearnerConfig:
     warmup_steps: Annotated[int, Range(1, 10**12)] = 10_000
     """decisions gathered before the first update, by uniformly random actions"""
     env_steps_per_update: Annotated[float, Range(0.001, 10**6)] = 16.0
-    """decisions (all games together) per gradient step after warm-up. The thesis gives none, Rainbow for Atari has 4"""
+    """decisions (all games together) per gradient step after warm-up. A gate chose 16 (docs/FINDINGS.md); the thesis
+    gives none, and Rainbow for Atari has 4"""
     step_tolerance: Annotated[int, Range(1, 10**9)] = 256
     """decisions by which learner and actors may run apart"""
     batch_size: Annotated[int, Range(1, 65536)] = 32

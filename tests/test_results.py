@@ -128,6 +128,10 @@ def test_the_hour_of_the_main_job_says_what_its_records_give():
     assert (
         "{} percent of the bound in the first 5,000 gradient steps, {} at 15,000 to 20,000, and {} in the last 4,090."
     ).format(*learning) in page
+    assert round(2 * 200_000 / last["num_updates"]) == 2 * 4.5
+    (readme,) = re.findall("200,000 gradient steps, about (.*?) hours", (ROOT / "README.md").read_text())
+    assert f"whole job take {readme} hours" in page
+    assert f"`rainbow_4task` needs some {readme} hours" in guide
 
 
 @pytest.mark.parametrize(
