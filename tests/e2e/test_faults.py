@@ -239,7 +239,7 @@ def test_stalls_lose_nothing_and_restart_nobody(tmp_path, pause_s):
     """The learner stops for a while, one actor is a hundred times slower than the other, one game never ends."""
     run = tmp_path / "run"
     rules = {"default": {"sleep_s": 0.3}, "fast_enemies": {"endless": True}}
-    flags = "--learner.total-updates 500 --replay.capacity 12000".split()
+    flags = "--learner.total-updates 500 --replay.capacity 36000".split()
     process = launch(run, *flags, environment=mischief(rules))
     wait_until(lambda: num_updates(run) >= 100, "update 100")
     process.send_signal(signal.SIGSTOP)
