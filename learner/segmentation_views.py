@@ -26,6 +26,9 @@ _THINGS = ("enemy", "projectile", "kit", "poison", "other", "key")
 DECORATIONS = ("scenery", "effect")
 _PARTS = (("wall",), ("plane",), _THINGS, DECORATIONS)
 """what has colours of its own"""
+_TINTED_SHARE = 0.2
+_PATCHED_SHARE = 0.4
+"""of other surroundings"""
 
 
 class Shot(NamedTuple):
@@ -52,7 +55,9 @@ def changed_view(
     """A frame as it might look elsewhere, and its labels.
 
     Three of four keep colours, textures and light, and most of these have other surroundings: so looks meet that are
-    known from different tasks. In the others, looks change as well.
+    known from different tasks. In the others, looks change as well. Some of the other surroundings have walls or floors
+    in shades of one colour, or with patches of one colour each: else what is light, or of a strong colour, would be
+    taken for a thing.
 
     What is put before other surroundings is hidden where their walls and things are nearer. The floor of all maps of a
     scenario is at one height, so things stand on it as they do in the game: far ones before far walls.
@@ -72,6 +77,11 @@ def changed_view(
     elsewhere, other_looks = rng.random(2) < (0.85, 0.25)
     if elsewhere:
         behind = _Scene.of(surroundings)
+        tinted, patched = rng.random(2) < (_TINTED_SHARE, _PATCHED_SHARE)
+        if tinted:
+            behind.view = _tinted(rng, behind.view, behind.labels)
+        if patched:
+            behind.view = _patched(rng, behind.view, behind.labels, shot.frame[_is(shot.labels, _THINGS) == 1])
         if other_looks:
             behind.view = _other_parts(rng, behind.view, behind.labels)
         if decorations is not None:
@@ -215,6 +225,44 @@ _STYLES = {"STYLE_Shadow": _shadow, "STYLE_Translucent": _translucent, "STYLE_Fu
 """f(rng, things, surroundings) -> things as the engine draws them in a render style"""
 OUTLINES = ("STYLE_Shadow", "STYLE_Fuzzy")
 """render styles that show nothing of a thing but its outline: before other surroundings it looks different"""
+
+
+def _tinted(rng: np.random.Generator, view: Frame, labels: np.ndarray) -> Frame:
+    """Walls, or floors and ceilings, in shades of one colour, mostly a strong one."""
+    part = (("wall",), ("plane",))[int(rng.integers(2))]
+    colour = rng.random(3) ** 2
+    shades = view.max(axis=-1, keepdims=True) * np.exp(rng.normal(0, 0.4))
+    return cv2.copyTo((shades * colour / colour.max()).astype(np.float32), _is(labels, part), view.copy())
+
+
+def _patched(rng: np.random.Generator, view: Frame, labels: np.ndarray, colours: np.ndarray) -> Frame:
+    """Walls, floors and ceilings with one to five patches: strips or blocks, aslant and tapered as in perspective.
+
+    Args:
+        colours: u8[N 3], of things. Of ten patches three have one of these, four a light grey, and three any.
+    """
+    view, (height, width) = view.copy(), labels.shape
+    for _ in range(int(rng.integers(1, 6))):
+        kind = rng.random()
+        if kind < 0.4:
+            colour = rng.uniform(120, 255) + rng.normal(0, 10, 3)
+        elif kind < 0.7 and len(colours):
+            colour = colours[int(rng.integers(len(colours)))]
+        else:
+            colour = rng.uniform(0, 255, 3)
+        if rng.random() < 0.5:
+            length, thickness, taper = rng.uniform(20, 200), np.exp(rng.uniform(0.4, 2.6)), rng.uniform(0.3, 1.7)
+        else:
+            (length, thickness), taper = np.exp(rng.uniform(1.4, 4.1, 2)), rng.uniform(0.7, 1.3)
+        ends = length / 2 * np.array([-1, 1])
+        middle, half = ends * rng.normal(0, 0.3), thickness / 2 * np.array([1, taper])
+        corners = np.column_stack([[*ends, *ends[::-1]], [*(middle - half), *(middle + half)[::-1]]])
+        place = np.zeros((height, width), np.uint8)
+        cv2.fillConvexPoly(place, np.rint(corners + rng.uniform(0, (width, height))).astype(np.int32), 1)
+        part = (("wall", "plane"), ("wall",), ("plane",))[int(rng.integers(3))]
+        grain = rng.normal(0, rng.uniform(0, 25), (height, width, 1))
+        cv2.copyTo((colour + grain).astype(np.float32), place & _is(labels, part), view)
+    return view
 
 
 def _other_parts(rng: np.random.Generator, view: Frame, labels: np.ndarray) -> Frame:

@@ -98,6 +98,13 @@ def filled(colour: int, label: int, depth: int = 20) -> views.Shot:
     return shot(np.full((48, 60, 3), colour, np.uint8), np.full((48, 60), label, np.uint8), depth)
 
 
+@pytest.fixture
+def plain_surfaces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No tints and no patches."""
+    monkeypatch.setattr(views, "_TINTED_SHARE", 0.0)
+    monkeypatch.setattr(views, "_PATCHED_SHARE", 0.0)
+
+
 def inner(found: np.ndarray, label: int) -> np.ndarray:
     """The pixels of a label that are not at an edge."""
     return cv2.erode(np.uint8(found == label), np.ones((5, 5)), borderValue=0) > 0
@@ -117,6 +124,7 @@ def test_a_changed_view_has_the_things_of_one_frame_and_the_surroundings_of_eith
     assert not any("scenery" in names and len(names) > 1 for names in seen)
 
 
+@pytest.mark.usefixtures("plain_surfaces")
 def test_things_stand_before_other_surroundings_that_keep_their_looks_in_every_fourth_view():
     frame, labels = parted()
     frame[labels == ENEMY] = (200, 10, 10)
@@ -273,6 +281,7 @@ def test_outlines_show_the_surroundings_that_they_are_put_before():
     assert all(0.54 <= shade <= 0.76 for shade in shades)
 
 
+@pytest.mark.usefixtures("plain_surfaces")
 def test_most_styles_that_are_drawn_are_known_ones():
     """Ten sets of seeds: 38 to 55 shadows if none is known, 126 to 153 if they are."""
     frame, labels = parted()
@@ -311,6 +320,32 @@ def test_parts_are_changed_each_by_itself():
             tuple(bool((view != frame)[labels == LABEL_CLASSES.index(n)].any()) for n in ("wall", "plane", "enemy"))
         )
     assert len(set(changed)) == 8, "each of the three parts is changed or not, whatever the others are"
+
+
+def test_a_tint_gives_walls_or_floors_shades_of_one_colour():
+    frame, labels = parted()
+    view, changed = frame.astype(np.float32), set()
+    for seed in range(20):
+        tinted = views._tinted(np.random.default_rng(seed), view, labels)
+        (number,) = np.unique(labels[(tinted != view).any(axis=-1)])
+        part = labels == number
+        assert (tinted[~part] == view[~part]).all()
+        shares = tinted[part] / tinted[part].max(axis=-1, keepdims=True)
+        np.testing.assert_allclose(shares, np.broadcast_to(shares[0], shares.shape), atol=1e-4)
+        changed.add(int(number))
+    assert changed == {WALL, PLANE}
+
+
+def test_patches_are_on_walls_and_floors_alone_and_some_have_the_colour_of_a_thing():
+    frame, labels = parted()
+    view, changed, alike = frame.astype(np.float32), set(), 0
+    for seed in range(200):
+        patched = views._patched(np.random.default_rng(seed), view, labels, np.array([[250, 0, 250]], np.uint8))
+        new = (patched != view).any(axis=-1)
+        changed |= set(np.unique(labels[new]).tolist())
+        alike += bool(new.any() and (np.abs(patched[new] - (250, 0, 250)).mean() < 25))
+    assert changed == {WALL, PLANE}
+    assert alike >= 5
 
 
 def test_mirrored_exchanges_left_and_right_of_both():
