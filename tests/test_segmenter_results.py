@@ -80,6 +80,7 @@ def test_the_findings_say_what_the_trials_of_health_gathering_found():
     trials = json.loads((ROOT / "results" / "gates" / "segmenters" / "health_gathering_trials.json").read_text())
     used = json.loads((ROOT / "gvz" / "segmenters" / "health_gathering.json").read_text())
     forms = {
+        "one_frame": "things of one frame in each",
         "base": "three frames: things of three in each",
         "tint": "three frames, surfaces in shades of a drawn colour",
         "texture": "three frames, surfaces with a drawn texture",
@@ -87,9 +88,12 @@ def test_the_findings_say_what_the_trials_of_health_gathering_found():
         "varied": "three frames, and frames of varied maps",
         "base_1500": "three frames",
         "texture_1500": "three frames, surfaces with a drawn texture",
+        "patches": "three frames, surfaces with patches",
+        "tints_patches": "three frames, surfaces with tints and patches",
     }
     assert list(trials["networks"]) == list(forms)
-    rows = [("used: things of one frame", used), *((forms[form], one) for form, one in trials["networks"].items())]
+    rows = [(forms[form], one) for form, one in trials["networks"].items()]
+    rows.append(("used: three frames, surfaces with tints and patches", used))
     for title, network in rows:
         found = network["average_precision"]
         assert list(found) == [task.id for task in named_tasks("health_gathering", split="gate")]

@@ -15,9 +15,8 @@ EXPERIMENT = dataclasses.replace(
     published={},
     notes=(
         "The networks come with GViZDoom. Each learned from the engine's labels, on the eight training tasks of its "
-        "scenario, for 700 seconds of processor time, in Defend the Center and Seek and Kill 1,500, which come to the "
-        "time of these runs. Agents need no labels. They also observe the scenario's game variables, and have a "
-        "discount of 0.95. In Dodge Projectiles they get a reward for moving in training. Other agents here see "
-        "frames alone, and have 0.99.",
+        "scenario, for 1,500 seconds of processor time, in Dodge Projectiles for 700, which come to the time of these "
+        "runs. Agents need no labels. They also observe the scenario's game variables, and have a discount of 0.95. In "
+        "Dodge Projectiles they get a reward for moving in training. Other agents here see frames alone, and have 0.99.",
     ),
 )
