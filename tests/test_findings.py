@@ -56,6 +56,10 @@ def test_the_findings_say_what_segmented_agents_have_on_single_tasks():
     assert f"on `short_agent+water`, where agents have {score(f'{gathering}/short_agent+water')} instead of" in page
     water, classes = f"{gathering}/short_agent+water", "rainbow_general+classes"
     assert f"frames of classes have {score(water, classes)} there, segmented ones {score(water)}." in page
+    assert f"`poison+stimpacks` has {score(f'{gathering}/poison+stimpacks')} instead of 73." in page
+    gate_tasks = [task.id for task in named_tasks(gathering, split="gate")]
+    of_gate = estimate(agent_scores(episodes.filter(scenario=gathering), "rainbow_segmented"), gate_tasks).text
+    assert f"**Health Gathering has {of_gate} instead of 80.2" in page
     trained = [score(f"{gathering}/{name}") for name in ("supreme", "poison")]
     assert f"`supreme` and `poison`, training tasks, stand at {' and '.join(trained)}, and" in page
     both = f"{gathering}/poison+supreme"
