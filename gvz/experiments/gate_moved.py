@@ -13,8 +13,14 @@ EXPERIMENT = Gate(
         "moved": {"env.reward_weights": [["dodge_projectiles.moved", 0.0002]]},
         "moved_more": {"env.reward_weights": [["dodge_projectiles.moved", 0.0005]]},
         "moved_most": {"env.reward_weights": [["dodge_projectiles.moved", 0.002]]},
+        "shift_moved": {
+            "env.reward_weights": [["dodge_projectiles.moved", 0.005]],
+            "agent.augmentations": ["shift"],
+            "agent.augmentation_strength": 0.5,
+        },
     },
     scenarios=("dodge_projectiles",),
     trainings=("train8",),
     max_processor_s=900.0,
+    notes=("`shift_moved` also shifts frames; `shift` of `gate_shift` is the same with 0.002.",),
 )
