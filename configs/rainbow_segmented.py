@@ -3,7 +3,7 @@
 The network (`gvz segmenter`) has learned from the engine's labels what things look like, and the agent learns play
 alone. Frames are 24x42, half as high and wide, so the convolutions are half as large with half the strides. The agent
 also observes the scenario's game variables, and looks less far ahead, with a discount of 0.95. In Dodge Projectiles it
-gets a reward for moving (docs/FINDINGS.md).
+gets a reward for moving, and half of a batch shows shifted frames (docs/FINDINGS.md).
 """
 
 import dataclasses
@@ -25,3 +25,5 @@ CONFIG = dataclasses.replace(
         GENERAL.agent, conv_kernels=(4, 4), conv_strides=(2, 2), discount=0.95, game_variables=True
     ),
 )
+
+SCENARIO_SETTINGS = {"dodge_projectiles": {"agent.augmentations": ["shift"], "agent.augmentation_strength": 0.5}}

@@ -54,15 +54,18 @@ def parse(arguments: Sequence[str]) -> Launch:
         ConfigError, TaskError: an invalid value. SystemExit(2): flags that do not parse.
     """
     name = argument(arguments, "--config") or DEFAULT_CONFIG
+    agent = argument(arguments, "--agent.name")
+
+    def parsed(config: RunConfig) -> Launch:
+        if agent is not None and agent != config.agent.name:
+            config = with_agent(config, agent)
+        return tyro.cli(Launch, args=arguments, default=Launch(config=name, run=config), prog="python -m gvz.launch")
+
     config = load_config(name)
-    if (agent := argument(arguments, "--agent.name")) is not None and agent != config.agent.name:
-        config = with_agent(config, agent)
-    return tyro.cli(
-        Launch,
-        args=arguments,
-        default=Launch(config=name, run=config),
-        prog="python -m gvz.launch",
-    )
+    launch = parsed(config)
+    played = launch.run.table.scenarios
+    of_scenario = load_config(name, played[0].id) if len(played) == 1 else config
+    return launch if of_scenario == config else parsed(of_scenario)
 
 
 def resumed_config(run: RunDir, config: RunConfig) -> RunConfig:

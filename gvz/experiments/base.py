@@ -14,9 +14,8 @@ from typing import Any, Literal, get_args
 from gvz.core.errors import ConfigError, nearest
 from gvz.core.registry import discover
 from gvz.evaluation.simple import SIMPLE_PLAYERS
-from gvz.experiments.settings import with_settings
 from gvz.run.config import RunConfig
-from gvz.run.config_files import load_config
+from gvz.run.config_files import load_config, with_settings
 from gvz.scenarios.map_set import PROCEDURAL, VARIED, names_map_set
 from gvz.tasks import (
     LEVELS,
@@ -87,7 +86,8 @@ class TrainingRun:
     @property
     def run_config(self) -> RunConfig:
         """Its config file with the settings of its variant, at full size."""
-        return with_settings(load_config(self.config), {"scenario": self.scenario, **self.settings})
+        config = load_config(self.config, self.scenario)
+        return with_settings(config, {"scenario": self.scenario, **self.settings})
 
     @property
     def checkpoint_period_updates(self) -> int:
@@ -322,12 +322,13 @@ def experiments() -> dict[str, Experiment]:
     found = {name: module.EXPERIMENT for name, module in discover("gvz.experiments", "EXPERIMENT").items()}
     assert all(name == experiment.name for name, experiment in found.items()), "an experiment's name is its file's"
     for experiment in found.values():
-        for config in map(load_config, experiment.configs):
-            for (variant, settings), scenario in itertools.product(experiment.variants.items(), experiment.scenarios):
+        for config, scenario in itertools.product(experiment.configs, experiment.scenarios):
+            defaults = load_config(config, scenario)
+            for variant, settings in experiment.variants.items():
                 try:
-                    with_settings(config, {"scenario": scenario, **settings})
+                    with_settings(defaults, {"scenario": scenario, **settings})
                 except ConfigError as error:
-                    where = f"experiment {experiment.name}: variant {variant} of {config.name}"
+                    where = f"experiment {experiment.name}: variant {variant} of {config}"
                     raise ConfigError(f"{where}: {error}") from error
     return found
 

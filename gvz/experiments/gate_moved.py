@@ -2,6 +2,9 @@
 
 from gvz.experiments.gate import Gate
 
+PLAIN = {"agent.augmentations": []}
+"""without the shifted frames that `rainbow_segmented` has in Dodge Projectiles"""
+
 EXPERIMENT = Gate(
     name="gate_moved",
     title="Gate: a reward for moving in Dodge Projectiles",
@@ -9,10 +12,10 @@ EXPERIMENT = Gate(
     "make agents dodge better?",
     configs=("rainbow_segmented",),
     variants={
-        "plain": {"env.reward_weights": [["dodge_projectiles.moved", 0.0]]},
-        "moved": {"env.reward_weights": [["dodge_projectiles.moved", 0.0002]]},
-        "moved_more": {"env.reward_weights": [["dodge_projectiles.moved", 0.0005]]},
-        "moved_most": {"env.reward_weights": [["dodge_projectiles.moved", 0.002]]},
+        "plain": {"env.reward_weights": [["dodge_projectiles.moved", 0.0]], **PLAIN},
+        "moved": {"env.reward_weights": [["dodge_projectiles.moved", 0.0002]], **PLAIN},
+        "moved_more": {"env.reward_weights": [["dodge_projectiles.moved", 0.0005]], **PLAIN},
+        "moved_most": {"env.reward_weights": [["dodge_projectiles.moved", 0.002]], **PLAIN},
         "shift_moved": {
             "env.reward_weights": [["dodge_projectiles.moved", 0.005]],
             "agent.augmentations": ["shift"],

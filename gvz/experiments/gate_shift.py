@@ -17,5 +17,5 @@ EXPERIMENT = Gate(
     scenarios=("dodge_projectiles", "defend_the_center", "health_gathering"),
     trainings=("train8",),
     max_processor_s=900.0,
-    notes=("`moved_most` is `rainbow_segmented` as it is.",),
+    notes=("`moved_most` is `rainbow_segmented` without shifted frames.",),
 )

@@ -1,8 +1,9 @@
 """A gate: does an agent dodge new missiles better if it learned with sticky actions?"""
 
 from gvz.experiments.gate import Gate
+from gvz.experiments.gate_moved import EXPERIMENT as MOVED
 
-_BEFORE = {"env.reward_weights": [["dodge_projectiles.moved", 0.0]]}
+_BEFORE = MOVED.variants["plain"]
 """of `rainbow_segmented` until `gate_moved`"""
 
 EXPERIMENT = Gate(

@@ -8,8 +8,8 @@ import dataclasses
 
 from gvz.core.errors import ConfigError
 from gvz.experiments.base import Experiment
-from gvz.experiments.settings import Settings
 from gvz.run.config import RunConfig, off_policy
+from gvz.run.config_files import Settings
 from learner.agents.configs.pqn import PQNConfig
 from learner.config import ValueConfig
 

@@ -10,11 +10,15 @@ from typing import Any, get_args, get_type_hints
 
 from gvz.core.env_config import typed
 from gvz.core.errors import ConfigError, nearest
-from gvz.run.config import RunConfig
+from gvz.run.config import RunConfig, with_agent
+from gvz.tasks import scenarios
 from learner.config import AgentConfig, LearnerConfig, OnPolicyConfig, agent_config_class
 
 CONFIG_SCHEMA = 2
 """Raised by one whenever a saved config.json can no longer be read as before."""
+
+Settings = dict[str, Any]
+"""field of RunConfig, dotted ("learner.batch_size") -> value"""
 
 
 def configs_directory() -> Path:
@@ -47,11 +51,16 @@ def find_config_file(text: str) -> Path:
     raise ConfigError(f"--config: no config {text!r}{hint}; there are {', '.join(names)} (or give a path: ./{text})")
 
 
-def load_config(text: str) -> RunConfig:
+def load_config(text: str, scenario: str | None = None) -> RunConfig:
     """Runs a config file and returns its `CONFIG`.
 
+    Args:
+        text: a name in configs/, or a path.
+        scenario: whose settings count. A file may define `SCENARIO_SETTINGS`: scenario -> dotted field of RunConfig ->
+            value. They hold for a run that plays tasks of this scenario alone, and flags come after them.
+
     Raises:
-        ConfigError: no such file, it fails, or it does not define `CONFIG: RunConfig`.
+        ConfigError: no such file, it fails, it does not define `CONFIG: RunConfig`, or a setting does not fit.
     """
     path = find_config_file(text)
     namespace: dict[str, Any] = {"__name__": f"configs.{path.stem}", "__file__": str(path)}
@@ -60,11 +69,35 @@ def load_config(text: str) -> RunConfig:
         config = namespace.get("CONFIG")
         if not isinstance(config, RunConfig):
             raise ConfigError(f"got {type(config).__name__} for CONFIG, want `CONFIG = RunConfig(...)`")
-        return build_config(dataclasses.asdict(config), "CONFIG", type(config.agent))  # checks the types
+        config = build_config(dataclasses.asdict(config), "CONFIG", type(config.agent))  # checks the types
+        settings = namespace.get("SCENARIO_SETTINGS", {})
+        if unknown := set(settings) - set(scenarios()):
+            raise ConfigError(f"SCENARIO_SETTINGS: got {', '.join(unknown)}, want some of {', '.join(scenarios())}")
+        return with_settings(config, settings.get(scenario, {}))
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
     except Exception as error:  # a config file is the user's own program: anything may come out of it
         raise ConfigError(f"{path}: {type(error).__name__}: {error}") from error
+
+
+def with_settings(config: RunConfig, settings: Mapping[str, Any]) -> RunConfig:
+    """The configuration with these values. "agent.name" changes the agent, and then its other fields.
+
+    Raises:
+        ConfigError: an unknown field, or a value that the configuration refuses.
+    """
+    if (agent := settings.get("agent.name")) is not None:
+        config = with_agent(config, agent)
+    plain = dataclasses.asdict(config)
+    for name, value in settings.items():
+        *groups, field = name.split(".")
+        part: Any = plain
+        for group in groups:
+            part = part.get(group) if isinstance(part, dict) else None
+        if not isinstance(part, dict) or field not in part or isinstance(part[field], dict):
+            raise ConfigError(f"settings: got {name}, want a field of RunConfig, for example learner.batch_size")
+        part[field] = value
+    return build_config(plain, "settings", type(config.agent))
 
 
 def config_to_dict(config: RunConfig) -> dict[str, Any]:

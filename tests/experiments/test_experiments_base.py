@@ -8,8 +8,7 @@ import pytest
 
 from gvz.core.errors import ConfigError, TaskError
 from gvz.experiments.base import Experiment, TrainingRun, experiment_named, experiments
-from gvz.experiments.settings import with_settings
-from gvz.run.config_files import load_config
+from gvz.run.config_files import load_config, with_settings
 from gvz.tasks import named_tasks, parse_task, scenarios
 
 THESIS_AVERAGES = {

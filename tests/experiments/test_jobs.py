@@ -9,9 +9,8 @@ from gvz.experiments.base import experiments
 from gvz.experiments.jobs import PlayerJob, RunJob, training_flags
 from gvz.experiments.plan import Evaluation
 from gvz.experiments.scale import scaled
-from gvz.experiments.settings import with_settings
 from gvz.launch import parse
-from gvz.run.config_files import config_to_dict, load_config
+from gvz.run.config_files import config_to_dict, load_config, with_settings
 
 EVALUATION = Evaluation(tasks=("defend_the_center/default",), episodes=2)
 
