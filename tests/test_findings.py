@@ -135,6 +135,14 @@ def test_the_findings_say_what_shifted_frames_gave():
     gate_tasks = [task.id for task in named_tasks("dodge_projectiles", split="gate")]
     in_zoo = episodes.filter(episodes["task"].is_in(gate_tasks), agent="rainbow_segmented+shift", run_seed=2222)
     assert f"is in the zoo, rounded: seed 2222, which has {in_zoo['normalized_score'].mean():.1f} there." in page
+    sets = [[task.id for task in named_tasks("dodge_projectiles", split=split)] for split in ("gate", "train8")]
+    on_gate, trained, on_gate_more, trained_more = (
+        episodes.filter(episodes["task"].is_in(tasks), agent=f"rainbow_segmented+{variant}")["normalized_score"].mean()
+        for variant in ("shift", "shift_moved")
+        for tasks in sets
+    )
+    assert f"0.002 has {on_gate:.1f} on the gate tasks and {trained:.1f} on the training tasks." in page
+    assert f"0.005 has {on_gate_more:.1f} and {trained_more:.1f}. It has one seed" in page
     tasks = [task.id for task in named_tasks("defend_the_center", split="train8")]
     of_tasks = episodes.filter(episodes["task"].is_in(tasks))
     plain, everywhere, vertical = (

@@ -3,7 +3,7 @@
 from gvz.experiments.gate import Gate
 
 PLAIN = {"agent.augmentations": []}
-"""without the shifted frames that `rainbow_segmented` has in Dodge Projectiles"""
+"""without the shifted frames of `rainbow_segmented` in Dodge Projectiles"""
 
 EXPERIMENT = Gate(
     name="gate_moved",

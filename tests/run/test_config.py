@@ -92,6 +92,46 @@ def test_a_broken_config_file_is_named(tmp_path, text, message):
         load_config(str(file))
 
 
+def test_settings_of_a_scenario_hold_for_runs_that_play_it_alone_and_flags_come_after_them(tmp_path):
+    file = tmp_path / "mine.py"
+    settings = {"seek_and_kill": {"agent.discount": 0.5, "replay.capacity": 50_000}}
+    file.write_text(
+        f"from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='mine')\nSCENARIO_SETTINGS = {settings}\n"
+    )
+
+    def discount(flags: str) -> float:
+        return parse(["--config", str(file), *flags.split()]).run.agent.discount
+
+    assert (load_config(str(file)).agent.discount, load_config(str(file), "seek_and_kill").agent.discount) == (
+        0.99,
+        0.5,
+    )
+    assert discount("") == discount("--scenario health_gathering") == 0.99
+    assert discount("--scenario seek_and_kill") == discount("--tasks seek_and_kill/red seek_and_kill/blue") == 0.5
+    assert discount("--scenario seek_and_kill --agent.discount 0.9") == 0.9
+    assert discount("--tasks seek_and_kill/red dodge_projectiles/city --env.action-set unified_v1") == 0.99
+    assert (
+        parse(["--config", str(file), "--scenario", "seek_and_kill", "--agent.name", "dqn"]).run.agent.discount == 0.5
+    )
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"seek_and_kil": {}}, "SCENARIO_SETTINGS: got seek_and_kil, want some of defend_the_center"),
+        ({"seek_and_kill": {"agent.discout": 0.5}}, "settings: got agent.discout, want a field of RunConfig"),
+        ({"seek_and_kill": {"agent.discount": "a"}}, "settings.agent.discount: got 'a', want"),
+    ],
+)
+def test_a_setting_of_a_scenario_that_does_not_fit_is_named(tmp_path, settings, message):
+    file = tmp_path / "broken.py"
+    file.write_text(
+        f"from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='a')\nSCENARIO_SETTINGS = {settings}\n"
+    )
+    with pytest.raises(ConfigError, match=re.escape(str(file)) + ".*" + re.escape(message)):
+        load_config(str(file), "seek_and_kill")
+
+
 def test_a_near_miss_is_suggested():
     with pytest.raises(ConfigError, match="did you mean 'rainbow_4task'"):
         load_config("rainbow_4tasks")
