@@ -53,7 +53,8 @@ def test_the_findings_say_what_putting_frames_together_gave():
         assert row(title, task, measure) in page
         assert task in {pair.id for pair in named_tasks(task.partition("/")[0], split="pairs")}
     gate_tasks = [task.id for task in named_tasks("seek_and_kill", split="gate")]
-    for form in ("decorated", "few_own_things", "logarithm", "looks", "direct", "three_frames", "three_frames_more"):
+    more = ("three_frames", "three_frames_more", "tints_patches")
+    for form in ("decorated", "few_own_things", "logarithm", "looks", "direct", *more):
         found = record["networks"][form]["tasks"]
         tasks = ["seek_and_kill/red+shadows", *gate_tasks]
         cells = " | ".join(f"{found[task]['average_precision']['enemy']:.2f}" for task in tasks)

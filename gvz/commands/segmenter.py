@@ -65,6 +65,7 @@ class TrainSegmenter:
         from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, Segmenter
         from learner.segmentation import train_segmentation, write_onnx
 
+        of_machine = machine.describe()  # with the commit of the code that is loaded now
         begun_s, steps, loss = machine.processor_s(), 0, 0.0
         with Bars(line_period_s=10.0) as bars:
 
@@ -103,7 +104,7 @@ class TrainSegmenter:
             "batch_size": _BATCH_SIZE,
             "processor_s": round(spent_s, 1),
             "loss": round(loss, 4),
-            "machine": machine.describe(),
+            "machine": of_machine,
             "average_precision": {task: {k: round(v, 3) for k, v in found.items()} for task, found in scores.items()},
         }
         self.out.with_suffix(".json").write_text(json.dumps(record, indent=2) + "\n")
