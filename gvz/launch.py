@@ -61,11 +61,11 @@ def parse(arguments: Sequence[str]) -> Launch:
             config = with_agent(config, agent)
         return tyro.cli(Launch, args=arguments, default=Launch(config=name, run=config), prog="python -m gvz.launch")
 
-    config = load_config(name)
+    config = load_config(name, argument(arguments, "--scenario"))
     launch = parsed(config)
     played = launch.run.table.scenarios
-    of_scenario = load_config(name, played[0].id) if len(played) == 1 else config
-    return launch if of_scenario == config else parsed(of_scenario)
+    of_played = load_config(name, played[0].id if len(played) == 1 else None)
+    return launch if of_played == config else parsed(of_played)
 
 
 def resumed_config(run: RunDir, config: RunConfig) -> RunConfig:
