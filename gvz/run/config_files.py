@@ -9,9 +9,9 @@ from types import MappingProxyType
 from typing import Any, get_args, get_type_hints
 
 from gvz.core.env_config import typed
-from gvz.core.errors import ConfigError, nearest
+from gvz.core.errors import ConfigError, TaskError, nearest
 from gvz.run.config import RunConfig, with_agent
-from gvz.tasks import scenarios
+from gvz.tasks import scenario_named
 from learner.config import AgentConfig, LearnerConfig, OnPolicyConfig, agent_config_class
 
 CONFIG_SCHEMA = 2
@@ -71,10 +71,10 @@ def load_config(text: str, scenario: str | None = None) -> RunConfig:
             raise ConfigError(f"got {type(config).__name__} for CONFIG, want `CONFIG = RunConfig(...)`")
         config = build_config(dataclasses.asdict(config), "CONFIG", type(config.agent))  # checks the types
         settings = namespace.get("SCENARIO_SETTINGS", {})
-        if unknown := set(settings) - set(scenarios()):
-            raise ConfigError(f"SCENARIO_SETTINGS: got {', '.join(unknown)}, want some of {', '.join(scenarios())}")
+        for name in settings:
+            scenario_named(name)  # or an error that names it
         return with_settings(config, settings.get(scenario, {}))
-    except ConfigError as error:
+    except (ConfigError, TaskError) as error:
         raise ConfigError(f"{path}: {error}") from error
     except Exception as error:  # a config file is the user's own program: anything may come out of it
         raise ConfigError(f"{path}: {type(error).__name__}: {error}") from error

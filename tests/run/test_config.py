@@ -94,7 +94,10 @@ def test_a_broken_config_file_is_named(tmp_path, text, message):
 
 def test_settings_of_a_scenario_hold_for_runs_that_play_it_alone_and_flags_come_after_them(tmp_path):
     file = tmp_path / "mine.py"
-    settings = {"seek_and_kill": {"agent.discount": 0.5, "replay.capacity": 50_000}}
+    settings = {
+        "seek_and_kill": {"agent.discount": 0.5, "replay.capacity": 50_000},
+        "find_the_key": {"agent.discount": 0.75},
+    }
     file.write_text(
         f"from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='mine')\nSCENARIO_SETTINGS = {settings}\n"
     )
@@ -109,6 +112,7 @@ def test_settings_of_a_scenario_hold_for_runs_that_play_it_alone_and_flags_come_
     assert discount("") == discount("--scenario health_gathering") == 0.99
     assert discount("--scenario seek_and_kill") == discount("--tasks seek_and_kill/red seek_and_kill/blue") == 0.5
     assert discount("--scenario seek_and_kill --agent.discount 0.9") == 0.9
+    assert discount("--tasks find_the_key/default") == 0.75
     assert discount("--tasks seek_and_kill/red dodge_projectiles/city --env.action-set unified_v1") == 0.99
     assert (
         parse(["--config", str(file), "--scenario", "seek_and_kill", "--agent.name", "dqn"]).run.agent.discount == 0.5
@@ -118,7 +122,7 @@ def test_settings_of_a_scenario_hold_for_runs_that_play_it_alone_and_flags_come_
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"seek_and_kil": {}}, "SCENARIO_SETTINGS: got seek_and_kil, want some of defend_the_center"),
+        ({"seek_and_kil": {}}, "unknown scenario 'seek_and_kil' (did you mean 'seek_and_kill'"),
         ({"seek_and_kill": {"agent.discout": 0.5}}, "settings: got agent.discout, want a field of RunConfig"),
         ({"seek_and_kill": {"agent.discount": "a"}}, "settings.agent.discount: got 'a', want"),
     ],
