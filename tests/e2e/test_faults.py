@@ -91,7 +91,10 @@ def await_fault(run_dir: Path, since: int, kind: str, number: int) -> dict:
     def found() -> list[dict]:
         return [row for row in faults(run_dir)[since:] if (row["kind"], row["actor"]) == (kind, number)]
 
-    wait_until(lambda: bool(found()), f"a fault {kind} of actor {number}; so far {faults(run_dir)}")
+    try:
+        wait_until(lambda: bool(found()), f"a fault {kind} of actor {number}")
+    except AssertionError as error:
+        raise AssertionError(f"{error}; there are {faults(run_dir)}") from None
     return found()[0]
 
 
