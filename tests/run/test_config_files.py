@@ -1,0 +1,108 @@
+"""Config files: found by name or path, and what is wrong with one is said with its path."""
+
+import re
+
+import pytest
+
+from gvz.core.errors import ConfigError
+from gvz.launch import parse
+from gvz.run.config_files import find_config_file, load_config
+from gvz.tasks import scenarios
+from learner.config import ValueConfig
+
+
+def test_a_path_is_taken_as_a_path(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text("from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='mine', seed=5)\n")
+    assert load_config(str(file)).seed == 5
+    with pytest.raises(ConfigError, match=r"no file '.*/other\.py'"):
+        find_config_file(str(tmp_path / "other.py"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x = 1", "got NoneType for CONFIG, want `CONFIG = RunConfig"),
+        ("1 / 0", "ZeroDivisionError: division by zero"),
+        ("def (", "SyntaxError"),
+        ("from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='a b')", "name: got 'a b'"),
+        (
+            "from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='a', mode='asynch')",
+            "CONFIG.mode: got 'asynch'",
+        ),
+        (
+            "from gvz.run.config import LearnerConfig, RunConfig\n"
+            "CONFIG = RunConfig(name='a', learner=LearnerConfig(batch_size=32.5))",
+            "CONFIG.learner.batch_size: got 32.5, want int",
+        ),
+    ],
+)
+def test_a_broken_config_file_is_named(tmp_path, text, message):
+    file = tmp_path / "broken.py"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=re.escape(str(file)) + ".*" + re.escape(message)):
+        load_config(str(file))
+
+
+def test_settings_of_a_scenario_hold_for_runs_that_play_it_alone_and_flags_come_after_them(tmp_path):
+    file = tmp_path / "mine.py"
+    settings = {
+        "seek_and_kill": {"agent.discount": 0.5, "replay.capacity": 50_000},
+        "find_the_key": {"agent.discount": 0.75},
+    }
+    file.write_text(
+        f"from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='mine')\nSCENARIO_SETTINGS = {settings}\n"
+    )
+
+    def discount(flags: str) -> float:
+        return parse(["--config", str(file), *flags.split()]).run.agent.discount
+
+    assert load_config(str(file)).agent.discount == 0.99
+    assert load_config(str(file), "seek_and_kill").agent.discount == 0.5
+    assert discount("") == discount("--scenario health_gathering") == 0.99
+    assert discount("--scenario seek_and_kill") == discount("--tasks seek_and_kill/red seek_and_kill/blue") == 0.5
+    assert discount("--scenario seek_and_kill --agent.discount 0.9") == 0.9
+    assert discount("--tasks find_the_key/default") == 0.75
+    assert discount("--tasks seek_and_kill/red dodge_projectiles/city --env.action-set unified_v1") == 0.99
+    assert discount("--scenario seek_and_kill --agent.name dqn") == 0.5
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"seek_and_kil": {}}, "unknown scenario 'seek_and_kil' (did you mean 'seek_and_kill'"),
+        ({"seek_and_kill": {"agent.discout": 0.5}}, "settings: got agent.discout, want a field of RunConfig"),
+        ({"seek_and_kill": {"agent.discount": "a"}}, "settings.agent.discount: got 'a', want"),
+    ],
+)
+def test_a_setting_of_a_scenario_that_does_not_fit_is_named(tmp_path, settings, message):
+    file = tmp_path / "broken.py"
+    file.write_text(
+        f"from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='a')\nSCENARIO_SETTINGS = {settings}\n"
+    )
+    with pytest.raises(ConfigError, match=re.escape(str(file)) + ".*" + re.escape(message)):
+        load_config(str(file), "seek_and_kill")
+
+
+def test_a_name_that_no_file_can_have_is_refused():
+    with pytest.raises(ConfigError, match=r"--config: 'a+' cannot be read: File name too long"):
+        find_config_file("a" * 300)
+
+
+def test_a_near_miss_is_suggested():
+    with pytest.raises(ConfigError, match="did you mean 'rainbow_4task'"):
+        load_config("rainbow_4tasks")
+
+
+def test_the_segmented_config_shifts_frames_in_one_scenario_and_looks_further_ahead_in_another():
+    found = {}
+    for scenario in scenarios():
+        agent = load_config("rainbow_segmented", scenario).agent
+        assert isinstance(agent, ValueConfig)
+        found[scenario] = agent.augmentations, agent.discount
+    assert found == {
+        "defend_the_center": ((), 0.95),
+        "dodge_projectiles": (("shift",), 0.95),
+        "health_gathering": ((), 0.98),
+        "seek_and_kill": ((), 0.95),
+    }
