@@ -52,6 +52,13 @@ class SegmentationNetwork(nn.Module):
         return nn.Conv(self.num_classes, (1, 1), name="classes")(cells)
 
 
+def normalized(screens: UInt8[Array, "B H W 3"]) -> Float[Array, "B H W 3"]:
+    """Each screen with mean 0 and a deviation of about 1, as `gvz.segmentation.network_input` has it."""
+    screens = screens.astype(jnp.float32)
+    mean, deviation = (reduce(screens, axis=(1, 2, 3), keepdims=True) for reduce in (jnp.mean, jnp.std))
+    return (screens - mean) / (deviation + 12.75)
+
+
 def segmentation_loss(
     logits: Float[Array, "B h w C"], labels: UInt8[Array, "B H W"], class_weights: Float[Array, "C"]
 ) -> Float[Array, ""]:
@@ -75,7 +82,7 @@ def train_segmentation(
     """Trains a network by Adam. Its step rises over the first 100 gradient steps and falls by a cosine to 0 at the end.
 
     Args:
-        batches: (frames f32[B 3 H W], labels u8[B H W]), without end; all of one shape.
+        batches: (screens u8[B H W 3], labels u8[B H W]), without end; all of one shape.
         class_weights: f32[C], of the pixels of each class in the loss.
         key: of the first parameters.
         share_done: (gradient steps, last loss) -> how much of the training is done; it ends at 1.
@@ -86,25 +93,25 @@ def train_segmentation(
     network, weights = SegmentationNetwork(len(class_weights)), jnp.asarray(class_weights)
     optimizer = optax.inject_hyperparams(optax.adam)(learning_rate=_LEARNING_RATE)
 
-    def loss(params: Params, frames: Array, labels: Array) -> Float[Array, ""]:
-        return segmentation_loss(network.apply(params, jnp.moveaxis(frames, 1, -1)), labels, weights)  # pyright: ignore
+    def loss(params: Params, screens: Array, labels: Array) -> Float[Array, ""]:
+        return segmentation_loss(network.apply(params, normalized(screens)), labels, weights)  # pyright: ignore
 
     @jax.jit
-    def step(params: Params, state: Any, frames: Array, labels: Array, rate: float) -> tuple[Params, Any, Array]:
-        value, gradient = jax.value_and_grad(loss)(params, frames, labels)
+    def step(params: Params, state: Any, screens: Array, labels: Array, rate: float) -> tuple[Params, Any, Array]:
+        value, gradient = jax.value_and_grad(loss)(params, screens, labels)
         state.hyperparams["learning_rate"] = rate
         updates, state = optimizer.update(gradient, state, params)
         return optax.apply_updates(params, updates), state, value
 
     params, state, last = None, None, 0.0
-    for num_steps, (frames, labels) in enumerate(batches):
+    for num_steps, (screens, labels) in enumerate(batches):
         if params is None:
-            params = network.init(key, jnp.moveaxis(jnp.asarray(frames), 1, -1))
+            params = network.init(key, normalized(jnp.asarray(screens)))
             state = optimizer.init(params)
         if (done := share_done(num_steps, float(last))) >= 1.0:
             return params
         rate = _LEARNING_RATE * min(1.0, (num_steps + 1) / _WARMUP_STEPS) * (1 + np.cos(np.pi * done)) / 2
-        params, state, last = step(params, state, frames, labels, np.float32(rate))
+        params, state, last = step(params, state, screens, labels, np.float32(rate))
     return params
 
 

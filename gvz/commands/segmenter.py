@@ -1,17 +1,23 @@
 """`gvz segmenter`: trains the network of segmented frames."""
 
+import contextlib
 import json
 import sys
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 from gvz.core.errors import ConfigError
 
 TrainSet = Literal["train4", "train8"]
-_BATCH_SIZE = 8
-_SHOW_PERIOD_STEPS = 20
+_LOOK_PERIOD_STEPS = 20
+"""between two looks at the time"""
+_BATCHES_AHEAD = 4
+"""of each worker"""
+Played = TypeVar("Played")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,15 +42,19 @@ class TrainSegmenter:
     gate_frames: int = 300
     """of each gate task, for the scores"""
     processor_s: float = 1_600.0
-    """seconds of processor time, of games and learning together, after which training ends"""
+    """seconds of processor time, of games and learning in all processes together, after which training ends"""
+    batch_size: int = 8
+    """frames of a gradient step"""
+    workers: int = 0
+    """processes that play and change frames while this one learns, to keep a GPU busy; with 0 this one does it all"""
     seed: int = 1111
     """of the first parameters and of the changes of frames"""
 
     def run(self) -> int:
         """Plays, trains, scores, writes."""
-        for name in ("frames", "gate_frames"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"--{name.replace('_', '-')}: got {getattr(self, name)}, want at least 1")
+        for name, least in (("frames", 1), ("gate_frames", 1), ("batch_size", 1), ("workers", 0)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"--{name.replace('_', '-')}: got {getattr(self, name)}, want at least {least}")
         if self.processor_s <= 0:
             raise ConfigError(f"--processor-s: got {self.processor_s:g}, want more than 0")
         if self.out.suffix != ".onnx":
@@ -59,7 +69,9 @@ class TrainSegmenter:
         import jax
         import numpy as np
 
-        from gvz.evaluation.segmentation import CLASS_WEIGHTS, labelled_frames, score, training_batches
+        from gvz.core import janitor
+        from gvz.evaluation import segmentation
+        from gvz.evaluation.workers import worker_processes
         from gvz.run import machine
         from gvz.run.bars import Bar, Bars
         from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, Segmenter
@@ -67,41 +79,60 @@ class TrainSegmenter:
 
         of_machine = machine.describe()  # with the commit of the code that is loaded now
         begun_s, steps, loss = machine.processor_s(), 0, 0.0
-        with Bars(line_period_s=10.0) as bars:
+        with Bars(line_period_s=10.0) as bars, contextlib.ExitStack() as until_trained:
 
             def show(unit: str, done: int, total: int, text: str) -> None:
                 bars.show([Bar(name=unit, done=done, total=total, unit=unit, text=text)])
 
-            labelled = []
-            for task in tasks:
-                show("tasks", len(labelled), len(tasks), f"frames of {task.id}")
-                labelled.append(labelled_frames(task, self.frames))
+            def played(found: Iterable[Played]) -> Iterator[Played]:
+                """Shows which task comes next."""
+                found = iter(found)
+                for number, task in enumerate(tasks):
+                    show("tasks", number, len(tasks), f"frames of {task.id}")
+                    yield next(found)
+
+            if self.workers:
+                directory = until_trained.enter_context(janitor.temporary_directory())
+                executor = until_trained.enter_context(worker_processes(self.workers))
+                keep = partial(segmentation.keep_frames, num_frames=self.frames, directory=directory)
+                list(played(executor.map(keep, tasks)))
+                num_ahead = _BATCHES_AHEAD * self.workers
+                batches = segmentation.batches_of_workers(
+                    executor, num_ahead, tasks, directory, self.batch_size, self.seed
+                )
+            else:
+                labelled = list(played(segmentation.labelled_frames(task, self.frames) for task in tasks))
+                batches = segmentation.Batches(labelled, self.batch_size, self.seed)
+
+            spent_s = 0.0
 
             def share_done(num_steps: int, last_loss: float) -> float:
-                nonlocal steps, loss
+                nonlocal steps, loss, spent_s
                 steps, loss = num_steps, last_loss
-                spent_s = machine.processor_s() - begun_s
-                if num_steps % _SHOW_PERIOD_STEPS == 0:
+                if num_steps % _LOOK_PERIOD_STEPS == 0:
+                    spent_s = machine.processor_s() - begun_s
                     text = f"processor seconds, gradient step {num_steps:,}, loss {loss:.3f}"
                     show("s", round(spent_s), round(self.processor_s), text)
                 return spent_s / self.processor_s
 
-            batches = training_batches(labelled, _BATCH_SIZE, self.seed)
-            params = train_segmentation(batches, CLASS_WEIGHTS, jax.random.key(self.seed), share_done)
-            write_onnx(params, self.out, INPUT_HEIGHT, INPUT_WIDTH)
+            weights, key = segmentation.CLASS_WEIGHTS, jax.random.key(self.seed)
+            params = train_segmentation(batches, weights, key, share_done)
             spent_s = machine.processor_s() - begun_s
+            until_trained.close()
+            write_onnx(params, self.out, INPUT_HEIGHT, INPUT_WIDTH)
             segment, scores = Segmenter(str(self.out)), {}
             for task in named_tasks(self.scenario, split="gate"):
                 show("tasks", len(scores), len(scores) + 1, f"scores on {task.id}")
-                gate = labelled_frames(task, self.gate_frames)
-                scores[task.id] = score(np.stack([segment(frame) for frame in gate.frames]), gate.labels)
+                gate = segmentation.labelled_frames(task, self.gate_frames)
+                scores[task.id] = segmentation.score(np.stack([segment(frame) for frame in gate.frames]), gate.labels)
         record = {
             "scenario": self.scenario,
             "tasks": [task.id for task in tasks],
             "frames_per_task": self.frames,
             "seed": self.seed,
             "gradient_steps": steps,
-            "batch_size": _BATCH_SIZE,
+            "batch_size": self.batch_size,
+            "workers": self.workers,
             "processor_s": round(spent_s, 1),
             "loss": round(loss, 4),
             "machine": of_machine,

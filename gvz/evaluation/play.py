@@ -10,23 +10,19 @@ not done: rows would depend on the size of the batch, and games that end at diff
 import contextlib
 import dataclasses
 import hashlib
-import multiprocessing
-import os
 import queue
-import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from gvz.core import janitor
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import EngineError, GvzError, WaitTimeoutError
 from gvz.core.stop import StopRequest
 from gvz.core.watchdog import AwakeClock
 from gvz.evaluation.players import Player
-from gvz.transport.child import one_core
+from gvz.evaluation.workers import worker_processes
 
 if TYPE_CHECKING:
     from gvz.env import DoomEnv
@@ -149,23 +145,17 @@ def play(
             for player_spec, episode in ordered:
                 yield player_spec, worker.play(player_spec, id(player_spec), episode)
         return
-    others = set(multiprocessing.active_children())
-    executor = ProcessPoolExecutor(
-        max_workers=max(1, min(num_workers, len(ordered))),
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_begin_worker,
-        initargs=(os.getpid(),),
-    )
-    futures = {executor.submit(_play, job[0], id(job[0]), job[1]): job[0] for job in ordered}
-    finished: queue.SimpleQueue[Future[Row]] = queue.SimpleQueue()
-    for future in futures:
-        future.add_done_callback(finished.put)
-    left = len(futures)
+    left = len(ordered)
     try:
-        while left:
-            future = _next(finished, stop)
-            yield futures[future], future.result()
-            left -= 1
+        with worker_processes(max(1, min(num_workers, left))) as executor:
+            futures = {executor.submit(_play, job[0], id(job[0]), job[1]): job[0] for job in ordered}
+            finished: queue.SimpleQueue[Future[Row]] = queue.SimpleQueue()
+            for future in futures:
+                future.add_done_callback(finished.put)
+            while left:
+                future = _next(finished, stop)
+                yield futures[future], future.result()
+                left -= 1
     except BrokenProcessPool as error:
         raise GvzError("evaluation: a worker process died; what it had not finished can be played again") from error
     except queue.Empty:
@@ -173,13 +163,6 @@ def play(
             f"evaluation: waited {EPISODE_TIMEOUT_S:g} s for one of {num_workers} workers to end an episode; {left} "
             "are left, and can be played by the same command"
         ) from None
-    finally:
-        if left:  # their episodes are not wanted any more, and one of them may hang
-            for worker in set(multiprocessing.active_children()) - others:
-                worker.kill()
-        executor.shutdown(wait=True, cancel_futures=True)
-        if left:
-            janitor.clean_dead_instances()
 
 
 def _next(finished: queue.SimpleQueue[Future[Row]], stop: StopRequest | None) -> Future[Row]:
@@ -227,12 +210,6 @@ class _Worker:
 
 _worker = _Worker()
 """of this worker process"""
-
-
-def _begin_worker(parent_pid: int) -> None:
-    janitor.die_with_parent(parent_pid)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    os.environ |= one_core()
 
 
 def _play(player_spec: PlayerSpec, key: int, episode: Episode) -> Row:

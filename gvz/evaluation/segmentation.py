@@ -1,7 +1,11 @@
 """Frames with the engine's labels, to train a segmentation network on and to score it by."""
 
+import itertools
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
+from concurrent.futures import Executor, Future
+from functools import cache, partial
+from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -13,7 +17,7 @@ from gvz.evaluation.play import episode_seed
 from gvz.evaluation.players import Player, RandomPlayer, ScriptedPlayer
 from gvz.scenarios.base import Task, Textures
 from gvz.scenarios.compiler import task_content
-from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, network_input
+from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH
 from learner.segmentation import CELL
 from learner.segmentation_views import (
     OUTLINES,
@@ -46,6 +50,9 @@ class Labelled(NamedTuple):
         return Shot(self.frames[number], self.labels[number], self.depths[number], self.style)
 
 
+Batch = tuple[np.ndarray, np.ndarray]
+"""(screens u8[B H W 3], labels u8[B H W])"""
+_ARRAYS = ("frames", "labels", "depths")
 CLASS_WEIGHTS = np.where(np.isin(LABEL_CLASSES, ("wall", "plane", "weapon")), 1.0, 8.0).astype(np.float32)
 """f32[C] of pixels in the loss: things cover few of them, and all weigh the same, so that none is taken for another"""
 _BASE_SEED = 7
@@ -95,46 +102,108 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
             episode += 1
     finally:
         env.close()
+    return Labelled(np.stack(frames), np.stack(labels), np.stack(depths), *_looks(task))
+
+
+class Batches:
+    """Batches of changed frames, to train on. A batch follows from the tasks' frames, the seed and its number alone.
+
+    Args:
+        tasks: each frame of a batch is drawn at random from a task drawn at random.
+        batch_size: frames of a batch, B.
+        seed: of all choices.
+    """
+
+    def __init__(self, tasks: Sequence[Labelled], batch_size: int, seed: int):
+        self._tasks, self._batch_size, self._seed = tasks, batch_size, seed
+        self._styles = sorted({task.style for task in tasks if task.style is not None})
+        self._decorated = [task for task in tasks if (task.labels == LABEL_CLASSES.index("scenery")).any()]
+        by_textures = {task.textures: [one for one in tasks if one.textures == task.textures] for task in tasks}
+        self._alike = list(by_textures.values())
+
+    def __iter__(self) -> Iterator[Batch]:
+        return map(self.batch, itertools.count())
+
+    def batch(self, number: int) -> Batch:
+        """The batch of this number, of the size that a network sees."""
+        rng = np.random.default_rng((self._seed, number))
+        views = [self._view(rng) for _ in range(self._batch_size)]
+        return np.stack([view for view, _ in views]), np.stack([labels for _, labels in views])
+
+    def _view(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        def drawn(tasks: Sequence[Labelled]) -> Shot:
+            return tasks[int(rng.integers(len(tasks)))].shot(rng)
+
+        def drawn_surroundings() -> Shot:
+            """Textures that few tasks have are drawn as often as others."""
+            return drawn(self._alike[int(rng.integers(len(self._alike)))])
+
+        shot = drawn(self._tasks)
+        view, labels, is_changed = shot.frame, shot.labels, rng.random() >= _CLEAN_SHARE
+        if is_changed:
+            decorations = drawn(self._decorated) if self._decorated and rng.random() < _DECORATED_SHARE else None
+            others = [drawn(self._tasks) for _ in range(_NUM_OTHERS)]
+            gained = partial(num_pixels_gained, (shot, *others))
+            surroundings = max((drawn_surroundings() for _ in range(_TRIES)), key=gained)
+            view, labels = changed_view(rng, shot, surroundings, decorations, others, self._styles)
+        if is_changed and rng.random() < _MOVED_SHARE:
+            view, labels = moved(rng, view, labels, INPUT_HEIGHT, INPUT_WIDTH)
+        else:
+            view, labels = shrunk(view, labels, INPUT_HEIGHT, INPUT_WIDTH)
+        return mirrored(rng, view, labels)
+
+
+def keep_frames(task: Task, num_frames: int, directory: Path) -> None:
+    """Puts `labelled_frames` of a task into a directory, where several processes can share them."""
+    found, where = labelled_frames(task, num_frames), _kept(task, directory)
+    where.mkdir(parents=True)
+    for name in _ARRAYS:
+        np.save(where / f"{name}.npy", getattr(found, name))
+
+
+def batches_of_workers(
+    executor: Executor, num_ahead: int, tasks: Sequence[Task], directory: Path, batch_size: int, seed: int
+) -> Iterator[Batch]:
+    """What `Batches` of the kept frames of these tasks has, in its order, made by other processes.
+
+    Args:
+        executor: the processes.
+        num_ahead: batches that are made before they are asked for.
+        tasks: of which `keep_frames` has kept frames.
+        directory: where.
+        batch_size: see `Batches`.
+        seed: see `Batches`.
+    """
+    coming: deque[Future[Batch]] = deque()
+    for number in itertools.count():
+        coming.append(executor.submit(_batch, tuple(tasks), directory, batch_size, seed, number))
+        if len(coming) > num_ahead:
+            yield coming.popleft().result()
+
+
+def _batch(tasks: tuple[Task, ...], directory: Path, batch_size: int, seed: int, number: int) -> Batch:
+    return _kept_batches(tasks, directory, batch_size, seed).batch(number)
+
+
+@cache
+def _kept_batches(tasks: tuple[Task, ...], directory: Path, batch_size: int, seed: int) -> Batches:
+    """A worker opens the files once; what it reads of them it shares with the others."""
+    labelled = [
+        Labelled(*(np.load(_kept(task, directory) / f"{name}.npy", mmap_mode="r") for name in _ARRAYS), *_looks(task))
+        for task in tasks
+    ]
+    return Batches(labelled, batch_size, seed)
+
+
+def _kept(task: Task, directory: Path) -> Path:
+    return directory / task.id
+
+
+def _looks(task: Task) -> tuple[str | None, Textures]:
+    """`style` and `textures` of a task's frames."""
     styles = (task.scenario.attribute(name).content.entity.get("RenderStyle") for name in task.attributes)
     style = next((str(one) for one in styles if one in OUTLINES), None)
-    textures = task_content(task, config.profile).textures
-    return Labelled(np.stack(frames), np.stack(labels), np.stack(depths), style, textures)
-
-
-def training_batches(tasks: Sequence[Labelled], batch_size: int, seed: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Batches without end: (network inputs f32[B 3 H W], labels u8[B H W]), each frame of a task drawn at random."""
-    rng = np.random.default_rng(seed)
-    styles = sorted({task.style for task in tasks if task.style is not None})
-    decorated = [task for task in tasks if (task.labels == LABEL_CLASSES.index("scenery")).any()]
-    by_textures = {task.textures: [one for one in tasks if one.textures == task.textures] for task in tasks}
-    alike = list(by_textures.values())
-
-    def drawn(tasks: Sequence[Labelled]) -> Shot:
-        return tasks[int(rng.integers(len(tasks)))].shot(rng)
-
-    def drawn_surroundings() -> Shot:
-        """Textures that few tasks have are drawn as often as others."""
-        return drawn(alike[int(rng.integers(len(alike)))])
-
-    while True:
-        inputs, answers = [], []
-        for _ in range(batch_size):
-            shot = drawn(tasks)
-            frame, labels, is_changed = shot.frame, shot.labels, rng.random() >= _CLEAN_SHARE
-            if is_changed:
-                decorations = drawn(decorated) if decorated and rng.random() < _DECORATED_SHARE else None
-                others = [drawn(tasks) for _ in range(_NUM_OTHERS)]
-                gained = partial(num_pixels_gained, (shot, *others))
-                surroundings = max((drawn_surroundings() for _ in range(_TRIES)), key=gained)
-                frame, labels = changed_view(rng, shot, surroundings, decorations, others, styles)
-            if is_changed and rng.random() < _MOVED_SHARE:
-                frame, labels = moved(rng, frame, labels, INPUT_HEIGHT, INPUT_WIDTH)
-            else:
-                frame, labels = shrunk(frame, labels, INPUT_HEIGHT, INPUT_WIDTH)
-            frame, labels = mirrored(rng, frame, labels)
-            inputs.append(network_input(np.ascontiguousarray(frame)))
-            answers.append(labels)
-        yield np.stack(inputs), np.stack(answers)
+    return style, task_content(task, EnvConfig().profile).textures
 
 
 def score(probabilities: np.ndarray, labels: np.ndarray) -> Mapping[str, float]:

@@ -18,6 +18,7 @@ from gvz.env import DoomEnv
         ("--scenario seek_and_kill --out n.onnx --frames 0", "--frames: got 0, want at least 1"),
         ("--scenario seek_and_kill --out n.onnx --gate-frames 0", "--gate-frames: got 0, want at least 1"),
         ("--scenario seek_and_kill --out n.onnx --processor-s 0", "--processor-s: got 0, want more than 0"),
+        ("--scenario seek_and_kill --out n.onnx --workers -1", "--workers: got -1, want at least 0"),
     ],
 )
 def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, tmp_path, monkeypatch):
@@ -37,9 +38,11 @@ def test_without_onnx_it_says_so_before_anything_is_played(capsys, tmp_path, mon
 
 
 @pytest.mark.engine
-def test_a_network_is_trained_scored_and_played_with(capsys, tmp_path):
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_network_is_trained_scored_and_played_with(workers, capsys, tmp_path):
     file = tmp_path / "mine.onnx"
     flags = f"--scenario health_gathering --training-set train4 --out {file} --frames 20 --gate-frames 60"
+    flags += f" --workers {workers}"
     assert cli.main([*"segmenter --processor-s 15".split(), *flags.split()]) == 0
     out, _ = capsys.readouterr()
     record = json.loads(file.with_suffix(".json").read_text())

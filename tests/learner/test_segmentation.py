@@ -12,7 +12,14 @@ import pytest
 
 from gvz.core.env_config import LABEL_CLASSES
 from learner import segmentation_views as views
-from learner.segmentation import CELL, SegmentationNetwork, segmentation_loss, train_segmentation, write_onnx
+from learner.segmentation import (
+    CELL,
+    SegmentationNetwork,
+    normalized,
+    segmentation_loss,
+    train_segmentation,
+    write_onnx,
+)
 
 NUM_CLASSES = len(LABEL_CLASSES)
 H, W = 36, 48
@@ -22,13 +29,13 @@ def squares(seed: int, batch_size: int = 16) -> Iterator[tuple[np.ndarray, np.nd
     """Frames of grain, with a square of stripes somewhere that is class 3; stripes and grain are equally bright."""
     rng = np.random.default_rng(seed)
     while True:
-        frames = rng.normal(0, 1, (batch_size, 3, H, W)).astype(np.float32)
+        frames = rng.normal(128, 40, (batch_size, H, W, 3))
         labels = np.zeros((batch_size, H, W), np.uint8)
         for frame, label in zip(frames, labels, strict=True):
             y, x = rng.integers(0, H - 12), rng.integers(0, W - 12)
             label[y : y + 12, x : x + 12] = 3
-            frame[:, y : y + 12, x : x + 12] = np.where(np.arange(12) // 2 % 2, 1.5, -1.5)
-        yield frames, labels
+            frame[y : y + 12, x : x + 12] = np.where(np.arange(12) // 2 % 2, 188, 68)[:, None]
+        yield frames.clip(0, 255).astype(np.uint8), labels
 
 
 def test_the_loss_is_the_weighted_cross_entropy_of_every_pixel():
@@ -70,7 +77,7 @@ def test_it_learns_to_tell_stripes_from_grain():
     class_weights = np.where(np.arange(NUM_CLASSES) == 3, 8, 1).astype(np.float32)
     params = train_segmentation(squares(0), class_weights, jax.random.key(0), lambda num_steps, _: num_steps / 200)
     frames, labels = next(squares(1, 64))
-    logits = SegmentationNetwork(NUM_CLASSES).apply(params, np.moveaxis(frames, 1, -1))
+    logits = SegmentationNetwork(NUM_CLASSES).apply(params, normalized(frames))
     cells = labels.reshape(64, H // CELL, CELL, W // CELL, CELL).swapaxes(2, 3).reshape(64, H // CELL, W // CELL, -1)
     stripes, grain = (cells == 3).all(axis=-1), (cells == 0).all(axis=-1)
     answers = np.asarray(jnp.argmax(jnp.asarray(logits), axis=-1))
