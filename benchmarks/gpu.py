@@ -1,14 +1,15 @@
 """Everything that a GPU changes, in one command of at most nine minutes: `python -m benchmarks gpu`.
 
-Gradient steps at batch 32, 256 and 1024 in float32 and bfloat16, and by the number in one call; the sum tree at batch
-256; insertion and drawing with up to 4 million records; decisions of the network on the device; the whole run of
-`rainbow_4task` with both kinds of `actors.inference`; the device's memory against the bill. Sizes are those of
+The whole run of `rainbow_4task` with both kinds of `actors.inference`; gradient steps at batch 32, 256 and 1024 in
+float32 and bfloat16, and by the number in one call; decisions of the network on the device; the device's memory against
+the bill; the sum tree at batch 256; insertion and drawing with up to 4 million records. Sizes are those of
 `rainbow_4task`; records of the large replays have small frames. Without a GPU nothing is measured, but `--quick` runs
 each part once.
 """
 
 import dataclasses
 import tempfile
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -22,6 +23,8 @@ CAPACITIES = (100_000, 1_000_000, 4_000_000)
 NUM_LEAVES = 1_000_000
 RUN_UPDATES = 4_000
 """gradient steps of the whole run"""
+LAST_START_S = 400.0
+"""a part that comes later is left out: compilers take most of the time, and how long is not known before"""
 
 
 def measure(budget: Budget) -> list[Row]:
@@ -31,8 +34,19 @@ def measure(budget: Budget) -> list[Row]:
     if jax.default_backend() == "cpu" and not budget.quick:
         return [absent("everything on this list", "JAX finds no GPU here")]
     few = dataclasses.replace(budget, rounds=min(budget.rounds, 3), body_s=budget.body_s / 2)
-    replay = growth.replay_rows(few, _few(CAPACITIES, few))
-    rows = [*_batches(few), *_calls(few), *_tree(few), *replay, *_whole(few)]
+    parts: dict[str, Callable[[], list[Row]]] = {
+        "the run": partial(_whole, few),
+        "gradient steps by batch, float32": partial(_batches, few, "float32"),
+        "gradient steps by their number in one call, decisions on the device, memory": partial(_calls, few),
+        "gradient steps by batch, bfloat16": partial(_batches, few, "bfloat16"),
+        "sum tree": partial(_tree, few),
+        "insertion and drawing": lambda: growth.replay_rows(few, _few(CAPACITIES, few)),
+    }
+    start_s, rows = time.monotonic(), list[Row]()
+    for name, part in parts.items():
+        spent_s = time.monotonic() - start_s
+        print(f"  after {spent_s:.0f} s: {name}", flush=True)
+        rows += part() if spent_s < LAST_START_S else [absent(name, f"the parts before took {spent_s:.0f} s")]
     return [row for row in rows if row["kind"] != "goal"]  # those of growth are of other sizes
 
 
@@ -41,22 +55,19 @@ def _few(sizes: tuple[int, ...], budget: Budget) -> tuple[int, ...]:
     return (min(sizes[0], 1_000),) if budget.quick else sizes
 
 
-def _batches(budget: Budget) -> list[Row]:
-    """Gradient steps by batch and dtype of the activations."""
-    rows = []
-    for dtype in ("float32", "bfloat16"):
+def _batches(budget: Budget, dtype: str) -> list[Row]:
+    """Gradient steps by batch, with activations of this dtype."""
 
-        def change(config: Any, size: int, dtype: str = dtype) -> Any:
-            agent = dataclasses.replace(config.agent, activation_dtype=dtype)
-            learner = dataclasses.replace(config.learner, batch_size=size)
-            return dataclasses.replace(config, agent=agent, learner=learner)
+    def change(config: Any, size: int) -> Any:
+        agent = dataclasses.replace(config.agent, activation_dtype=dtype)
+        learner = dataclasses.replace(config.learner, batch_size=size)
+        return dataclasses.replace(config, agent=agent, learner=learner)
 
-        seconds = growth.updates_by_size(budget, (8,) if budget.quick else BATCHES, change)
-        rows += [
-            rates(f"learner, batch {size:.0f}, {dtype}", updates_per_s=[1 / s for s in found], batch_size=int(size))
-            for size, found in seconds.items()
-        ]
-    return rows
+    seconds = growth.updates_by_size(budget, (8,) if budget.quick else BATCHES, change)
+    return [
+        rates(f"learner, batch {size:.0f}, {dtype}", updates_per_s=[1 / s for s in found], batch_size=int(size))
+        for size, found in seconds.items()
+    ]
 
 
 def _calls(budget: Budget) -> list[Row]:
