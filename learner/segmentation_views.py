@@ -51,6 +51,7 @@ def changed_view(
     decorations: Shot | None = None,
     others: Sequence[Shot] = (),
     known_styles: Sequence[str] = (),
+    tints_and_patches: bool = True,
 ) -> tuple[np.ndarray, np.ndarray]:
     """A frame as it might look elsewhere, and its labels.
 
@@ -69,6 +70,7 @@ def changed_view(
         decorations: further ones, which then stand there as well.
         others: whose things then stand there as well.
         known_styles: of OUTLINES, those that some task has; three of four styles that are drawn are of these.
+        tints_and_patches: whether some of the other surroundings have them.
 
     Returns:
         (u8[H W 3], u8[H W]).
@@ -77,7 +79,7 @@ def changed_view(
     elsewhere, other_looks = rng.random(2) < (0.85, 0.25)
     if elsewhere:
         behind = _Scene.of(surroundings)
-        tinted, patched = rng.random(2) < (_TINTED_SHARE, _PATCHED_SHARE)
+        tinted, patched = (rng.random(2) < (_TINTED_SHARE, _PATCHED_SHARE)) & tints_and_patches
         if tinted:
             behind.view = _tinted(rng, behind.view, behind.labels)
         if patched:

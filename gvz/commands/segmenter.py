@@ -47,6 +47,9 @@ class TrainSegmenter:
     """frames of a gradient step"""
     workers: int = 0
     """processes that play and change frames while this one learns, to keep a GPU busy; with 0 this one does it all"""
+    tints_and_patches: bool = True
+    """whether walls and floors of some frames get tints and patches: better in Health Gathering, worse in Seek and Kill
+    (docs/FINDINGS.md)"""
     seed: int = 1111
     """of the first parameters and of the changes of frames"""
 
@@ -91,18 +94,17 @@ class TrainSegmenter:
                     show("tasks", number, len(tasks), f"frames of {task.id}")
                     yield next(found)
 
+            how = (self.batch_size, self.seed, self.tints_and_patches)
             if self.workers:
                 directory = until_trained.enter_context(janitor.temporary_directory())
                 executor = until_trained.enter_context(worker_processes(self.workers))
                 keep = partial(segmentation.keep_frames, num_frames=self.frames, directory=directory)
                 list(played(executor.map(keep, tasks)))
                 num_ahead = _BATCHES_AHEAD * self.workers
-                batches = segmentation.batches_of_workers(
-                    executor, num_ahead, tasks, directory, self.batch_size, self.seed
-                )
+                batches = segmentation.batches_of_workers(executor, num_ahead, tasks, directory, *how)
             else:
                 labelled = list(played(segmentation.labelled_frames(task, self.frames) for task in tasks))
-                batches = segmentation.Batches(labelled, self.batch_size, self.seed)
+                batches = segmentation.Batches(labelled, *how)
 
             spent_s = 0.0
 
@@ -133,6 +135,7 @@ class TrainSegmenter:
             "gradient_steps": steps,
             "batch_size": self.batch_size,
             "workers": self.workers,
+            "tints_and_patches": self.tints_and_patches,
             "processor_s": round(spent_s, 1),
             "loss": round(loss, 4),
             "machine": of_machine,

@@ -112,10 +112,12 @@ class Batches:
         tasks: each frame of a batch is drawn at random from a task drawn at random.
         batch_size: frames of a batch, B.
         seed: of all choices.
+        tints_and_patches: whether surfaces get them, see `changed_view`.
     """
 
-    def __init__(self, tasks: Sequence[Labelled], batch_size: int, seed: int):
+    def __init__(self, tasks: Sequence[Labelled], batch_size: int, seed: int, tints_and_patches: bool = True):
         self._tasks, self._batch_size, self._seed = tasks, batch_size, seed
+        self._tints_and_patches = tints_and_patches
         self._styles = sorted({task.style for task in tasks if task.style is not None})
         self._decorated = [task for task in tasks if (task.labels == LABEL_CLASSES.index("scenery")).any()]
         by_textures = {task.textures: [one for one in tasks if one.textures == task.textures] for task in tasks}
@@ -145,7 +147,9 @@ class Batches:
             others = [drawn(self._tasks) for _ in range(_NUM_OTHERS)]
             gained = partial(num_pixels_gained, (shot, *others))
             surroundings = max((drawn_surroundings() for _ in range(_TRIES)), key=gained)
-            view, labels = changed_view(rng, shot, surroundings, decorations, others, self._styles)
+            view, labels = changed_view(
+                rng, shot, surroundings, decorations, others, self._styles, self._tints_and_patches
+            )
         if is_changed and rng.random() < _MOVED_SHARE:
             view, labels = moved(rng, view, labels, INPUT_HEIGHT, INPUT_WIDTH)
         else:
@@ -162,7 +166,7 @@ def keep_frames(task: Task, num_frames: int, directory: Path) -> None:
 
 
 def batches_of_workers(
-    executor: Executor, num_ahead: int, tasks: Sequence[Task], directory: Path, batch_size: int, seed: int
+    executor: Executor, num_ahead: int, tasks: Sequence[Task], directory: Path, *how: int | bool
 ) -> Iterator[Batch]:
     """What `Batches` of the kept frames of these tasks has, in its order, made by other processes.
 
@@ -171,28 +175,27 @@ def batches_of_workers(
         num_ahead: batches that are made before they are asked for.
         tasks: of which `keep_frames` has kept frames.
         directory: where.
-        batch_size: see `Batches`.
-        seed: see `Batches`.
+        how: the further arguments of `Batches`.
     """
     coming: deque[Future[Batch]] = deque()
     for number in itertools.count():
-        coming.append(executor.submit(_batch, tuple(tasks), directory, batch_size, seed, number))
+        coming.append(executor.submit(_batch, number, tuple(tasks), directory, *how))
         if len(coming) > num_ahead:
             yield coming.popleft().result()
 
 
-def _batch(tasks: tuple[Task, ...], directory: Path, batch_size: int, seed: int, number: int) -> Batch:
-    return _kept_batches(tasks, directory, batch_size, seed).batch(number)
+def _batch(number: int, tasks: tuple[Task, ...], directory: Path, *how: int | bool) -> Batch:
+    return _kept_batches(tasks, directory, *how).batch(number)
 
 
 @cache
-def _kept_batches(tasks: tuple[Task, ...], directory: Path, batch_size: int, seed: int) -> Batches:
+def _kept_batches(tasks: tuple[Task, ...], directory: Path, *how: int | bool) -> Batches:
     """A worker opens the files once; what it reads of them it shares with the others."""
     labelled = [
         Labelled(*(np.load(_kept(task, directory) / f"{name}.npy", mmap_mode="r") for name in _ARRAYS), *_looks(task))
         for task in tasks
     ]
-    return Batches(labelled, batch_size, seed)
+    return Batches(labelled, *how)
 
 
 def _kept(task: Task, directory: Path) -> Path:
