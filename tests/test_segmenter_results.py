@@ -53,14 +53,14 @@ def test_the_findings_say_what_putting_frames_together_gave():
         assert row(title, task, measure) in page
         assert task in {pair.id for pair in named_tasks(task.partition("/")[0], split="pairs")}
     gate_tasks = [task.id for task in named_tasks("seek_and_kill", split="gate")]
-    more = ("three_frames", "three_frames_more", "tints_patches")
+    more = ("three_frames", "three_frames_more", "three_frames_longer", "tints_patches")
     for form in ("decorated", "few_own_things", "logarithm", "looks", "direct", *more):
         found = record["networks"][form]["tasks"]
         tasks = ["seek_and_kill/red+shadows", *gate_tasks]
         cells = " | ".join(f"{found[task]['average_precision']['enemy']:.2f}" for task in tasks)
         assert f" s | {cells} |" in page
-    found = record["networks"]["three_frames_more"]["tasks"]
-    for name in ("defend_the_center", "seek_and_kill"):  # which have networks of this form
+    for name, form in (("defend_the_center", "three_frames_more"), ("seek_and_kill", "three_frames_longer")):
+        found = record["networks"][form]["tasks"]
         used = json.loads((ROOT / "gvz" / "segmenters" / f"{name}.json").read_text())["average_precision"]
         assert used == {task: found[task]["average_precision"] for task in used}
     count = record["put_together"]["enemies_per_frame"]
