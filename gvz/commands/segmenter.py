@@ -94,17 +94,17 @@ class TrainSegmenter:
                     show("tasks", number, len(tasks), f"frames of {task.id}")
                     yield next(found)
 
-            how = (self.batch_size, self.seed, self.tints_and_patches)
+            spec = segmentation.BatchSpec(self.batch_size, self.seed, self.tints_and_patches)
             if self.workers:
                 directory = until_trained.enter_context(janitor.temporary_directory())
                 executor = until_trained.enter_context(worker_processes(self.workers))
                 keep = partial(segmentation.keep_frames, num_frames=self.frames, directory=directory)
                 list(played(executor.map(keep, tasks)))
                 num_ahead = _BATCHES_AHEAD * self.workers
-                batches = segmentation.batches_of_workers(executor, num_ahead, tasks, directory, *how)
+                batches = segmentation.batches_of_workers(executor, num_ahead, tasks, directory, spec)
             else:
                 labelled = list(played(segmentation.labelled_frames(task, self.frames) for task in tasks))
-                batches = segmentation.Batches(labelled, *how)
+                batches = segmentation.Batches(labelled, spec)
 
             spent_s = 0.0
 

@@ -105,19 +105,27 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
     return Labelled(np.stack(frames), np.stack(labels), np.stack(depths), *_looks(task))
 
 
+class BatchSpec(NamedTuple):
+    """How batches are made."""
+
+    batch_size: int
+    """B"""
+    seed: int
+    """of all choices"""
+    tints_and_patches: bool = True
+    """whether surfaces get them, see `changed_view`"""
+
+
 class Batches:
-    """Batches of changed frames, to train on. A batch follows from the tasks' frames, the seed and its number alone.
+    """Batches of changed frames, to train on. A batch follows from the tasks' frames, the spec and its number alone.
 
     Args:
         tasks: each frame of a batch is drawn at random from a task drawn at random.
-        batch_size: frames of a batch, B.
-        seed: of all choices.
-        tints_and_patches: whether surfaces get them, see `changed_view`.
+        spec: how they are made.
     """
 
-    def __init__(self, tasks: Sequence[Labelled], batch_size: int, seed: int, tints_and_patches: bool = True):
-        self._tasks, self._batch_size, self._seed = tasks, batch_size, seed
-        self._tints_and_patches = tints_and_patches
+    def __init__(self, tasks: Sequence[Labelled], spec: BatchSpec):
+        self._tasks, self._spec = tasks, spec
         self._styles = sorted({task.style for task in tasks if task.style is not None})
         self._decorated = [task for task in tasks if (task.labels == LABEL_CLASSES.index("scenery")).any()]
         by_textures = {task.textures: [one for one in tasks if one.textures == task.textures] for task in tasks}
@@ -128,8 +136,8 @@ class Batches:
 
     def batch(self, number: int) -> Batch:
         """The batch of this number, of the size that a network sees."""
-        rng = np.random.default_rng((self._seed, number))
-        views = [self._view(rng) for _ in range(self._batch_size)]
+        rng = np.random.default_rng((self._spec.seed, number))
+        views = [self._view(rng) for _ in range(self._spec.batch_size)]
         return np.stack([view for view, _ in views]), np.stack([labels for _, labels in views])
 
     def _view(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -148,7 +156,7 @@ class Batches:
             gained = partial(num_pixels_gained, (shot, *others))
             surroundings = max((drawn_surroundings() for _ in range(_TRIES)), key=gained)
             view, labels = changed_view(
-                rng, shot, surroundings, decorations, others, self._styles, self._tints_and_patches
+                rng, shot, surroundings, decorations, others, self._styles, self._spec.tints_and_patches
             )
         if is_changed and rng.random() < _MOVED_SHARE:
             view, labels = moved(rng, view, labels, INPUT_HEIGHT, INPUT_WIDTH)
@@ -166,7 +174,7 @@ def keep_frames(task: Task, num_frames: int, directory: Path) -> None:
 
 
 def batches_of_workers(
-    executor: Executor, num_ahead: int, tasks: Sequence[Task], directory: Path, *how: int | bool
+    executor: Executor, num_ahead: int, tasks: Sequence[Task], directory: Path, spec: BatchSpec
 ) -> Iterator[Batch]:
     """What `Batches` of the kept frames of these tasks has, in its order, made by other processes.
 
@@ -175,34 +183,34 @@ def batches_of_workers(
         num_ahead: batches that are made before they are asked for.
         tasks: of which `keep_frames` has kept frames.
         directory: where.
-        how: the further arguments of `Batches`.
+        spec: how they are made.
     """
     coming: deque[Future[Batch]] = deque()
     for number in itertools.count():
-        coming.append(executor.submit(_batch, number, tuple(tasks), directory, *how))
+        coming.append(executor.submit(_batch, number, tuple(tasks), directory, spec))
         if len(coming) > num_ahead:
             yield coming.popleft().result()
 
 
-def _batch(number: int, tasks: tuple[Task, ...], directory: Path, *how: int | bool) -> Batch:
-    return _kept_batches(tasks, directory, *how).batch(number)
+def _batch(number: int, tasks: tuple[Task, ...], directory: Path, spec: BatchSpec) -> Batch:
+    return _kept_batches(tasks, directory, spec).batch(number)
 
 
 @cache
-def _kept_batches(tasks: tuple[Task, ...], directory: Path, *how: int | bool) -> Batches:
+def _kept_batches(tasks: tuple[Task, ...], directory: Path, spec: BatchSpec) -> Batches:
     """A worker opens the files once; what it reads of them it shares with the others."""
     labelled = [
         Labelled(*(np.load(_kept(task, directory) / f"{name}.npy", mmap_mode="r") for name in _ARRAYS), *_looks(task))
         for task in tasks
     ]
-    return Batches(labelled, *how)
+    return Batches(labelled, spec)
 
 
 def _kept(task: Task, directory: Path) -> Path:
     return directory / task.id
 
 
-def _looks(task: Task) -> tuple[str | None, Textures]:
+def _looks(task: Task) -> tuple[str | None, Textures | None]:
     """`style` and `textures` of a task's frames."""
     styles = (task.scenario.attribute(name).content.entity.get("RenderStyle") for name in task.attributes)
     style = next((str(one) for one in styles if one in OUTLINES), None)

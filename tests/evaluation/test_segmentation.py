@@ -10,6 +10,7 @@ import pytest
 from gvz.core.env_config import LABEL_CLASSES
 from gvz.env import DoomEnv
 from gvz.evaluation import segmentation
+from gvz.evaluation.segmentation import BatchSpec
 from gvz.evaluation.workers import worker_processes
 from gvz.scenarios.base import Textures
 from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, network_input
@@ -112,7 +113,7 @@ def test_batches_hold_screens_and_labels_of_all_tasks_and_follow_from_their_numb
         )
         for n in (ENEMY, KIT)
     ]
-    made = segmentation.Batches(tasks, 8, seed=3)
+    made = segmentation.Batches(tasks, BatchSpec(8, seed=3))
     batches = list(itertools.islice(made, 4))
     assert {int(n) for _, labels in batches for n in np.unique(labels)} == {ENEMY, KIT}
     assert not np.array_equal(batches[0][0], batches[1][0])
@@ -127,10 +128,12 @@ def test_batches_hold_screens_and_labels_of_all_tasks_and_follow_from_their_numb
 @pytest.mark.engine
 def test_workers_make_the_same_batches(tmp_path):
     tasks = [parse_task(f"seek_and_kill/{name}") for name in ("default", "shadows")]
-    here = segmentation.Batches([segmentation.labelled_frames(task, 3) for task in tasks], 2, seed=5)
+    here = segmentation.Batches([segmentation.labelled_frames(task, 3) for task in tasks], BatchSpec(2, seed=5))
     with worker_processes(2) as executor:
         list(executor.map(partial(segmentation.keep_frames, num_frames=3, directory=tmp_path), tasks))
-        theirs = list(itertools.islice(segmentation.batches_of_workers(executor, 3, tasks, tmp_path, 2, 5), 6))
+        theirs = list(
+            itertools.islice(segmentation.batches_of_workers(executor, 3, tasks, tmp_path, BatchSpec(2, seed=5)), 6)
+        )
     assert here._styles == ["STYLE_Shadow"]
     for (screens, labels), (screens_there, labels_there) in zip(here, theirs, strict=False):
         np.testing.assert_array_equal(screens_there, screens)
@@ -154,7 +157,7 @@ def test_decorations_come_into_the_frames_of_tasks_that_have_none():
     labels[:, :, 40:60, 40:60], labels[0, :, 80:120, 100:140] = effect, scenery
     frames = np.random.default_rng(0).integers(0, 256, (3, 144, 256, 3), dtype=np.uint8)
     tasks = [segmentation.Labelled(frames, one, np.full((3, 144, 256), 9, np.uint8)) for one in labels]
-    batches = itertools.islice(segmentation.Batches(tasks, 8, seed=0), 75)
+    batches = itertools.islice(segmentation.Batches(tasks, BatchSpec(8, seed=0)), 75)
     shown = np.mean([(one == scenery).any() for _, answers in batches for one in answers])
     assert 0.39 <= shown <= 0.57, "0.36, and some of the 600 frames that are of this task; ten seeds: 0.45 to 0.52"
 
@@ -172,7 +175,7 @@ def test_surroundings_of_each_look_are_drawn_as_often():
     labels = [np.full((3, 144, 256), plane if n < 7 else wall, np.uint8) for n in range(8)]
     depths = np.full((3, 144, 256), 9, np.uint8)
     tasks = [segmentation.Labelled(frames, one, depths, None, grey if n < 7 else red) for n, one in enumerate(labels)]
-    batches = itertools.islice(segmentation.Batches(tasks, 8, seed=0), 75)
+    batches = itertools.islice(segmentation.Batches(tasks, BatchSpec(8, seed=0)), 75)
     shown = np.mean([(one == wall).any() for _, answers in batches for one in answers])
     assert 0.31 <= shown <= 0.48, "0.28 / 8 + 0.72 / 2 = 0.40; 0.125 if tasks were drawn"
 
