@@ -230,18 +230,16 @@ def test_the_findings_say_what_more_decisions_for_each_gradient_step_take():
     assert f"{wait} percent of their time, with 16 still {wait_16}." in page
 
 
-_LONGER = ("defend_the_center", "dodge_projectiles", "seek_and_kill")
-"""scenarios of `general_segmented_long` that were run"""
-
-
 def test_the_findings_say_what_six_times_the_time_gave():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     agents = {"rainbow_general+sight_loss": "loss of sight", "rainbow_segmented": "segmented"}
     for folder, seconds in (("general_short", "900 s"), ("general", "5,400 s")):
         episodes = results_of(folder).episodes
-        for name, (agent, called) in itertools.product(_LONGER, agents.items()):
-            if name == "dodge_projectiles" and (agent, folder) != ("rainbow_segmented", "general"):
-                continue  # not run, or by another config now
+        for name, (agent, called) in itertools.product(scenarios(), agents.items()):
+            if name == "dodge_projectiles" and folder == "general_short":
+                continue  # by another config now
+            if name in ("dodge_projectiles", "health_gathering") and agent != "rainbow_segmented":
+                continue  # not run
             scores = agent_scores(episodes.filter(scenario=name), agent)
             sets = [named_tasks(name, split=split) for split in ("train8", "gate", "test")]
             cells = [estimate(scores, [t.id for t in tasks]).text for tasks in (*sets, named_tasks(name, level=4))]
@@ -259,12 +257,13 @@ def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
         return [float(np.mean([found["normalized_score"].mean() for found in of_seed])) for of_seed in rows]
 
     gains = {}
-    for name, split in itertools.product(("defend_the_center", "seek_and_kill"), ("train8", "gate", "test")):
+    compared = ("defend_the_center", "health_gathering", "seek_and_kill")
+    for name, split in itertools.product(compared, ("train8", "gate", "test")):
         before, (after,) = means(short, name, split), means(long, name, split)
         assert len(before) == 3
-        within = (name, split) == ("seek_and_kill", "test")
-        assert after > (min(before) if within else max(before))
-        assert (after < max(before)) == within
+        below, within = ((name, split) == one for one in (("health_gathering", "gate"), ("seek_and_kill", "test")))
+        assert (after < min(before)) == below
+        assert (after > max(before)) != (below or within)
         gains[name, split] = f"{after - np.mean(before):.1f}"
     for name in ("defend_the_center", "seek_and_kill"):
         of_seeds, (of_long,) = (
@@ -272,15 +271,23 @@ def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
             for episodes, seeds in ((short, (1111, 2222, 3333)), (long, (1111,)))
         )
         assert min(of_seeds) <= of_long <= max(of_seeds), "level 4 gains nothing"
-    center, kill = (
-        [gains[name, split] for split in ("train8", "gate", "test")] for name in ("defend_the_center", "seek_and_kill")
-    )
+    center, gathering, kill = ([gains[name, split] for split in ("train8", "gate", "test")] for name in compared)
     assert (
         f"In Defend the Center they gain {' and '.join(center[:2])} points, in Seek and Kill {' and '.join(kill[:2])}."
         in page
     )
-    assert f"test tasks gain {center[2]} points in Defend the Center and" in page
-    assert f"beside segmented frames | {center[1]} | -4.0 | | {kill[1]} | as you like" in page
+    assert f"test tasks gain {center[2]} points in Defend the Center, 2.2 in" in page
+    assert f"and {gathering[2]} in Health Gathering**, also above" in page
+    assert f"**In Health Gathering the gate tasks lose {gathering[1].lstrip('-')} points**" in page
+    assert f"The training tasks gain {gathering[0]} points" in page
+    assert f"beside segmented frames | {center[1]} | -4.0 | {gathering[1]} | {kill[1]} | as you like" in page
+    said = []
+    for task in ("short_agent", "short_agent+water", "supreme"):
+        scores = [one.filter(task=f"health_gathering/{task}")["normalized_score"].mean() for one in (long, short)]
+        said += [f"{score:.0f}" for score in scores]
+    words = "`short_agent`, a training task, has {} instead of {}, and `short_agent+water` {} instead of {}."
+    assert words.format(*said[:4]) in page
+    assert "`supreme` has {} instead of {}.".format(*said[4:]) in page
     arachnotron = long.filter(task="dodge_projectiles/arachnotron")["normalized_score"].mean()
     assert f"`arachnotron` has {arachnotron:.0f} instead of 84." in page
 
@@ -293,7 +300,7 @@ def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
     )
 
     learning = []
-    for name in ("defend_the_center", "seek_and_kill", "dodge_projectiles"):
+    for name in ("defend_the_center", "seek_and_kill", "dodge_projectiles", "health_gathering"):
         file = ROOT / f"results/general/runs/rainbow_segmented/{name}/train8/seed_1111/episodes.jsonl.gz"
         rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
         last = rows[-1]["num_updates"]
@@ -302,7 +309,7 @@ def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
             learning.append(f"{np.mean(scores):.0f}")
     assert (
         "{} points at 30,000 to 40,000 gradient steps, {} at 60,000 to 70,000, and {} in the last 10,000. "
-        "Seek and Kill had {}, {} and {}, and Dodge Projectiles {}, {} and {}."
+        "Seek and Kill had {}, {} and {}, Dodge Projectiles {}, {} and {}, and Health Gathering {}, {} and {}."
     ).format(*learning) in page
 
 

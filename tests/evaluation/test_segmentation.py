@@ -134,7 +134,6 @@ def test_workers_make_the_same_batches(tmp_path):
         theirs = list(
             itertools.islice(segmentation.batches_of_workers(executor, 3, tasks, tmp_path, BatchSpec(2, seed=5)), 6)
         )
-    assert here._styles == ["STYLE_Shadow"]
     for (screens, labels), (screens_there, labels_there) in zip(here, theirs, strict=False):
         np.testing.assert_array_equal(screens_there, screens)
         np.testing.assert_array_equal(labels_there, labels)
