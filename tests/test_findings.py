@@ -313,6 +313,36 @@ def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
     ).format(*learning) in page
 
 
+def test_the_findings_say_what_seven_minutes_of_a_gpu_gave():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    folder, short = ROOT / "results" / "general_gpu", results_of("general_short").episodes
+    episodes = {
+        "rainbow_general (8 tasks)": ("`rainbow_general`, 2 cores", short),
+        "rainbow_general_gpu": ("`rainbow_general_gpu`, 16 cores and a GPU", results_of("general_gpu").episodes),
+        "rainbow_segmented": ("`rainbow_segmented`, 2 cores", short),
+    }
+    name = "seek_and_kill"
+    sets = [named_tasks(name, split=split) for split in ("train8", "gate", "test")]
+    shadows = {}
+    for agent, (called, found) in episodes.items():
+        scores = agent_scores(found.filter(scenario=name), agent)
+        cells = [estimate(scores, [task.id for task in tasks]).text for tasks in (*sets, named_tasks(name, level=4))]
+        assert f"| {called} | {' | '.join(cells)} |" in page
+        rows = found.filter(agent=agent, task=f"{name}/blue+shadows")["normalized_score"]
+        shadows[agent] = f"{rows.mean():.0f}"
+    said = f"`blue+shadows` has {shadows['rainbow_general_gpu']} (segmented frames: {shadows['rainbow_segmented']})."
+    assert said in page
+    (file,) = folder.glob("runs/**/metrics.jsonl.gz")
+    rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+    readme, last = " ".join((folder / "README.md").read_text().split()), rows[-1]
+    counts = f"{last['num_updates']:,} gradient steps", f"{last['actors/env_steps']:,} decisions"
+    assert f"{counts[0]}, {counts[1]}, training seed 1111" in readme
+    assert f"{counts[0]} and {counts[1]}; one seed" in page
+    rates = [np.median([row[key] for row in rows]) for key in ("learner/updates_per_s", "actors/decisions_per_s")]
+    assert f"made {rates[0]:.0f} gradient steps and took {rates[1]:,.0f} decisions a second" in readme
+    assert f"used {last['run/processor_s']:,.0f} seconds of processor time" in readme
+
+
 def test_the_findings_say_what_the_first_loss_of_sight_gave():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     episodes = results_of("gates").episodes
