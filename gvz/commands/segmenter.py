@@ -17,6 +17,7 @@ _LOOK_PERIOD_STEPS = 20
 """between two looks at the time"""
 _BATCHES_AHEAD = 4
 """of each worker"""
+_DIED = "gvz segmenter: a worker process died, perhaps for want of memory; give it fewer --workers or --frames"
 Played = TypeVar("Played")
 
 
@@ -46,7 +47,8 @@ class TrainSegmenter:
     batch_size: int = 8
     """frames of a gradient step"""
     workers: int = 0
-    """processes that play and change frames while this one learns, to keep a GPU busy; with 0 this one does it all"""
+    """processes that play and change frames while this one learns, to keep a GPU busy; with 0 this one does it all.
+    They share the frames in files of the temporary directory (TMPDIR), 185 KB each"""
     tints_and_patches: bool = True
     """whether walls and floors of some frames get tints and patches: better in Health Gathering, worse in Seek and Kill
     (docs/FINDINGS.md)"""
@@ -97,7 +99,7 @@ class TrainSegmenter:
             spec = segmentation.BatchSpec(self.batch_size, self.seed, self.tints_and_patches)
             if self.workers:
                 directory = until_trained.enter_context(janitor.temporary_directory())
-                executor = until_trained.enter_context(worker_processes(self.workers))
+                executor = until_trained.enter_context(worker_processes(self.workers, _DIED))
                 keep = partial(segmentation.keep_frames, num_frames=self.frames, directory=directory)
                 list(played(executor.map(keep, tasks)))
                 num_ahead = _BATCHES_AHEAD * self.workers

@@ -13,12 +13,11 @@ import hashlib
 import queue
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gvz.core.env_config import EnvConfig
-from gvz.core.errors import EngineError, GvzError, WaitTimeoutError
+from gvz.core.errors import EngineError, WaitTimeoutError
 from gvz.core.stop import StopRequest
 from gvz.core.watchdog import AwakeClock
 from gvz.evaluation.players import Player
@@ -145,9 +144,9 @@ def play(
             for player_spec, episode in ordered:
                 yield player_spec, worker.play(player_spec, id(player_spec), episode)
         return
-    left = len(ordered)
+    left, died = len(ordered), "evaluation: a worker process died; what it had not finished can be played again"
     try:
-        with worker_processes(max(1, min(num_workers, left))) as executor:
+        with worker_processes(max(1, min(num_workers, left)), died) as executor:
             futures = {executor.submit(_play, job[0], id(job[0]), job[1]): job[0] for job in ordered}
             finished: queue.SimpleQueue[Future[Row]] = queue.SimpleQueue()
             for future in futures:
@@ -156,8 +155,6 @@ def play(
                 future = _next(finished, stop)
                 yield futures[future], future.result()
                 left -= 1
-    except BrokenProcessPool as error:
-        raise GvzError("evaluation: a worker process died; what it had not finished can be played again") from error
     except queue.Empty:
         raise WaitTimeoutError(
             f"evaluation: waited {EPISODE_TIMEOUT_S:g} s for one of {num_workers} workers to end an episode; {left} "

@@ -6,16 +6,21 @@ import os
 import signal
 from collections.abc import Generator
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 
 from gvz.core import janitor
+from gvz.core.errors import GvzError
 from gvz.transport.child import one_core
 
 
 @contextlib.contextmanager
-def worker_processes(num_workers: int) -> Generator[ProcessPoolExecutor, None, None]:
+def worker_processes(num_workers: int, died: str) -> Generator[ProcessPoolExecutor, None, None]:
     """An executor of so many processes, which end with the block: at once if an exception leaves it.
 
     They also end if this process is killed.
+
+    Raises:
+        GvzError: one of them died; `died` is its text.
     """
     others = set(multiprocessing.active_children())
     executor = ProcessPoolExecutor(
@@ -28,6 +33,8 @@ def worker_processes(num_workers: int) -> Generator[ProcessPoolExecutor, None, N
     try:
         yield executor
         ended = True
+    except BrokenProcessPool as error:
+        raise GvzError(died) from error
     finally:
         if not ended:  # what they do is not wanted any more, and one of them may hang
             for worker in set(multiprocessing.active_children()) - others:

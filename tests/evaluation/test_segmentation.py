@@ -1,6 +1,8 @@
 """Labelled frames of the real engine, batches of them, and scores of what a network says."""
 
 import itertools
+import multiprocessing
+import os
 from contextlib import closing
 from functools import partial
 
@@ -8,6 +10,7 @@ import numpy as np
 import pytest
 
 from gvz.core.env_config import LABEL_CLASSES
+from gvz.core.errors import GvzError
 from gvz.env import DoomEnv
 from gvz.evaluation import segmentation
 from gvz.evaluation.segmentation import BatchSpec
@@ -129,7 +132,7 @@ def test_batches_hold_screens_and_labels_of_all_tasks_and_follow_from_their_numb
 def test_workers_make_the_same_batches(tmp_path):
     tasks = [parse_task(f"seek_and_kill/{name}") for name in ("default", "shadows")]
     here = segmentation.Batches([segmentation.labelled_frames(task, 3) for task in tasks], BatchSpec(2, seed=5))
-    with worker_processes(2) as executor:
+    with worker_processes(2, "died") as executor:
         list(executor.map(partial(segmentation.keep_frames, num_frames=3, directory=tmp_path), tasks))
         theirs = list(
             itertools.islice(segmentation.batches_of_workers(executor, 3, tasks, tmp_path, BatchSpec(2, seed=5)), 6)
@@ -137,6 +140,13 @@ def test_workers_make_the_same_batches(tmp_path):
     for (screens, labels), (screens_there, labels_there) in zip(here, theirs, strict=False):
         np.testing.assert_array_equal(screens_there, screens)
         np.testing.assert_array_equal(labels_there, labels)
+
+
+def test_a_worker_that_dies_is_told_and_the_others_end():
+    before = set(multiprocessing.active_children())
+    with pytest.raises(GvzError, match="one of them died"), worker_processes(2, "one of them died") as executor:
+        executor.submit(os._exit, 1).result()
+    assert set(multiprocessing.active_children()) <= before
 
 
 def test_a_screen_is_normalized_in_training_as_it_is_later():
