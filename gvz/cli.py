@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 import gvz
-from gvz.core.errors import GvzError
+from gvz.core.errors import EXIT_INTERRUPTED, GvzError
 from gvz.core.registry import discover
 
 EXIT_BROKEN_PIPE = 141
@@ -29,6 +29,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except GvzError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
+    except KeyboardInterrupt:  # of a command that has nothing to say about it
+        print("interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
     except BrokenPipeError:  # the reader of our output has closed it: gvz tasks | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at the end
         return EXIT_BROKEN_PIPE

@@ -1,0 +1,114 @@
+"""The gvz command: quick to start, resumable, one clear message for bad input."""
+
+import json
+import os
+import subprocess
+import sys
+from importlib.metadata import version
+
+import pytest
+
+from gvz import cli
+from gvz.core.registry import discover
+from gvz.tasks import scenarios
+
+
+def test_help_loads_neither_jax_nor_vizdoom_nor_anything_heavy():
+    code = (
+        "import sys; from gvz import cli\n"
+        "try: cli.main(['--help'])\n"
+        "except SystemExit as end: assert end.code == 0\n"
+        "heavy = ('numpy', 'jax', 'vizdoom', 'cv2', 'PIL', 'gymnasium', 'orbax', 'polars', 'matplotlib')\n"
+        "print([m for m in heavy if m in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stderr.strip() == "[]"
+    for command in discover("gvz.commands"):
+        assert f"• {command} " in done.stdout
+
+
+def test_a_reader_that_has_enough_is_no_error():
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "gvz.cli", "tasks"]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, timeout=120, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_help_of_a_command_says_all_that_the_overview_leaves_out(capsys):
+    told = []
+    for arguments in (["--help"], ["evaluate", "--help"]):
+        with pytest.raises(SystemExit, match=r"^(0|None)$"):
+            cli.main(arguments)
+        told.append(capsys.readouterr().out)
+    overview, evaluate = told
+    assert "Play evaluation episodes and append a row" in " ".join(overview.split())
+    assert "Episode n of a task has the same seed" not in overview
+    assert "Episode n of a task has the same seed" in evaluate
+    assert "RUN_DIR" in evaluate
+    assert "None" not in evaluate.replace("(default: None)", "")
+
+
+def test_it_says_its_version(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"gvizdoom {version('gvizdoom')}\n"
+
+
+def test_tasks_lists_all_named_tasks(capsys):
+    assert cli.main(["tasks", "--json"]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert len(rows) == 76
+    assert len({row["gymnasium_id"] for row in rows}) == 76
+    gore = next(row for row in rows if row["task"] == "defend_the_center/gore")
+    assert (gore["level"], gore["attributes"], gore["sets"]) == (1, ["gore"], ["train4", "train8", "pairs"])
+
+
+def test_tasks_prints_a_table(capsys):
+    assert cli.main(["tasks", "--scenario", "seek_and_kill", "--split", "test"]) == 0
+    head, *lines = capsys.readouterr().out.splitlines()
+    assert head.split() == ["level", "sets", "task"]
+    assert len(lines) == 7
+    assert lines[0].split() == ["2", "test", "seek_and_kill/blue+shadows"]
+    assert lines[-1].split() == [
+        *("4", "test", "seek_and_kill/complete", "=", "mixed_enemies+obstacles+red+resized_enemies+shadows")
+    ]
+    assert {len(line) > 80 for line in lines[:-1]} == {False}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("tasks --scenario seek_and_kil", "unknown scenario 'seek_and_kil' (did you mean 'seek_and_kill'?)"),
+        ("tasks --tasks seek_and_kill/blu", "unknown attribute 'blu' (did you mean 'blue'?)"),
+        ("tasks --tasks seek_and_kill/blue --split test", "--tasks: got ids and also --scenario, --split or --level"),
+        ("gallery --scenario nowhere", "unknown scenario 'nowhere'"),
+        ("gallery --out {file}/below", "cannot be made: Not a directory"),
+        ("train --config no_such", "no config 'no_such'"),
+    ],
+)
+def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, tmp_path):
+    (tmp_path / "file").touch()
+    assert cli.main(arguments.format(file=tmp_path / "file").split()) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: ")
+    assert message in err
+    assert "Traceback" not in err
+
+
+def test_tasks_of_later_scenarios_are_listed_by_their_suite(capsys):
+    assert cli.main(["tasks", "--suite", "extended", "--json"]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert {row["scenario"] for row in rows} == set(scenarios("extended"))
+    assert len([row for row in rows if row["scenario"] == "find_the_key"]) == 22
+    assert "GViZDoom/FindTheKey-Default-v0" in [row["gymnasium_id"] for row in rows]
+
+
+def test_ctrl_c_gives_one_line_and_the_exit_code_that_shells_expect(capsys, monkeypatch):
+    def interrupted(_: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "run", interrupted)
+    assert cli.main(["gallery"]) == 130
+    assert capsys.readouterr() == ("", "interrupted\n")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from gvz.core.env_config import EnvConfig, Profile
-from gvz.core.errors import ConfigError
+from gvz.core.errors import EXIT_INTERRUPTED, ConfigError
 from gvz.core.stop import StopRequest
 from gvz.evaluation.selection import ALL_TASKS, TaskSelection
 from gvz.evaluation.simple import SimplePlayerName
@@ -20,7 +20,6 @@ from gvz.scenarios.base import Task
 if TYPE_CHECKING:
     from gvz.evaluation.play import PlayerSpec, Row
 
-EXIT_INTERRUPTED = 130
 LINE_PERIOD_S = 10.0
 """seconds between lines of progress when the output is not a terminal"""
 

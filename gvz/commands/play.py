@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from gvz.core.env_config import EnvConfig, Profile
-from gvz.core.errors import ConfigError
+from gvz.core.errors import EXIT_INTERRUPTED, ConfigError
 from gvz.scenarios.base import Task
 from gvz.tasks import parse_task
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from gvz.evaluation.episode_log import RecordFile
     from gvz.viewer import Window
 
-EXIT_INTERRUPTED = 130
 SPEED = 1.0
 """times the game's own; no flag, since scores at another speed do not compare"""
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from gvz.core.errors import ConfigError
+from gvz.core.errors import EXIT_INTERRUPTED, ConfigError
 from gvz.evaluation.choice import ANY_EPISODE, EpisodeChoice
 
 if TYPE_CHECKING:
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
     from gvz.evaluation.playback import Moment
 
-EXIT_INTERRUPTED = 130
 ANIMATION_S = 20.0
 """how much of an episode is put into a .gif or .webp, seconds, unless --seconds says otherwise: they grow large"""
 

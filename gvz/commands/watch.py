@@ -7,15 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from gvz.core.errors import ConfigError
+from gvz.core.errors import EXIT_INTERRUPTED, ConfigError
 from gvz.evaluation.choice import ANY_EPISODE, EpisodeChoice
 from gvz.scenarios.base import Task
 
 if TYPE_CHECKING:
     from gvz.evaluation.play import PlayerSpec
     from gvz.viewer import Window
-
-EXIT_INTERRUPTED = 130
 
 
 @dataclass(frozen=True, kw_only=True)

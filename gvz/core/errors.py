@@ -7,6 +7,9 @@ can go wrong at run time has a class here, and its message says what, where, got
 from collections.abc import Iterable
 from difflib import get_close_matches
 
+EXIT_INTERRUPTED = 130
+"""exit code that a shell shows for a program that Ctrl-C ended"""
+
 
 class GvzError(Exception):
     """Base of all errors of this project."""
