@@ -199,11 +199,12 @@ def _batch(number: int, tasks: tuple[Task, ...], directory: Path, spec: BatchSpe
 @cache
 def _kept_batches(tasks: tuple[Task, ...], directory: Path, spec: BatchSpec) -> Batches:
     """A worker opens the files once; what it reads of them it shares with the others."""
-    labelled = [
-        Labelled(*(np.load(_kept(task, directory) / f"{name}.npy", mmap_mode="r") for name in _ARRAYS), *_looks(task))
-        for task in tasks
-    ]
-    return Batches(labelled, spec)
+    return Batches([_opened(task, directory) for task in tasks], spec)
+
+
+def _opened(task: Task, directory: Path) -> Labelled:
+    frames, labels, depths = (np.load(_kept(task, directory) / f"{name}.npy", mmap_mode="r") for name in _ARRAYS)
+    return Labelled(frames, labels, depths, *_looks(task))
 
 
 def _kept(task: Task, directory: Path) -> Path:
