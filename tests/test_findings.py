@@ -313,6 +313,25 @@ def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
     ).format(*learning) in page
 
 
+def test_the_findings_say_what_agents_have_whose_network_learned_longer():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    name = "seek_and_kill"
+    used, longer = (
+        agent_scores(results_of(folder).episodes.filter(scenario=name), agent)
+        for folder, agent in (
+            ("general_short", "rainbow_segmented"),
+            ("general_short", "rainbow_segmented+longer_network"),
+        )
+    )
+    sets = [[task.id for task in named_tasks(name, split=split)] for split in ("train8", "gate", "test")]
+    for called, scores in (("the network that is used", used), ("the one that learned longer", longer)):
+        cells = [estimate(scores, tasks).text for tasks in (*sets, [f"{name}/complete"])]
+        assert f"| {called} | {' | '.join(cells)} |" in page
+    gain = estimate_groups([(scores, sets[1]) for scores in (longer, used)], difference).text
+    assert f"The difference on the gate tasks is {gain} points." in page
+    assert f"beside segmented frames | | | | {gain} | no |" in page
+
+
 def test_the_findings_say_what_seven_minutes_of_a_gpu_gave():
     page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     folder, short = ROOT / "results" / "general_gpu", results_of("general_short").episodes
@@ -428,6 +447,12 @@ def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
         tasks, mine = [task.id for task in named_tasks(name, split="gate")], episodes.filter(scenario=name)
         agents = [agent_scores(mine, agent) for agent in ("rainbow_segmented", "rainbow_general (8 tasks)")]
         of_segmented.append(estimate_groups([(scores, tasks) for scores in agents], difference).text)
+    tasks, mine = (
+        [task.id for task in named_tasks("seek_and_kill", split="gate")],
+        episodes.filter(scenario="seek_and_kill"),
+    )
+    agents = [agent_scores(mine, agent) for agent in ("rainbow_segmented+longer_network", "rainbow_segmented")]
+    of_network = estimate_groups([(scores, tasks) for scores in agents], difference).text
     assert len(named) > 10
-    assert named <= gains | set(of_segmented)
+    assert named <= gains | {*of_segmented, of_network}
     assert f"game variables | {' | '.join(of_segmented)} | no: `rainbow_segmented` |" in summary
