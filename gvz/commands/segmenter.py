@@ -18,7 +18,7 @@ _LOOK_PERIOD_STEPS = 20
 _BATCHES_AHEAD = 4
 """of each worker"""
 _DIED = "gvz segmenter: a worker process died, perhaps for want of memory; give it fewer --workers or --frames"
-Played = TypeVar("Played")
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +89,7 @@ class TrainSegmenter:
             def show(unit: str, done: int, total: int, text: str) -> None:
                 bars.show([Bar(name=unit, done=done, total=total, unit=unit, text=text)])
 
-            def played(found: Iterable[Played]) -> Iterator[Played]:
+            def played(found: Iterable[T]) -> Iterator[T]:
                 """Shows which task comes next."""
                 found = iter(found)
                 for number, task in enumerate(tasks):

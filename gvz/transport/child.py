@@ -37,6 +37,7 @@ def one_core() -> dict[str, str]:
         "OMP_NUM_THREADS": "1",
         "OPENBLAS_NUM_THREADS": "1",
         "MKL_NUM_THREADS": "1",
+        "OPENCV_FOR_THREADS_NUM": "1",
     }
 
 

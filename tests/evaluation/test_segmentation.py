@@ -6,6 +6,7 @@ import os
 from contextlib import closing
 from functools import partial
 
+import cv2
 import numpy as np
 import pytest
 
@@ -140,6 +141,11 @@ def test_workers_make_the_same_batches(tmp_path):
     for (screens, labels), (screens_there, labels_there) in zip(here, theirs, strict=False):
         np.testing.assert_array_equal(screens_there, screens)
         np.testing.assert_array_equal(labels_there, labels)
+
+
+def test_a_worker_keeps_to_one_core():
+    with worker_processes(1, "died") as executor:
+        assert executor.submit(cv2.getNumThreads).result() == 1
 
 
 def test_a_worker_that_dies_is_told_and_the_others_end():
