@@ -47,7 +47,11 @@ ALLOWED = {
     ("gvz/core/registry.py", "import_module"): "modules of our own packages, found on the disk",
     ("actors/loop.py", "import_module"): "the environment's class, which the learner names to the actor it started",
 }
-PROCESS_POOLS = {"gvz/evaluation/play.py": "pickles what the parent gives to the workers it started, and their rows"}
+PROCESS_POOLS = {
+    "gvz/evaluation/workers.py": "starts the workers of the two below",
+    "gvz/evaluation/play.py": "pickles what the parent gives to the workers it started, and their rows",
+    "gvz/evaluation/segmentation.py": "pickles what the parent gives to the workers it started, and their batches",
+}
 SERVERS = {"bind", "listen", "create_server", "start_server", "serve_forever", "start_unix_server"}
 
 
