@@ -201,3 +201,31 @@ def test_the_readme_says_how_fast_the_records_are():
     ) in readme
     assert row("actors", "") in readme
     assert row("actors_tuned", ", tuned engine") in readme
+
+
+def test_pages_say_what_a_gpu_gave():
+    record = json.loads((ROOT / "results" / "performance" / "gpu_gpu.json").read_text())
+    rows = {row["name"]: row for row in record["rows"]}
+    cores, device = (rows[f"the run, actors.inference {where}"] for where in ("actors", "device"))
+    alone = [row["updates_per_s"]["median"] for name, row in rows.items() if name.startswith("learner, ")]
+    updates = [run["updates_per_s"]["median"] for run in (cores, device)]
+    guide = " ".join((ROOT / "docs" / "how-to" / "train.md").read_text().split())
+    assert f"`rainbow_4task` makes {updates[0]:.0f} gradient steps a second" in guide
+    assert f"chooses the actions, too, and it makes {updates[1]:.0f} ([measured]" in guide
+    assert f"The learner alone makes up to {max(alone):,.0f}." in guide
+    first = [
+        rows[f"from the command to the first gradient step, actors.inference {where}"] for where in ("actors", "device")
+    ]
+    assert "step came after {:.0f} and {:.0f} seconds.".format(*(row["median"] for row in first)) in guide
+    readme = " ".join((ROOT / "README.md").read_text().split())
+    decisions = round(device["decisions_per_s"]["median"], -1)
+    assert f"makes {updates[1]:.0f} gradient steps and plays {decisions:,.0f} decisions a second" in readme
+    log = (ROOT / "results" / "general_gpu" / "compilation.txt").read_text()
+    act, train_step = (
+        [float(s) for s in re.findall(rf"jit\({name}\) in ([\d.]+) sec", log)] for name in ("act", "train_step")
+    )
+    acting, learning = sum(act), sum(train_step)
+    assert f"it was {acting + learning:.0f} of 180 seconds" in guide
+    page = " ".join((ROOT / "results" / "general_gpu" / "README.md").read_text().split())
+    assert f"for five batch sizes ({acting:.0f} s), then the gradient step ({learning:.0f} s)" in page
+    assert (len(act), len(train_step)) == (5, 1)

@@ -15,9 +15,9 @@ from gvz.transport.child import one_core
 
 @contextlib.contextmanager
 def worker_processes(num_workers: int, died: str) -> Generator[ProcessPoolExecutor, None, None]:
-    """An executor of so many processes, which end with the block: at once if an exception leaves it.
+    """An executor with this number of processes. They end with the block.
 
-    They also end if this process is killed.
+    If an exception leaves the block, the processes are killed. They also end if this process is killed.
 
     Raises:
         GvzError: one of them died; `died` is its text.

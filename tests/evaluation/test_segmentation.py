@@ -159,7 +159,7 @@ def test_a_screen_is_normalized_in_training_as_it_is_later():
     screens = np.random.default_rng(0).integers(10, 90, (2, INPUT_HEIGHT, INPUT_WIDTH, 3), dtype=np.uint8)
     screens[1] = 0
     expected = [np.moveaxis(network_input(screen), 0, -1) for screen in screens]
-    np.testing.assert_allclose(normalized(screens), expected, atol=2e-5)
+    np.testing.assert_allclose(normalized(screens), expected, atol=2e-6)  # ten seeds, three instruction sets: 2.4e-7
 
 
 def test_decorations_come_into_the_frames_of_tasks_that_have_none():

@@ -1,0 +1,266 @@
+"""What the findings say of agents on segmented frames is what their records give."""
+
+import gzip
+import itertools
+import json
+
+import numpy as np
+
+from gvz.evaluation.statistics import difference
+from gvz.reports.experiment_section import comparison_table
+from gvz.reports.scores import agent_scores, estimate, estimate_groups
+from gvz.tasks import TaskSet, named_tasks, scenario_named, scenarios
+from tests.test_results import ROOT, results_of
+
+
+def test_the_findings_say_what_segmented_agents_have_on_single_tasks():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    episodes = results_of("general_short").episodes
+
+    def score(task: str, agent: str = "rainbow_segmented") -> str:
+        scores = episodes.filter(agent=agent, task=task)["normalized_score"].to_numpy()
+        assert len(scores) == (150 if agent == "rainbow_segmented" else 50)
+        return f"{scores.mean():.0f}"
+
+    center, gathering, dodging = "defend_the_center", "health_gathering", "dodge_projectiles"
+    assert f"`gore+mossy_bricks` {score(f'{center}/gore+mossy_bricks')} instead of 81" in page
+    assert (
+        f"`fuzzy_enemies+gore+stone_wall` has {score(f'{center}/fuzzy_enemies+gore+stone_wall')} instead of 54" in page
+    )
+    assert f"`complete` {score(f'{center}/complete')} instead of 47" in page
+    assert f"on `short_agent+water`, where agents have {score(f'{gathering}/short_agent+water')} instead of" in page
+    water, classes = f"{gathering}/short_agent+water", "rainbow_general+classes"
+    assert f"frames of classes have {score(water, classes)} there, segmented ones {score(water)}." in page
+    assert f"`poison+stimpacks` has {score(f'{gathering}/poison+stimpacks')} instead of 73." in page
+    gate_tasks = [task.id for task in named_tasks(gathering, split="gate")]
+    of_gate = estimate(agent_scores(episodes.filter(scenario=gathering), "rainbow_segmented"), gate_tasks).text
+    assert f"**Health Gathering has {of_gate} instead of 80.2" in page
+    trained = [score(f"{gathering}/{name}") for name in ("supreme", "poison")]
+    assert f"`supreme` and `poison`, training tasks, stand at {' and '.join(trained)}, and" in page
+    both = f"{gathering}/poison+supreme"
+    assert f"`poison+supreme` at {score(both)} (classes: {score(both, classes)})" in page
+    at_random = score(f"{gathering}/complete", "random")
+    assert f"`complete` has {score(f'{gathering}/complete')}; a random player has {at_random}." in page
+    arachnotron, complete = (score(f"{dodging}/{name}") for name in ("arachnotron+city", "complete"))
+    assert f"`arachnotron+city` has {arachnotron} and `complete` {complete}, where the sweep" in page
+    assert f"`revenants`, whose missiles turn, has {score(f'{dodging}/revenants')}." in page
+    shadows, hard, *of_classes = (
+        score(f"seek_and_kill/{name}", agent)
+        for agent in ("rainbow_segmented", "rainbow_general+classes")
+        for name in ("blue+shadows", "complete")
+    )
+    assert f"`blue+shadows` has {shadows} instead of 14, `complete` {hard} instead of 18." in page
+    assert f"Frames of classes have {' and '.join(of_classes)}." in page
+    learning = []
+    for file in (ROOT / "results" / "general_short" / "runs" / "rainbow_segmented" / "seek_and_kill").glob(
+        "**/episodes.jsonl.gz"
+    ):
+        rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+        learning += [row["normalized_score"] for row in rows if 8_000 <= row["num_updates"] < 10_000]
+    assert f"training episodes had {np.mean(learning):.0f} points at 8,000 to 10,000 gradient steps" in page
+    level_4 = [score(f"{name}/complete") for name in scenarios()]
+    assert f"{', '.join(level_4[:3])} and {level_4[3]} on the four tasks `complete`" in page
+
+
+def test_the_findings_say_how_much_agents_of_the_gate_moved_and_what_it_gave_by_task():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    moved, by_task = [], {"arachnotron": [], "mancubus+resized_agent": []}
+    for variant in ("plain", "moved", "moved_more", "moved_most"):
+        folder = ROOT / "results" / "gates" / "runs" / f"rainbow_segmented+{variant}" / "dodge_projectiles"
+        played = [gzip.decompress(file.read_bytes()) for file in sorted(folder.glob("**/evaluation.jsonl.gz"))]
+        rows = [json.loads(line) for lines in played for line in lines.splitlines()]
+        for name, means in by_task.items():
+            scores = [row["normalized_score"] for row in rows if row["task"] == f"dodge_projectiles/{name}"]
+            assert len(scores) == 40
+            means.append(f"{np.mean(scores):.0f}")
+        trained = [
+            gzip.decompress(file.read_bytes()).splitlines()[-60:] for file in folder.glob("**/episodes.jsonl.gz")
+        ]
+        last = [json.loads(line) for lines in trained for line in lines]
+        assert len(last) == 120
+        moved.append(np.mean([row["reward_components"].get("moved", 0.0) / row["length_steps"] for row in last]))
+    assert f"agents got {moved[0]:.0f}, {moved[1]:.3f}, {moved[2]:.3f} or {moved[3]:.3f} a decision for it" in page
+    assert f"with both, {moved[2] / 0.0005:.0f} and {moved[3] / 0.002:.0f} map units in five decisions" in page
+    assert "`arachnotron` has {}, {}, {} and {} by weight".format(*by_task["arachnotron"]) in page
+    assert "`mancubus+resized_agent` has {}, {}, {} and {}".format(*by_task["mancubus+resized_agent"]) in page
+
+
+def test_the_findings_say_what_shifted_frames_gave():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    episodes, said = results_of("gates").episodes, []
+    for task in ("arachnotron", "mancubus+resized_agent"):
+        for variant in ("shift", "moved_most"):
+            rows = episodes.filter(agent=f"rainbow_segmented+{variant}", task=f"dodge_projectiles/{task}")
+            assert len(rows) == 40
+            said.append(f"{rows['normalized_score'].mean():.0f}")
+    assert "`arachnotron` has {} instead of {}, `mancubus+resized_agent` {} instead of {}.".format(*said) in page
+    gate_tasks = [task.id for task in named_tasks("dodge_projectiles", split="gate")]
+    in_zoo = episodes.filter(episodes["task"].is_in(gate_tasks), agent="rainbow_segmented+shift", run_seed=2222)
+    assert f"is in the zoo, rounded: seed 2222, which has {in_zoo['normalized_score'].mean():.1f} there." in page
+    sets = [[task.id for task in named_tasks("dodge_projectiles", split=split)] for split in ("gate", "train8")]
+    on_gate, trained, on_gate_more, trained_more = (
+        episodes.filter(episodes["task"].is_in(tasks), agent=f"rainbow_segmented+{variant}")["normalized_score"].mean()
+        for variant in ("shift", "shift_moved")
+        for tasks in sets
+    )
+    assert f"0.002 has {on_gate:.1f} on the gate tasks and {trained:.1f} on the training tasks." in page
+    assert f"0.005 has {on_gate_more:.1f} and {trained_more:.1f}. It has one seed" in page
+    tasks = [task.id for task in named_tasks("defend_the_center", split="train8")]
+    of_tasks = episodes.filter(episodes["task"].is_in(tasks))
+    plain, everywhere, vertical = (
+        of_tasks.filter(agent=f"rainbow_segmented+{name}")["normalized_score"].mean()
+        for name in ("moved_most", "shift", "vertical")
+    )
+    assert f"[-3.9, -0.4] on the gate tasks and {plain - everywhere:.0f} on the training tasks. The thought" in page
+    assert f"the training tasks lose {plain - vertical:.0f} point, but the gate tasks lose no less" in page
+    (gate,) = [asked for asked in results_of("gates").asked if asked.experiment.name == "gate_shift"]
+    gains = [row[2].text for row in comparison_table(results_of("gates"), gate).rows]
+    assert all(gain in page for gain in gains[:5])
+
+
+def test_the_findings_say_what_pairs_gave_beside_segmented_frames():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    episodes = results_of("gates").episodes
+
+    def means(task: str) -> list[float]:
+        """Of the agent of pairs, and of each of the agents of eight tasks."""
+        runs = (("8 tasks and pairs", 1111), ("8 tasks", 1111), ("8 tasks", 2222))
+        found = [
+            episodes.filter(agent=f"rainbow_segmented ({words})", run_seed=seed, task=task) for words, seed in runs
+        ]
+        assert [len(rows) for rows in found] == [20, 20, 20]
+        return [float(rows["normalized_score"].mean()) for rows in found]
+
+    said = []
+    for task in ("dodge_projectiles/arachnotron", "health_gathering/short_agent+water"):
+        pairs, *eight = means(task)
+        said += [f"{pairs:.0f}", f"{np.mean(eight):.0f}"]
+    assert "`arachnotron` has {} instead of {}, and `short_agent+water` {} instead of {}.".format(*said) in page
+    said = [f"{score:.0f}" for task in ("supreme", "poison") for score in means(f"health_gathering/{task}")]
+    assert (
+        "`supreme` has {}, where the two agents of eight tasks have {} and {}, and `poison` has {}, where they have {} "
+        "and {}."
+    ).format(*said) in page
+    pairs, eight = ([task.id for task in named_tasks("health_gathering", split=s)] for s in ("pairs", "train8"))
+    rare = [sum("poison" in task or "supreme" in task for task in tasks) for tasks in (pairs, eight)]
+    assert (rare, len(pairs)) == ([11, 2], 24)
+    (gate,) = [asked for asked in results_of("gates").asked if asked.experiment.name == "gate_pairs"]
+    gains = [row[2].text for row in comparison_table(results_of("gates"), gate).rows]
+    assert all(gain in page for gain in gains[1:3])
+
+
+def test_the_findings_say_what_six_times_the_time_gave():
+    page = (ROOT / "docs" / "FINDINGS.md").read_text()
+    agents = {"rainbow_general+sight_loss": "loss of sight", "rainbow_segmented": "segmented"}
+    for folder, seconds in (("general_short", "900 s"), ("general", "5,400 s")):
+        episodes = results_of(folder).episodes
+        for name, (agent, called) in itertools.product(scenarios(), agents.items()):
+            if name == "dodge_projectiles" and folder == "general_short":
+                continue  # by another config now
+            if name in ("dodge_projectiles", "health_gathering") and agent != "rainbow_segmented":
+                continue  # not run
+            scores = agent_scores(episodes.filter(scenario=name), agent)
+            sets = [named_tasks(name, split=split) for split in ("train8", "gate", "test")]
+            cells = [estimate(scores, [t.id for t in tasks]).text for tasks in (*sets, named_tasks(name, level=4))]
+            assert f"| {scenario_named(name).title} | {called} | {seconds} | {' | '.join(cells)} |" in page
+
+
+def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    short, long = (results_of(name).episodes.filter(agent="rainbow_segmented") for name in ("general_short", "general"))
+
+    def means(episodes, name: str, split: TaskSet) -> list[float]:
+        """Mean over the tasks, of each training seed."""
+        tasks, seeds = [task.id for task in named_tasks(name, split=split)], sorted(episodes["run_seed"].unique())
+        rows = [[episodes.filter(run_seed=seed, task=task) for task in tasks] for seed in seeds]
+        return [float(np.mean([found["normalized_score"].mean() for found in of_seed])) for of_seed in rows]
+
+    gains = {}
+    compared = ("defend_the_center", "health_gathering", "seek_and_kill")
+    for name, split in itertools.product(compared, ("train8", "gate", "test")):
+        before, (after,) = means(short, name, split), means(long, name, split)
+        assert len(before) == 3
+        below, within = ((name, split) == one for one in (("health_gathering", "gate"), ("seek_and_kill", "test")))
+        assert (after < min(before)) == below
+        assert (after > max(before)) != (below or within)
+        gains[name, split] = f"{after - np.mean(before):.1f}"
+    for name in ("defend_the_center", "seek_and_kill"):
+        of_seeds, (of_long,) = (
+            [episodes.filter(run_seed=seed, task=f"{name}/complete")["normalized_score"].mean() for seed in seeds]
+            for episodes, seeds in ((short, (1111, 2222, 3333)), (long, (1111,)))
+        )
+        assert min(of_seeds) <= of_long <= max(of_seeds), "level 4 gains nothing"
+    center, gathering, kill = ([gains[name, split] for split in ("train8", "gate", "test")] for name in compared)
+    assert (
+        f"In Defend the Center they gain {' and '.join(center[:2])} points, in Seek and Kill {' and '.join(kill[:2])}."
+        in page
+    )
+    assert f"test tasks gain {center[2]} points in Defend the Center, 2.2 in" in page
+    assert f"and {gathering[2]} in Health Gathering**, also above" in page
+    assert f"**In Health Gathering the gate tasks lose {gathering[1].lstrip('-')} points**" in page
+    assert f"The training tasks gain {gathering[0]} points" in page
+    assert f"beside segmented frames | {center[1]} | -4.0 | {gathering[1]} | {kill[1]} | as you like" in page
+    said = []
+    for task in ("short_agent", "short_agent+water", "supreme"):
+        scores = [one.filter(task=f"health_gathering/{task}")["normalized_score"].mean() for one in (long, short)]
+        said += [f"{score:.0f}" for score in scores]
+    words = "`short_agent`, a training task, has {} instead of {}, and `short_agent+water` {} instead of {}."
+    assert words.format(*said[:4]) in page
+    assert "`supreme` has {} instead of {}.".format(*said[4:]) in page
+    arachnotron = long.filter(task="dodge_projectiles/arachnotron")["normalized_score"].mean()
+    assert f"`arachnotron` has {arachnotron:.0f} instead of 84." in page
+
+    said = []
+    for task in ("seek_and_kill/blue+shadows", "seek_and_kill/blue+mixed_enemies+resized_enemies"):
+        said += [f"{episodes.filter(task=task)['normalized_score'].mean():.0f}" for episodes in (long, short)]
+    assert (
+        "`blue+shadows` has {} instead of {}, and `blue+mixed_enemies+resized_enemies` {} instead of {}.".format(*said)
+        in page
+    )
+
+    learning = []
+    for name in ("defend_the_center", "seek_and_kill", "dodge_projectiles", "health_gathering"):
+        file = ROOT / f"results/general/runs/rainbow_segmented/{name}/train8/seed_1111/episodes.jsonl.gz"
+        rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+        last = rows[-1]["num_updates"]
+        for low, high in ((30_000, 40_000), (60_000, 70_000), (last - 10_000, last + 1)):
+            scores = [row["normalized_score"] for row in rows if low <= row["num_updates"] < high]
+            learning.append(f"{np.mean(scores):.0f}")
+    assert (
+        "{} points at 30,000 to 40,000 gradient steps, {} at 60,000 to 70,000, and {} in the last 10,000. "
+        "Seek and Kill had {}, {} and {}, Dodge Projectiles {}, {} and {}, and Health Gathering {}, {} and {}."
+    ).format(*learning) in page
+
+
+def test_the_findings_say_what_agents_have_whose_network_learned_longer():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    name = "seek_and_kill"
+    used, longer = (
+        agent_scores(results_of(folder).episodes.filter(scenario=name), agent)
+        for folder, agent in (
+            ("general_short", "rainbow_segmented"),
+            ("general_short", "rainbow_segmented+longer_network"),
+        )
+    )
+    sets = [[task.id for task in named_tasks(name, split=split)] for split in ("train8", "gate", "test")]
+    for called, scores in (("the network that is used", used), ("the one that learned longer", longer)):
+        cells = [estimate(scores, tasks).text for tasks in (*sets, [f"{name}/complete"])]
+        assert f"| {called} | {' | '.join(cells)} |" in page
+    gain = estimate_groups([(scores, sets[1]) for scores in (longer, used)], difference).text
+    assert f"The difference on the gate tasks is {gain} points." in page
+    assert f"beside segmented frames | | | | {gain} | no |" in page
+
+
+def test_the_findings_say_what_a_longer_horizon_gave_in_health_gathering():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    episodes = results_of("gates").episodes
+
+    def score(variant: str, name: str) -> str:
+        rows = episodes.filter(agent=f"rainbow_segmented+{variant}", task=f"health_gathering/{name}")
+        assert len(rows) == 40
+        return f"{rows['normalized_score'].mean():.0f}"
+
+    assert f"`poison+stimpacks` has {score('far', 'poison+stimpacks')} instead of" in page
+    assert f"instead of {score('near', 'poison+stimpacks')}, and `poison` {score('far', 'poison')} instead of" in page
+    assert f"instead of {score('near', 'poison')}. `supreme` has {score('far', 'supreme')} instead of" in page
+    assert f"instead of {score('near', 'supreme')}." in page
