@@ -13,9 +13,9 @@ from gvz.scenarios.map_set import VARIED, names_map_set, parse_map_set
 
 LEVELS = range(MAX_LEVEL + 1)
 """levels of tasks, the easiest first"""
-TrainingSet = Literal["train1", "train4", "train8", "pairs"]
+TrainingSet = Literal["train1", "train4", "train8", "pairs", "compositions"]
 """tasks to train on; pairs: the eight of train8, and each two of their attributes that go together and are no named
-task"""
+task; compositions: likewise any number of their attributes"""
 TaskSet = Literal[TrainingSet, "test", "gate"]
 """a training set, the test set, or the gate set: the named tasks of GATE_LEVEL that are in neither"""
 GATE_LEVEL = 2
@@ -97,7 +97,7 @@ def named_tasks(
 ) -> tuple[Task, ...]:
     """The named tasks of a suite or scenario: scenarios in alphabetical order, tasks in the order of their file.
 
-    The set `pairs` is the one that has tasks without a name in the benchmark, too.
+    The sets `pairs` and `compositions` are those that have tasks without a name in the benchmark, too.
 
     Args:
         scenario: only tasks of this scenario, whatever its suite.
@@ -128,14 +128,18 @@ def attribute_tasks(scenario: str) -> tuple[Task, ...]:
     one = scenario_named(scenario)
     names = [attribute.name for attribute in one.attributes]
     alone = [Task(one, (name,), severities=((name, severity),)) for name in names for severity in (0.5, 1.0)]
-    return (Task(one), *alone, *_pairs(one, names))
+    return (Task(one), *alone, *_compositions(one, names, 2))
 
 
-def _pairs(scenario: Scenario, names: Container[str]) -> list[Task]:
-    """Each two of these attributes that are of different groups, in the order of the scenario's file."""
+def _compositions(scenario: Scenario, names: Container[str], most: int) -> list[Task]:
+    """Each two to `most` of these attributes that are of different groups: fewer first, then in the file's order."""
     chosen = [attribute for attribute in scenario.attributes if attribute.name in names]
-    pairs = itertools.combinations(chosen, 2)
-    return [Task(scenario, (a.name, b.name)) for a, b in pairs if not set(a.groups) & set(b.groups)]
+    return [
+        Task(scenario, tuple(attribute.name for attribute in some))
+        for number in range(2, most + 1)
+        for some in itertools.combinations(chosen, number)
+        if not any(set(a.groups) & set(b.groups) for a, b in itertools.combinations(some, 2))
+    ]
 
 
 def _names(scenario: Scenario, split: TaskSet | None) -> tuple[str, ...]:
@@ -145,7 +149,8 @@ def _names(scenario: Scenario, split: TaskSet | None) -> tuple[str, ...]:
     if split == "gate":
         used = {name for names in scenario.splits.values() for name in names}
         return tuple(name for name in scenario.tasks if name not in used)
-    if split == "pairs":
+    if split in ("pairs", "compositions"):
         eight, named = scenario.splits["train8"], named_tasks(scenario.id)
-        return (*eight, *(task.name for task in _pairs(scenario, eight) if task not in named))
+        composed = _compositions(scenario, eight, 2 if split == "pairs" else len(eight))
+        return (*eight, *(task.name for task in composed if task not in named))
     return scenario.splits[split]

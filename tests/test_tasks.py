@@ -244,14 +244,22 @@ def test_the_pairs_of_the_eight_training_tasks_are_all_that_have_no_name():
     )
 
 
+@pytest.mark.parametrize("split", ["pairs", "compositions"])
 @pytest.mark.parametrize("scenario", all_scenarios())
-def test_pairs_bring_no_new_attribute_and_no_task_that_others_are_scored_on(scenario):
-    eight, pairs = (named_tasks(scenario, split=split) for split in ("train8", "pairs"))
-    added = set(pairs) - set(eight)
-    assert pairs[:8] == eight
+def test_composed_sets_bring_no_new_attribute_and_no_task_that_others_are_scored_on(scenario, split):
+    eight, composed = named_tasks(scenario, split="train8"), named_tasks(scenario, split=split)
+    added = set(composed) - set(eight)
+    assert composed[:8] == eight
+    assert len(set(composed)) == len(composed)
     assert {name for task in added for name in task.attributes} <= {task.name for task in eight}
-    assert {task.level for task in added} == {2}
+    assert {task.level for task in added} == {2, 3, 4} if split == "compositions" else {2}
     assert not added & set(named_tasks(scenario))
+
+
+def test_compositions_are_all_that_have_no_name():
+    # of each group one or none: three textures, two decorations, four enemies, two heights of the agent, less those
+    # that have a name: default, 7 of level 1, 2 gate tasks, and 3 test tasks whose attributes are all trained on
+    assert len(named_tasks("dodge_projectiles", split="compositions")) == 8 + 3 * 2 * 4 * 2 - 8 - 2 - 3
 
 
 def test_the_gate_set_is_of_level_2_and_in_no_other_set():
@@ -322,7 +330,7 @@ def test_what_is_no_task_is_refused_with_what_is_possible(text: str, message: st
 def test_unknown_selections_of_named_tasks_are_refused():
     with pytest.raises(TaskError, match=r"level: got 5, want 0\.\.4"):
         named_tasks(level=5)
-    with pytest.raises(TaskError, match="split: got 'train2', want one of train1, train4, train8, pairs, test"):
+    with pytest.raises(TaskError, match="split: got 'train2', want one of train1, train4, train8, pairs, compositions, test"):
         named_tasks(split="train2")
     with pytest.raises(TaskError, match="unknown scenario 'seek'"):
         named_tasks("seek")

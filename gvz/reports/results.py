@@ -28,6 +28,7 @@ TRAINING_SETS: dict[TrainingSet, str] = {
     "train4": "4 tasks",
     "train8": "8 tasks",
     "pairs": "8 tasks and pairs",
+    "compositions": "8 tasks and compositions",
 }
 """what to call a training set: "4 tasks" for train4"""
 

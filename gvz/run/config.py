@@ -28,7 +28,10 @@ from learner.config import (
 
 MIN_CLUSTER_SLOTS = 128
 """step records that a game has room for in the replay of a run with actor hosts"""
-_SPLITS: dict[int | str, TrainingSet] = {1: "train1", 4: "train4", 8: "train8", "pairs": "pairs"}
+_SPLITS: dict[int | str, TrainingSet] = {
+    **{1: "train1", 4: "train4", 8: "train8"},
+    **{"pairs": "pairs", "compositions": "compositions"},
+}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -70,9 +73,9 @@ class RunConfig:
     """names the run directory"""
     scenario: str = "defend_the_center"
     """scenario whose training set is played (unless tasks are named)"""
-    training_set: Literal[1, 4, 8, "pairs"] = 4
+    training_set: Literal[1, 4, 8, "pairs", "compositions"] = 4
     """tasks in the training set: 1 is the default task, 4 and 8 add tasks of level 1, pairs adds to 8 each two of
-    their attributes that go together and are no named task"""
+    their attributes that go together and are no named task, compositions any number of them"""
     tasks: tuple[str, ...] | None = None
     """ids of the tasks to train on, instead of a training set; of several scenarios with env.action_set unified_v1"""
     seed: int = 1111

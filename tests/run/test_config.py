@@ -195,7 +195,7 @@ def test_a_saved_configuration_with_an_unknown_key_is_refused():
         ("tasks", 3, "config.tasks: got 3, want a list"),
         ("training_set", 4.0, "config.training_set: got 4.0, want one of 1, 4, 8"),
         ("training_set", True, "config.training_set: got True, want one of"),
-        ("training_set", "pair", "config.training_set: got 'pair', want one of 1, 4, 8, pairs"),
+        ("training_set", "pair", "config.training_set: got 'pair', want one of 1, 4, 8, pairs, compositions"),
     ],
 )
 def test_a_saved_configuration_of_wrong_type_is_refused(key, value, message):
