@@ -61,7 +61,11 @@ def test_tasks_lists_all_named_tasks(capsys):
     assert len(rows) == 76
     assert len({row["gymnasium_id"] for row in rows}) == 76
     gore = next(row for row in rows if row["task"] == "defend_the_center/gore")
-    assert (gore["level"], gore["attributes"], gore["sets"]) == (1, ["gore"], ["train4", "train8", "pairs", "compositions"])
+    assert (gore["level"], gore["attributes"], gore["sets"]) == (
+        1,
+        ["gore"],
+        ["train4", "train8", "pairs", "compositions"],
+    )
 
 
 def test_tasks_prints_a_table(capsys):

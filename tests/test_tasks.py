@@ -330,7 +330,9 @@ def test_what_is_no_task_is_refused_with_what_is_possible(text: str, message: st
 def test_unknown_selections_of_named_tasks_are_refused():
     with pytest.raises(TaskError, match=r"level: got 5, want 0\.\.4"):
         named_tasks(level=5)
-    with pytest.raises(TaskError, match="split: got 'train2', want one of train1, train4, train8, pairs, compositions, test"):
+    with pytest.raises(
+        TaskError, match="split: got 'train2', want one of train1, train4, train8, pairs, compositions, test"
+    ):
         named_tasks(split="train2")
     with pytest.raises(TaskError, match="unknown scenario 'seek'"):
         named_tasks("seek")

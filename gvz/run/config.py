@@ -29,8 +29,11 @@ from learner.config import (
 MIN_CLUSTER_SLOTS = 128
 """step records that a game has room for in the replay of a run with actor hosts"""
 _SPLITS: dict[int | str, TrainingSet] = {
-    **{1: "train1", 4: "train4", 8: "train8"},
-    **{"pairs": "pairs", "compositions": "compositions"},
+    1: "train1",
+    4: "train4",
+    8: "train8",
+    "pairs": "pairs",
+    "compositions": "compositions",
 }
 
 

@@ -173,7 +173,10 @@ def test_settings_change_their_fields_alone_and_another_agent_comes_first():
         ({"seeds": (1, 1)}, "want at least one, each once"),
         ({"episodes": 0}, "episodes: got 0, want at least 1"),
         ({"num_checkpoints": 4, "total_updates": 3}, "num_checkpoints 4, total_updates 3, want each at most the next"),
-        ({"trainings": ("test",)}, "trainings: got 'test', want train1, train4, train8, pairs, compositions, varied, varied-<number"),
+        (
+            {"trainings": ("test",)},
+            "trainings: got 'test', want train1, train4, train8, pairs, compositions, varied, varied-<number",
+        ),
         ({"variants": {"a b": {}}}, r"variants: got 'a b', want letters, digits and \. _ - \(it names"),
         ({"variants": {"a": {"seed": 1, "learner.batch_size": 1}}}, "variant a sets seed, which the experiment sets"),
         ({"max_processor_s": 0.0, "num_checkpoints": 1}, "max_processor_s 0 and num_checkpoints 1, want more than 0"),
