@@ -40,11 +40,6 @@ class PoolConfig(Play, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         run_actors = self.num_actors if self.run_actors is None else self.run_actors
-        if run_actors * self.games_per_actor < len(self.tasks):
-            raise ConfigError(
-                f"actors: got {run_actors} actors with {self.games_per_actor} games for {len(self.tasks)} tasks, "
-                "want at least one game a task"
-            )
         if self.cores and len(self.cores) != self.num_actors:
             raise ConfigError(f"actors: got cores {self.cores}, want one for each of {self.num_actors} actors, or none")
         if run_actors * self.games_per_actor > MAX_LANES:
