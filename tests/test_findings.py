@@ -209,3 +209,21 @@ def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
     assert len(named) > 10
     assert named <= gains | {*of_segmented, of_network}
     assert f"game variables | {' | '.join(of_segmented)} | no: `rainbow_segmented` |" in summary
+
+
+def test_the_findings_say_how_many_games_ran_at_once():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+
+    def games(runs: str) -> set[int]:
+        files = list((ROOT / "results").glob(f"{runs}/**/episodes.jsonl.gz"))
+        assert files
+        rows = ([json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()] for file in files)
+        return {len({row["lane"] for row in episodes if "lane" in row}) for episodes in rows}
+
+    assert games("general_short/runs/rainbow_segmented/*/train8") == {16}
+    assert "(16,900 to 19,700 gradient steps, 16 games at once)" in page
+    assert games("general_short/runs/rainbow_general+sight_loss") == {8}
+    assert "with a weight of 0.1. One seed with 8 games at once" in page
+    on_policy = [games(f"gates/runs/{name}/dodge_projectiles") for name in ("ppo_quick+plain", "pqn_quick+plain")]
+    assert [*on_policy, games("gates/runs/rainbow_quick+plain/dodge_projectiles")] == [{8}] * 3
+    assert "8 games at once; Rainbow on 2026-11-23, the others on 2026-11-26)" in page
