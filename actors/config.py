@@ -18,7 +18,7 @@ class ActorsConfig:
     """actor processes, of each host if there are some (cluster.hosts); default one per CPU core of this machine"""
     games_per_actor: int | None = None
     """games each actor plays and acts on in one batch; default the smallest number >= 4 that gives every actor
-    every task"""
+    every task, with more than 16 tasks that gives every task a game in the run"""
     placement: PlacementKind = "auto"
     """pinned: an actor and its engines share one core, and the learner keeps off these cores if there are others; free:
     any core; auto: pinned if at the start as many cores are idle as there are actors, and one more"""

@@ -9,12 +9,11 @@ EXPERIMENT = dataclasses.replace(
     name="general_compositions",
     title="Generalization when attributes come together in training",
     question="What do unseen tasks gain when training has any number of the attributes that it has anyway?",
-    variants={"uniform": {"curriculum.kind": "uniform", "actors.games_per_actor": 8}},
     trainings=("compositions",),
     columns="training",
     notes=(
         "No attribute is new: the set has the eight training tasks, and each choice of their attributes that go "
-        "together and are no named task. So the gate tasks and the test tasks stay unseen. Each game draws a task for "
-        "every episode. The thesis has no such set. " + SEGMENTED.notes[0],
+        "together and are no named task. So the gate tasks and the test tasks stay unseen. Each task has a game of its "
+        "own. The thesis has no such set. " + SEGMENTED.notes[0],
     ),
 )

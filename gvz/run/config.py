@@ -28,6 +28,8 @@ from learner.config import (
 
 MIN_CLUSTER_SLOTS = 128
 """step records that a game has room for in the replay of a run with actor hosts"""
+_FEW_TASKS = 16
+"""with so many tasks at most, every actor has a game of every task (actors.games_per_actor)"""
 _SPLITS: dict[int | str, TrainingSet] = {
     1: "train1",
     4: "train4",
@@ -263,7 +265,8 @@ class RunConfig:
         num_tasks, games = len(self.table), self.actors.games_per_actor
         actors = self.actors_per_host * max(1, self.cluster.hosts)
         if games is None:
-            games = num_tasks * math.ceil(4 / num_tasks)
+            share = num_tasks * math.ceil(4 / num_tasks) if num_tasks <= _FEW_TASKS else math.ceil(num_tasks / actors)
+            games = max(4, share)
         if games * actors < num_tasks and self.curriculum.kind == "fixed":
             raise ConfigError(
                 f"actors.games_per_actor: got {games} games for each of {actors} actors, but there are {num_tasks} "

@@ -8,6 +8,7 @@ import sys
 
 import pytest
 
+from actors.config import ActorsConfig
 from gvz.actions import UNIFIED_V1
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError, TaskError
@@ -258,6 +259,16 @@ def test_sync_mode_plays_the_same_games_in_one_place():
     flags = "--actors.num-actors 2 --actors.games-per-actor 3".split()
     both = [parse([*flags, "--mode", mode]).run for mode in ("async", "sync")]
     assert [(run.num_actors, run.games_per_actor, run.num_lanes) for run in both] == [(2, 3, 6), (1, 6, 6)]
+
+
+@pytest.mark.parametrize(
+    ("training_set", "actors", "games"),
+    [(1, 2, 4), (4, 2, 4), (8, 3, 8), ("compositions", 2, 43), ("compositions", 16, 6), ("compositions", 40, 4)],
+)
+def test_every_actor_has_every_task_unless_there_are_many(training_set, actors, games):
+    """Defend the Center has 86 compositions."""
+    run = RunConfig(name="x", training_set=training_set, actors=ActorsConfig(num_actors=actors))
+    assert run.games_per_actor == games
 
 
 def test_derived_numbers_are_saved_explicitly():
