@@ -1,5 +1,6 @@
 """What a person sees while a run goes on: a live panel on a terminal, plain lines elsewhere."""
 
+import math
 import sys
 import time
 from collections.abc import Mapping
@@ -12,8 +13,12 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from gvz.tasks import parse_task
+
 PLAIN_PERIOD_S = 10.0
 """seconds between lines when the output is not a terminal"""
+MAX_TASK_ROWS = 24
+"""with more tasks than that, the tasks of a level are shown together"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -57,6 +62,23 @@ def format_duration(seconds: float | None) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes:02d}:{rest:02d}"
 
 
+def _rows(status: Status) -> tuple[TaskStatus, ...]:
+    """The tasks; if there are many, the levels of each scenario, with the mean score in percent of the bound."""
+    if len(status.tasks) <= MAX_TASK_ROWS:
+        return status.tasks
+    levels: dict[str, list[TaskStatus]] = {}
+    for one in status.tasks:
+        task = parse_task(one.task)
+        levels.setdefault(f"{task.scenario.id}/level {task.level}", []).append(one)
+    return tuple(_together(f"{level} ({len(tasks)} tasks)", tasks) for level, tasks in levels.items())
+
+
+def _together(name: str, tasks: list[TaskStatus]) -> TaskStatus:
+    percents = [100 * task.score / task.upper_bound for task in tasks if task.episodes]
+    mean = sum(percents) / len(percents) if percents else math.nan
+    return TaskStatus(task=name, episodes=sum(task.episodes for task in tasks), score=mean, upper_bound=100.0)
+
+
 def _short_score(task: TaskStatus) -> str:
     return f"{task.score:.0f}/{task.upper_bound:.0f}" if task.episodes else "-"
 
@@ -86,7 +108,7 @@ def _figures(status: Status) -> tuple[str, ...]:
 
 def plain_line(status: Status) -> str:
     """One line with everything of a status."""
-    scores = "  ".join(f"{_short_name(t, status)} {_short_score(t)}" for t in status.tasks)
+    scores = "  ".join(f"{_short_name(t, status)} {_short_score(t)}" for t in _rows(status))
     return (
         f"{status.phase}  update {status.num_updates:,}/{status.total_updates:,}  eta {format_duration(status.eta_s)}  "
         f"{'  '.join(_figures(status))}  {scores}"
@@ -108,7 +130,7 @@ def panel(status: Status, width: int) -> Group:
     tasks.add_column("episodes", justify="right")
     tasks.add_column("recent score", justify="right")
     tasks.add_column("% of bound", justify="right")
-    for t in status.tasks:
+    for t in _rows(status):
         percent = f"{100 * t.score / t.upper_bound:.1f}" if t.episodes else "-"
         tasks.add_row(_short_name(t, status), f"{t.episodes:,}", _short_score(t), percent)
     num_restarts = int(status.row["actors/restarts"])

@@ -1,12 +1,15 @@
 """What a person sees: every number on the panel and in the plain line, on a terminal and off it."""
 
+import dataclasses
 import io
+import math
 import time
 
 import pytest
 from rich.console import Console
 
 from gvz.run.progress import PLAIN_PERIOD_S, Progress, Status, TaskStatus, format_duration, plain_line
+from gvz.tasks import named_tasks
 
 STATUS = Status(
     phase="training",
@@ -36,6 +39,25 @@ def test_the_plain_line_has_every_number():
     assert all(part in line for part in PARTS)
     assert "default -" in line
     assert "nan" not in line
+
+
+def test_many_tasks_are_shown_by_level():
+    ids = [task.id for task in named_tasks("defend_the_center", split="compositions")]
+    played = {
+        "defend_the_center/default": 110.0,
+        "defend_the_center/gore": 550.0,
+        "defend_the_center/fast_enemies": 275.0,
+    }
+    tasks = tuple(
+        TaskStatus(task=name, episodes=int(name in played), score=played.get(name, math.nan), upper_bound=1100.0)
+        for name in ids
+    )
+    line = plain_line(dataclasses.replace(STATUS, tasks=tasks))
+    # (50 + 25) / 2 percent; levels without an episode have no score
+    assert line.endswith(
+        "level 0 (1 tasks) 10/100  level 1 (7 tasks) 38/100  level 2 (14 tasks) -  "
+        "level 3 (27 tasks) -  level 4 (37 tasks) -"
+    )
 
 
 def test_off_a_terminal_lines_are_printed_rarely(monkeypatch):
