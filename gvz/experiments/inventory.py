@@ -112,11 +112,12 @@ def last_processor_s(directory: Path) -> float:
 
 
 def _last_number(directory: Path, field: str, kind: type[Number]) -> Number:
-    for line in reversed(records.last_lines(directory / "metrics.jsonl")):
-        try:
-            return kind(json.loads(line)[field])
-        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):  # half-written, or no row of ours
-            continue
+    for num_bytes in (records.TAIL_BYTES, 2 * records.MAX_LINE_LENGTH):  # a row with many tasks is long
+        for line in reversed(records.last_lines(directory / "metrics.jsonl", num_bytes)):
+            try:
+                return kind(json.loads(line)[field])
+            except (ValueError, KeyError, TypeError, OverflowError, RecursionError):  # half-written, or no row of ours
+                continue
     return kind()
 
 

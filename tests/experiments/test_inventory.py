@@ -88,6 +88,13 @@ def test_a_run_with_a_limit_of_processor_time_is_trained_when_its_last_row_has_i
     assert found(300, 20.0).trained, "it had all its gradient steps before"
 
 
+def test_the_newest_row_of_metrics_is_found_however_many_tasks_it_has(tmp_path):
+    tasks = {f"replay/share/seek_and_kill/task_{number}": 1 / 3_000 for number in range(3_000)}
+    rows = [{"num_updates": updates, **tasks, progress.PROCESSOR_S: updates / 2} for updates in (100, 200)]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows) + '{"num_updates": 3')
+    assert (progress.last_update(tmp_path), progress.last_processor_s(tmp_path)) == (200, 100.0)
+
+
 def test_episodes_of_another_base_seed_do_not_count(tmp_path):
     directory = save_policies(tmp_path, 100, 200, 300)
     (directory / "evaluation.jsonl").write_text(row("a", 0, num_updates=100, base_seed=7))
