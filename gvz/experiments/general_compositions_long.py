@@ -1,0 +1,14 @@
+"""The experiment `general_compositions` with three times the time."""
+
+import dataclasses
+
+from gvz.experiments.general_compositions import EXPERIMENT as SHORT
+
+EXPERIMENT = dataclasses.replace(
+    SHORT,
+    name="general_compositions_long",
+    title="Generalization when attributes come together in training, within 45 minutes of one core",
+    question="What do three times the time of general_compositions give?",
+    max_processor_s=2_700.0,
+)
+"""Runs of `general_compositions` go on from where they ended, if they are in the same results directory."""
