@@ -264,3 +264,35 @@ def test_the_findings_say_what_a_longer_horizon_gave_in_health_gathering():
     assert f"instead of {score('near', 'poison+stimpacks')}, and `poison` {score('far', 'poison')} instead of" in page
     assert f"instead of {score('near', 'poison')}. `supreme` has {score('far', 'supreme')} instead of" in page
     assert f"instead of {score('near', 'supreme')}." in page
+
+
+def test_the_findings_say_what_compositions_of_attributes_gave():
+    text = (ROOT / "docs" / "FINDINGS.md").read_text()
+    page = " ".join(text.split())
+    folders = {"8 tasks": "general_short", "compositions": "general_compositions"}
+    scores = {
+        (name, called): agent_scores(results_of(folder).episodes.filter(scenario=name), "rainbow_segmented")
+        for name in scenarios()
+        for called, folder in folders.items()
+    }
+    splits: tuple[TaskSet, ...] = ("train8", "gate", "test")
+
+    def sets(name: str) -> list[list[str]]:
+        return [*([task.id for task in named_tasks(name, split=split)] for split in splits), [f"{name}/complete"]]
+
+    for (name, called), of_agent in scores.items():
+        cells = [estimate(of_agent, tasks).text for tasks in sets(name)]
+        assert f"| {scenario_named(name).title} | {called} | {' | '.join(cells)} |" in page
+    for called in folders:
+        groups = [[(scores[name, called], sets(name)[column]) for name in scenarios()] for column in range(4)]
+        assert f"| mean | {called} | {' | '.join(estimate_groups(group, mean).text for group in groups)} |" in page
+    gains = [
+        estimate_groups([(scores[name, called], sets(name)[1]) for called in reversed(folders)], difference).text
+        for name in scenarios()
+    ]
+    assert f"[compositions of attributes](#{ANCHOR}) as tasks, too, beside segmented frames | {' | '.join(gains)} |" in page
+    last = {name: [] for name in scenarios()}
+    for name, steps in last.items():
+        for file in sorted((ROOT / "results/general_compositions/runs/rainbow_segmented").glob(f"{name}/*/*/metrics*")):
+            steps.append(json.loads(gzip.decompress(file.read_bytes()).splitlines()[-1])["num_updates"])
+    assert len(set(map(len, last.values()))) == 1
