@@ -3,13 +3,16 @@
 import gzip
 import itertools
 import json
+from pathlib import Path
 
 import numpy as np
 
-from gvz.evaluation.statistics import difference
+from gvz.evaluation.episode_log import read_rows
+from gvz.evaluation.statistics import difference, mean_over_scenarios
+from gvz.evaluation.zoo import run_directory
 from gvz.reports.experiment_section import comparison_table
 from gvz.reports.scores import agent_scores, estimate, estimate_groups
-from gvz.tasks import TaskSet, named_tasks, scenario_named, scenarios
+from gvz.tasks import TaskSet, named_tasks, parse_task, scenario_named, scenarios
 from tests.test_results import ROOT, results_of
 
 
@@ -267,8 +270,7 @@ def test_the_findings_say_what_a_longer_horizon_gave_in_health_gathering():
 
 
 def test_the_findings_say_what_compositions_of_attributes_gave():
-    text = (ROOT / "docs" / "FINDINGS.md").read_text()
-    page = " ".join(text.split())
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     folders = {"8 tasks": "general_short", "compositions": "general_compositions"}
     scores = {
         (name, called): agent_scores(results_of(folder).episodes.filter(scenario=name), "rainbow_segmented")
@@ -278,6 +280,7 @@ def test_the_findings_say_what_compositions_of_attributes_gave():
     splits: tuple[TaskSet, ...] = ("train8", "gate", "test")
 
     def sets(name: str) -> list[list[str]]:
+        """The training, gate and test tasks, and that of level 4."""
         return [*([task.id for task in named_tasks(name, split=split)] for split in splits), [f"{name}/complete"]]
 
     for (name, called), of_agent in scores.items():
@@ -285,14 +288,40 @@ def test_the_findings_say_what_compositions_of_attributes_gave():
         assert f"| {scenario_named(name).title} | {called} | {' | '.join(cells)} |" in page
     for called in folders:
         groups = [[(scores[name, called], sets(name)[column]) for name in scenarios()] for column in range(4)]
-        assert f"| mean | {called} | {' | '.join(estimate_groups(group, mean).text for group in groups)} |" in page
-    gains = [
-        estimate_groups([(scores[name, called], sets(name)[1]) for called in reversed(folders)], difference).text
-        for name in scenarios()
-    ]
-    assert f"[compositions of attributes](#{ANCHOR}) as tasks, too, beside segmented frames | {' | '.join(gains)} |" in page
-    last = {name: [] for name in scenarios()}
-    for name, steps in last.items():
-        for file in sorted((ROOT / "results/general_compositions/runs/rainbow_segmented").glob(f"{name}/*/*/metrics*")):
-            steps.append(json.loads(gzip.decompress(file.read_bytes()).splitlines()[-1])["num_updates"])
-    assert len(set(map(len, last.values()))) == 1
+        cells = [estimate_groups(group, mean_over_scenarios).text for group in groups]
+        assert f"| mean | {called} | {' | '.join(cells)} |" in page
+
+    def gains(column: int) -> list[str]:
+        pairs = [[(scores[name, called], sets(name)[column]) for called in reversed(folders)] for name in scenarios()]
+        return [estimate_groups(pair, difference).text for pair in pairs]
+
+    groups = [(scores[name, "compositions"], [f"{name}/complete"]) for name in scenarios()]
+    assert f"has {estimate_groups(groups, mean_over_scenarios).text} there. **Policies of such agents" in page
+    gate, hardest = gains(1), gains(3)
+    assert f"as tasks, too, beside segmented frames | {' | '.join(gate)} | no: `--training-set compositions` |" in page
+    assert f"level 4 gains {hardest[0]} points**, though the run" in page
+    assert f"The gate tasks show {gate[0]}." in page
+    assert f"the gate tasks lose**: {gate[2]} and {gate[3]}. On level 4 no gain is shown: {hardest[2]} and" in page
+    assert f"is shown: {hardest[2]} and {hardest[3]}." in page
+
+
+def test_the_findings_say_what_trained_agents_have_on_level_4_without_one_attribute():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    lines = gzip.decompress((ROOT / "results" / "zoo" / "without_one_attribute.jsonl.gz").read_bytes()).splitlines()
+    played: dict[str, list[float]] = {}
+    for row in map(json.loads, lines):
+        played.setdefault(row["task"], []).append(row["normalized_score"])
+    assert {len(found) for found in played.values()} == {15}
+    for name, scenario in scenarios().items():
+        missing: dict[str, float] = {}
+        for attribute in scenario.complete:
+            rest = "+".join(other for other in scenario.complete if other != attribute)
+            missing[attribute] = float(np.mean(played.pop(parse_task(f"{name}/{rest}").id)))
+        cells = ", ".join(
+            f"`{one}` {missing[one]:.0f}" for one in sorted(missing, key=missing.__getitem__, reverse=True)
+        )
+        of_zoo = read_rows(run_directory(Path(f"zoo:{name}")) / "evaluation.jsonl")
+        whole = [row["normalized_score"] for row in of_zoo if row["task"] == f"{name}/complete"]
+        assert len(whole) == 100
+        assert f"| {scenario.title} | {np.mean(whole):.0f} | {cells} |" in page
+    assert not played
