@@ -136,7 +136,13 @@ def test_the_hour_of_the_main_job_says_what_its_records_give():
 
 @pytest.mark.parametrize(
     ("folder", "split", "num_episodes"),
-    [("general_short", None, 50), ("general_compositions", None, 50), ("general", None, 100), ("gates", "gate", 20)],
+    [
+        ("general_short", None, 50),
+        ("general_compositions", None, 50),
+        ("general_compositions_long", None, 50),
+        ("general", None, 100),
+        ("gates", "gate", 20),
+    ],
 )
 def test_every_run_has_all_episodes_of_its_evaluation(folder: str, split: TaskSet | None, num_episodes: int):
     files = list((ROOT / "results" / folder).glob("runs/**/evaluation.jsonl.gz"))
