@@ -193,13 +193,19 @@ def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     summary = page.partition("## In short")[2].partition("\n## ")[0]
     named = set(re.findall(r"-?\d+\.\d \[-?\d+\.\d, -?\d+\.\d\]", summary))
-    results, episodes = results_of("gates"), results_of("general_short").episodes
+    results, episodes, composed = (
+        results_of("gates"),
+        results_of("general_short").episodes,
+        results_of("general_compositions").episodes,
+    )
     gains = {row[2].text for gate in results.asked for row in comparison_table(results, gate).rows}
-    of_segmented = []
+    of_segmented, of_compositions = [], set[str]()
     for name in scenarios():
         tasks, mine = [task.id for task in named_tasks(name, split="gate")], episodes.filter(scenario=name)
         agents = [agent_scores(mine, agent) for agent in ("rainbow_segmented", "rainbow_general (8 tasks)")]
         of_segmented.append(estimate_groups([(scores, tasks) for scores in agents], difference).text)
+        others = agent_scores(composed.filter(scenario=name), "rainbow_segmented")
+        of_compositions.add(estimate_groups([(scores, tasks) for scores in (others, agents[0])], difference).text)
     tasks, mine = (
         [task.id for task in named_tasks("seek_and_kill", split="gate")],
         episodes.filter(scenario="seek_and_kill"),
@@ -207,7 +213,7 @@ def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
     agents = [agent_scores(mine, agent) for agent in ("rainbow_segmented+longer_network", "rainbow_segmented")]
     of_network = estimate_groups([(scores, tasks) for scores in agents], difference).text
     assert len(named) > 10
-    assert named <= gains | {*of_segmented, of_network}
+    assert named <= gains | {*of_segmented, of_network} | of_compositions
     assert f"game variables | {' | '.join(of_segmented)} | no: `rainbow_segmented` |" in summary
 
 
