@@ -70,10 +70,11 @@ def _rows(status: Status) -> tuple[TaskStatus, ...]:
     for one in status.tasks:
         task = parse_task(one.task)
         levels.setdefault(f"{task.scenario.id}/level {task.level}", []).append(one)
-    return tuple(_together(f"{level} ({len(tasks)} tasks)", tasks) for level, tasks in levels.items())
+    return tuple(_together(level, tasks) for level, tasks in levels.items())
 
 
-def _together(name: str, tasks: list[TaskStatus]) -> TaskStatus:
+def _together(level: str, tasks: list[TaskStatus]) -> TaskStatus:
+    name = f"{level} ({len(tasks)} {'task' if len(tasks) == 1 else 'tasks'})"
     percents = [100 * task.score / task.upper_bound for task in tasks if task.episodes]
     mean = sum(percents) / len(percents) if percents else math.nan
     return TaskStatus(task=name, episodes=sum(task.episodes for task in tasks), score=mean, upper_bound=100.0)

@@ -55,7 +55,7 @@ def test_many_tasks_are_shown_by_level():
     line = plain_line(dataclasses.replace(STATUS, tasks=tasks))
     # (50 + 25) / 2 percent; levels without an episode have no score
     assert line.endswith(
-        "level 0 (1 tasks) 10/100  level 1 (7 tasks) 38/100  level 2 (14 tasks) -  "
+        "level 0 (1 task) 10/100  level 1 (7 tasks) 38/100  level 2 (14 tasks) -  "
         "level 3 (27 tasks) -  level 4 (37 tasks) -"
     )
 
