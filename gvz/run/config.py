@@ -29,7 +29,7 @@ from learner.config import (
 MIN_CLUSTER_SLOTS = 128
 """step records that a game has room for in the replay of a run with actor hosts"""
 _FEW_TASKS = 16
-"""with so many tasks at most, every actor has a game of every task (actors.games_per_actor)"""
+"""Up to this number of tasks, every actor has a game of each task. With more, the actors share the tasks."""
 _SPLITS: dict[int | str, TrainingSet] = {
     1: "train1",
     4: "train4",
@@ -264,9 +264,10 @@ class RunConfig:
         """Games of one actor process; in sync mode all games of the run."""
         num_tasks, games = len(self.table), self.actors.games_per_actor
         actors = self.actors_per_host * max(1, self.cluster.hosts)
-        if games is None:
-            share = num_tasks * math.ceil(4 / num_tasks) if num_tasks <= _FEW_TASKS else math.ceil(num_tasks / actors)
-            games = max(4, share)
+        if games is None and num_tasks > _FEW_TASKS:
+            games = max(4, math.ceil(num_tasks / actors))
+        elif games is None:
+            games = num_tasks * math.ceil(4 / num_tasks)
         if games * actors < num_tasks and self.curriculum.kind == "fixed":
             raise ConfigError(
                 f"actors.games_per_actor: got {games} games for each of {actors} actors, but there are {num_tasks} "
