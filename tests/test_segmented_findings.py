@@ -13,6 +13,7 @@ from gvz.evaluation.zoo import run_directory
 from gvz.reports.experiment_section import comparison_table
 from gvz.reports.scores import agent_scores, estimate, estimate_groups
 from gvz.tasks import TaskSet, named_tasks, parse_task, scenario_named, scenarios
+from tests.score_tables import score_cells, task_sets
 from tests.test_results import ROOT, results_of
 
 
@@ -163,9 +164,7 @@ def test_the_findings_say_what_six_times_the_time_gave():
             if name in ("dodge_projectiles", "health_gathering") and agent != "rainbow_segmented":
                 continue  # not run
             scores = agent_scores(episodes.filter(scenario=name), agent)
-            sets = [named_tasks(name, split=split) for split in ("train8", "gate", "test")]
-            cells = [estimate(scores, [t.id for t in tasks]).text for tasks in (*sets, named_tasks(name, level=4))]
-            assert f"| {scenario_named(name).title} | {called} | {seconds} | {' | '.join(cells)} |" in page
+            assert f"| {scenario_named(name).title} | {called} | {seconds} | {score_cells(scores, name)} |" in page
 
 
 def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
@@ -245,11 +244,10 @@ def test_the_findings_say_what_agents_have_whose_network_learned_longer():
             ("general_short", "rainbow_segmented+longer_network"),
         )
     )
-    sets = [[task.id for task in named_tasks(name, split=split)] for split in ("train8", "gate", "test")]
     for called, scores in (("the network that is used", used), ("the one that learned longer", longer)):
-        cells = [estimate(scores, tasks).text for tasks in (*sets, [f"{name}/complete"])]
-        assert f"| {called} | {' | '.join(cells)} |" in page
-    gain = estimate_groups([(scores, sets[1]) for scores in (longer, used)], difference).text
+        assert f"| {called} | {score_cells(scores, name)} |" in page
+    _, gate_tasks, *_ = task_sets(name)
+    gain = estimate_groups([(scores, gate_tasks) for scores in (longer, used)], difference).text
     assert f"The difference on the gate tasks is {gain} points." in page
     assert f"beside segmented frames | | | | {gain} | no |" in page
 
@@ -277,26 +275,20 @@ def test_the_findings_say_what_compositions_of_attributes_gave():
         for name in scenarios()
         for called, folder in folders.items()
     }
-    splits: tuple[TaskSet, ...] = ("train8", "gate", "test")
-
-    def sets(name: str) -> list[list[str]]:
-        """The training, gate and test tasks, and that of level 4."""
-        return [*([task.id for task in named_tasks(name, split=split)] for split in splits), [f"{name}/complete"]]
-
     for (name, called), of_agent in scores.items():
-        cells = [estimate(of_agent, tasks).text for tasks in sets(name)]
-        assert f"| {scenario_named(name).title} | {called} | {' | '.join(cells)} |" in page
+        assert f"| {scenario_named(name).title} | {called} | {score_cells(of_agent, name)} |" in page
     for called in folders:
-        groups = [[(scores[name, called], sets(name)[column]) for name in scenarios()] for column in range(4)]
-        cells = [estimate_groups(group, mean_over_scenarios).text for group in groups]
-        assert f"| mean | {called} | {' | '.join(cells)} |" in page
+        groups = [[(scores[name, called], task_sets(name)[column]) for name in scenarios()] for column in range(4)]
+        *cells, on_level_4 = (estimate_groups(group, mean_over_scenarios).text for group in groups)
+        assert f"| mean | {called} | {' | '.join(cells)} | {on_level_4} |" in page
+    assert f"has {on_level_4} there after the same time" in page
 
     def gains(column: int) -> list[str]:
-        pairs = [[(scores[name, called], sets(name)[column]) for called in reversed(folders)] for name in scenarios()]
+        pairs = [
+            [(scores[name, called], task_sets(name)[column]) for called in reversed(folders)] for name in scenarios()
+        ]
         return [estimate_groups(pair, difference).text for pair in pairs]
 
-    groups = [(scores[name, "compositions"], [f"{name}/complete"]) for name in scenarios()]
-    assert f"has {estimate_groups(groups, mean_over_scenarios).text} there after the same time" in page
     gate, hardest = gains(1), gains(3)
     where = "no; level 4 gains with time: `--training-set compositions`"
     assert f"as tasks, too, beside segmented frames | {' | '.join(gate)} | {where} |" in page
@@ -304,6 +296,9 @@ def test_the_findings_say_what_compositions_of_attributes_gave():
     assert f"The gate tasks show {gate[0]}." in page
     assert f"the gate tasks lose**: {gate[2]} and {gate[3]}. On level 4 no gain is shown: {hardest[2]} and" in page
     assert f"is shown: {hardest[2]} and {hardest[3]}." in page
+    hard = results_of("general_compositions").episodes.filter(task="seek_and_kill/complete")
+    found = [hard.filter(run_seed=seed)["normalized_score"].mean() for seed in (1111, 2222)]
+    assert "have {:.1f} and {:.1f} on `complete`.".format(*found) in page
 
 
 def test_the_findings_say_what_compositions_gave_with_more_time():
@@ -313,27 +308,37 @@ def test_the_findings_say_what_compositions_gave_with_more_time():
         ("compositions", "2,700 s", "general_compositions_long"),
         ("8 tasks", "5,400 s", "general"),
     )
-    splits: tuple[TaskSet, ...] = ("train8", "gate", "test")
-    for name in ("defend_the_center", "seek_and_kill"):
-        sets = [*([task.id for task in named_tasks(name, split=split)] for split in splits), [f"{name}/complete"]]
+    longest = dict.fromkeys(scenarios(), "general_compositions_long") | {"dodge_projectiles": "general_compositions"}
+    of_agents = {
+        name: agent_scores(results_of(folder).episodes.filter(scenario=name), "rainbow_segmented")
+        for name, folder in longest.items()
+    }
+    for name in scenarios():
+        if name == "dodge_projectiles":
+            continue  # not run
         for called, seconds, folder in rows:
             episodes = results_of(folder).episodes.filter(scenario=name, run_seed=1111)
-            cells = [estimate(agent_scores(episodes, "rainbow_segmented"), tasks).text for tasks in sets]
-            assert f"| {scenario_named(name).title} | {called} | {seconds} | {' | '.join(cells)} |" in page
-    longest = {"defend_the_center": "general_compositions_long", "seek_and_kill": "general_compositions_long"}
-    newest = [
-        results_of(longest.get(name, "general_compositions")).episodes.filter(scenario=name) for name in scenarios()
-    ]
-    of_agents = [agent_scores(episodes, "rainbow_segmented") for episodes in newest]
-    for words, tasks_of in (
-        ("78.6 on the test tasks", lambda name: [task.id for task in named_tasks(name, split="test")]),
-        ("50.9 on level 4", lambda name: [f"{name}/complete"]),
+            cells = score_cells(agent_scores(episodes, "rainbow_segmented"), name)
+            assert f"| {scenario_named(name).title} | {called} | {seconds} | {cells} |" in page
+    groups = [[(of_agents[name], task_sets(name)[column]) for name in scenarios()] for column in (2, 3)]
+    test, hardest = (estimate_groups(group, mean_over_scenarios).text.partition(" ")[0] for group in groups)
+    assert f"the mean over the scenarios is {test} on the test tasks and {hardest} on level 4." in page
+
+
+def test_the_findings_say_how_long_agents_of_compositions_learned():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+
+    def last_steps(folder: str) -> list[int]:
+        files = (ROOT / "results" / folder / "runs" / "rainbow_segmented").glob("**/metrics.jsonl.gz")
+        rows = [json.loads(gzip.decompress(file.read_bytes()).splitlines()[-1]) for file in files]
+        return sorted(row["num_updates"] for row in rows)
+
+    for folder, words in (
+        ("general_compositions", "{:,} to {:,} gradient steps (eight tasks: 16,900 to 19,700)"),
+        ("general_compositions_long", "{:,} to {:,} gradient steps ([records](../results/general_compositions_long"),
     ):
-        groups = [(scores, tasks_of(name)) for scores, name in zip(of_agents, scenarios(), strict=True)]
-        mean = estimate_groups(groups, mean_over_scenarios).estimate
-        assert mean is not None
-        assert words.startswith(f"{mean.value:.1f} ")
-        assert words in page
+        steps = last_steps(folder)
+        assert words.format(steps[0], steps[-1]) in page
 
 
 def test_the_findings_say_what_trained_agents_have_on_level_4_without_one_attribute():
