@@ -46,6 +46,8 @@ class Zoo:
 
 
 COMMAND = Zoo
+_NAMED_TASKS = 8
+"""of those that a policy was trained on; of more, their number is said"""
 
 
 def _card(name: str) -> list[str]:
@@ -61,9 +63,11 @@ def _card(name: str) -> list[str]:
     rows, _ = records.read_stored(directory / "evaluation.jsonl")
     metrics, _ = records.read_stored(directory / "metrics.jsonl")
     spent = f", {metrics[-1]['run/processor_s']:,.0f} s of processor time" if metrics else ""
+    trained_on, others = ", ".join(config.table.ids[:_NAMED_TASKS]), len(config.table.ids[_NAMED_TASKS:])
+    more = f" and {others} more tasks" if others else ""
     head = (
-        f"{PREFIX}{name}: {config.name}, seed {config.seed}, {num_updates:,} updates{spent}, trained on "
-        f"{', '.join(config.table.ids)}"
+        f"{PREFIX}{name}: {config.name}, seed {config.seed}, {num_updates:,} updates{spent}, "
+        f"trained on {trained_on}{more}"
     )
     tasks = TaskSelection(split="test").of_run([scenario.id for scenario in config.table.scenarios])
     found = score_rows(rows, {}, tasks, episodes=10**9)

@@ -65,7 +65,7 @@ def test_a_packed_policy_has_the_network_of_its_segmented_frames(tmp_path):
     assert trained_player(packed, found, 20).identity != identity, "these would be episodes of another player"
 
 
-@pytest.mark.parametrize(("record", "most"), [("metrics.jsonl", 200), ("episodes.jsonl", 4_000)])
+@pytest.mark.parametrize(("record", "most"), [("metrics.jsonl", 100), ("episodes.jsonl", 4_000)])
 @pytest.mark.parametrize(("times", "more"), [(0, 0), (0, 3), (1, 1), (5, 1)])
 def test_a_packed_policy_has_few_rows_of_training_and_the_last_one(run, record, most, times, more):
     num_rows = times * most + more
