@@ -11,7 +11,7 @@ from gvz.evaluation.episode_log import read_rows
 from gvz.evaluation.statistics import difference, mean_over_scenarios
 from gvz.evaluation.zoo import run_directory
 from gvz.reports.experiment_section import comparison_table
-from gvz.reports.scores import agent_scores, estimate, estimate_groups
+from gvz.reports.scores import Scores, agent_scores, estimate, estimate_groups
 from gvz.tasks import TaskSet, named_tasks, parse_task, scenario_named, scenarios
 from tests.score_tables import score_cells, task_sets
 from tests.test_results import ROOT, results_of
@@ -303,26 +303,59 @@ def test_the_findings_say_what_compositions_of_attributes_gave():
 
 def test_the_findings_say_what_compositions_gave_with_more_time():
     page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
-    rows = (
+    short, longer, eight = rows = (
         ("compositions", "900 s", "general_compositions"),
         ("compositions", "2,700 s", "general_compositions_long"),
         ("8 tasks", "5,400 s", "general"),
     )
-    longest = dict.fromkeys(scenarios(), "general_compositions_long") | {"dodge_projectiles": "general_compositions"}
-    of_agents = {
-        name: agent_scores(results_of(folder).episodes.filter(scenario=name), "rainbow_segmented")
-        for name, folder in longest.items()
+    of_seed = {
+        (name, row): agent_scores(results_of(row[2]).episodes.filter(scenario=name, run_seed=1111), "rainbow_segmented")
+        for name in scenarios()
+        for row in rows
     }
-    for name in scenarios():
-        if name == "dodge_projectiles":
-            continue  # not run
-        for called, seconds, folder in rows:
-            episodes = results_of(folder).episodes.filter(scenario=name, run_seed=1111)
-            cells = score_cells(agent_scores(episodes, "rainbow_segmented"), name)
-            assert f"| {scenario_named(name).title} | {called} | {seconds} | {cells} |" in page
-    groups = [[(of_agents[name], task_sets(name)[column]) for name in scenarios()] for column in (2, 3)]
-    test, hardest = (estimate_groups(group, mean_over_scenarios).text.partition(" ")[0] for group in groups)
-    assert f"the mean over the scenarios is {test} on the test tasks and {hardest} on level 4." in page
+    for (name, (called, seconds, _)), of_agent in of_seed.items():
+        cells = score_cells(of_agent, name)
+        assert f"| {scenario_named(name).title} | {called} | {seconds} | {cells} |" in page
+    for row in rows:
+        *cells, on_level_4 = _means({name: of_seed[name, row] for name in scenarios()})
+        assert f"| mean | {row[0]} | {row[1]} | {' | '.join(cells)} | {on_level_4} |" in page
+        if row == longer:
+            assert f"mean of the scenarios level 4 has {on_level_4}.**" in page
+            assert f"and {on_level_4} after three times the time, with one seed." in page
+
+    def gains(column: int, of: tuple[str, str, str]) -> str:
+        def mean(name: str, row: tuple[str, str, str]) -> float:
+            return float(estimate(of_seed[name, row], task_sets(name)[column]).text.split()[0])
+
+        *most, last = (f"{mean(name, longer) - mean(name, of):.1f}" for name in scenarios())
+        return f"{', '.join(most)} and {last}"
+
+    assert f"the test tasks gain {gains(2, short)} points" in page
+    assert f"and level 4 gains {gains(3, short)}." in page
+    assert f"had twice the time**: by {gains(2, eight)} points." in page
+    assert f"above them by {gains(3, eight)} points." in page
+    assert f"the differences are {gains(0, eight)} points. On the gate tasks they are {gains(1, eight)}." in page
+    in_short = gains(1, eight).replace(" and ", ", ").replace(", ", " | ")
+    assert f"against eight tasks with six times | {in_short} |" in page
+
+
+def test_the_findings_say_what_second_seeds_of_compositions_gave_with_more_time():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    episodes = results_of("general_compositions_long").episodes
+    second = episodes.filter(run_seed=2222)
+    for name in second["scenario"].unique():
+        of_agent = agent_scores(second.filter(scenario=name), "rainbow_segmented")
+        assert f"| {scenario_named(name).title} | {score_cells(of_agent, name)} |" in page
+    *_, on_test, on_level_4 = _means(
+        {name: agent_scores(episodes.filter(scenario=name), "rainbow_segmented") for name in scenarios()}
+    )
+    assert f"With the second seeds the mean is {on_level_4} on level 4 and {on_test} on the test tasks." in page
+
+
+def _means(of_agents: dict[str, Scores]) -> list[str]:
+    """Means over scenarios on each of `task_sets`."""
+    groups = [[(of_agents[name], task_sets(name)[column]) for name in scenarios()] for column in range(4)]
+    return [estimate_groups(group, mean_over_scenarios).text for group in groups]
 
 
 def test_the_findings_say_how_long_agents_of_compositions_learned():
