@@ -29,6 +29,7 @@ def main(owner_pid: int, directory: str, log: str, engine: str, arguments: list[
     os.setpgid(0, 0)  # the terminal's Ctrl-C is for the owner. No session: see gvz/transport/child.py
     os.chdir(directory)  # the engine writes _vizdoom/ here ...
     os.environ["HOME"] = directory  # ... and would look for its settings in the user's home
+    os.environ["ALSOFT_DRIVERS"] = "null"  # we play no sound, but OpenAL would leave /tmp/pulse-... of every engine
     start = Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]
     Path("instance.partial").write_text(f"{os.getpid()} {start} {instance_id}\n")
     Path("instance.partial").rename("instance")

@@ -157,6 +157,15 @@ def test_nothing_is_written_into_the_working_directory_or_home(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_nothing_but_our_records_is_written_into_the_temporary_directory(tmp_path: Path):
+    environment = {name: value for name, value in os.environ.items() if name != "XDG_RUNTIME_DIR"}  # as in a container
+    done = run("Engine(config).new_episode(1)", env={**environment, "TMPDIR": str(tmp_path)})
+    assert done.returncode == 0, done.stderr
+    [records] = tmp_path.iterdir()
+    assert records.name == f"gvizdoom-{os.getuid()}"
+    assert list(records.glob("*.json")) == []
+
+
 def test_home_and_working_directory_may_be_read_only():
     done = run("Engine(config).new_episode(1)", cwd="/proc", env={**os.environ, "HOME": "/proc"})
     assert done.returncode == 0, done.stderr
