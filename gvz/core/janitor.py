@@ -48,8 +48,9 @@ _ENGINE_SHM_PREFIXES = ("ViZDoomSM", *QUEUE_PREFIXES)
 _PR_SET_PDEATHSIG = 1
 _UNREADABLE = (OSError, ValueError, KeyError, TypeError, RecursionError)
 """what reading a damaged or forged record ends in"""
-_held: dict[Path, IO[str]] = {}
-"""the records of this process, locked"""
+_held: dict[Path, int] = {}
+"""descriptors of this process's records, locked. No file objects: Python closes these while it ends, when a thread of
+ViZDoom's client may still start an engine."""
 
 
 def runtime_dir() -> Path:
@@ -102,16 +103,17 @@ def record(directory: Path) -> None:
     while not (records.lock(file) and path.exists()):  # a janitor has taken the empty file for one of a dead owner
         file.close()
         file = _opened(path)
-    json.dump({"directory": str(directory), "owner_pid": os.getpid()}, file)
-    file.flush()
-    _held[directory] = file
+    with file:
+        json.dump({"directory": str(directory), "owner_pid": os.getpid()}, file)
+        file.flush()
+        _held[directory] = os.dup(file.fileno())  # shares the lock
 
 
 def forget(directory: Path) -> None:
     """Takes back this process's `record`; call it after the directory is gone. Unknown ones are ignored."""
     _record_path(directory).unlink(missing_ok=True)
     if directory in _held:
-        _held.pop(directory).close()
+        os.close(_held.pop(directory))
 
 
 def clean_dead_instances() -> list[str]:
@@ -183,6 +185,7 @@ def clean_engine(directory: Path) -> list[str]:
         if process_start(pid) == start and instance_id in _arguments(pid):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
+            wait_for_death(pid, start)  # until then, one that starts could still make its shared memory
             done.append(f"engine {instance_id} (pid {pid})")
         for prefix in _ENGINE_SHM_PREFIXES:
             done += _unlink_shm(prefix + instance_id)
@@ -266,6 +269,13 @@ def reap_killed(process: "subprocess.Popen[bytes]", who: str) -> None:
             f"waited {KILL_TIMEOUT_S:g} s for {who} (pid {process.pid}) to end after SIGKILL; it hangs in the kernel, "
             "which `ps -o pid,stat,wchan` shows"
         ) from error
+
+
+def wait_for_death(pid: int, start: int) -> None:
+    """Returns when a killed engine has ended, or when the kernel takes too long over it."""
+    deadline = time.monotonic() + KILL_TIMEOUT_S
+    while process_start(pid) == start and time.monotonic() < deadline:
+        time.sleep(0.001)
 
 
 def process_start(pid: int) -> int | None:

@@ -157,9 +157,7 @@ def end(game: Startable, directory: Path) -> None:
     instance = janitor.read_instance(directory)
     queues = [] if instance is None else queue_locks.mapped(instance[2])
     janitor.clean_engine(directory)
-    if instance is not None:
-        queue_locks.wait_for_death(*instance[:2])
-        queue_locks.free(queues)
+    queue_locks.free(queues)
     game.close()
     janitor.forget(directory)
 

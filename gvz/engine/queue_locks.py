@@ -10,7 +10,6 @@ import ctypes
 import mmap
 import struct
 import threading
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -43,10 +42,3 @@ def free(queues: Sequence[mmap.mmap]) -> None:
                 lock = ctypes.c_char.from_buffer(queue, _OFFSET)
                 ctypes.CDLL(None).pthread_mutex_unlock(ctypes.byref(lock))
                 del lock  # it would keep the mapping open
-
-
-def wait_for_death(pid: int, start: int) -> None:
-    """Returns when a killed engine has ended, or when the kernel takes too long over it."""
-    deadline = time.monotonic() + janitor.KILL_TIMEOUT_S
-    while janitor.process_start(pid) == start and time.monotonic() < deadline:
-        time.sleep(0.001)

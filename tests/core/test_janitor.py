@@ -52,7 +52,7 @@ def run_until_killed(code: str) -> str:
 
 def give_up(directory: Path) -> None:
     """Unlocks the record of a directory, as the end of its owner does."""
-    janitor._held.pop(directory).close()
+    os.close(janitor._held.pop(directory))
 
 
 def wait_until_gone(pid: int) -> bool:
@@ -119,6 +119,24 @@ def test_what_a_living_owner_has_is_left_alone(registry: Path, directory: Path):
     assert directory.exists()
     assert len(list(registry.glob("*.json"))) == 1
     janitor.forget(directory)
+
+
+def test_what_a_process_has_is_left_alone_while_its_interpreter_has_ended_and_its_threads_may_not(
+    registry: Path, directory: Path
+):
+    code = (
+        "import ctypes; from pathlib import Path; from gvz.core import janitor\n"
+        f"janitor.record(Path({str(directory)!r})); libc = ctypes.CDLL(None)\n"
+        "libc.__cxa_atexit(libc.pause, None, None); libc.__cxa_atexit(libc.puts, b'ended', None)\n"
+        "libc.setbuf(ctypes.c_void_p.in_dll(libc, 'stdout'), None)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as owner:
+        assert owner.stdout is not None
+        assert owner.stdout.readline() == "ended\n"
+        assert (janitor.dead_instances(), janitor.clean_dead_instances()) == ([], [])
+        owner.kill()
+    assert janitor.clean_dead_instances() == [f"directory {directory}"]
+    assert list(registry.iterdir()) == []
 
 
 def test_what_another_living_process_has_is_left_alone_until_it_ends(registry: Path, directory: Path):
