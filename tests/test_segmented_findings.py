@@ -361,16 +361,21 @@ def _means(of_agents: dict[str, Scores]) -> list[str]:
 def test_the_findings_say_how_long_agents_of_compositions_learned():
     page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
 
-    def last_steps(folder: str) -> list[int]:
-        files = (ROOT / "results" / folder / "runs" / "rainbow_segmented").glob("**/metrics.jsonl.gz")
+    def last_steps(folder: str, seed: str) -> list[int]:
+        files = (ROOT / "results" / folder / "runs" / "rainbow_segmented").glob(f"*/*/seed_{seed}/metrics.jsonl.gz")
         rows = [json.loads(gzip.decompress(file.read_bytes()).splitlines()[-1]) for file in files]
         return sorted(row["num_updates"] for row in rows)
 
-    for folder, words in (
-        ("general_compositions", "{:,} to {:,} gradient steps (eight tasks: 16,900 to 19,700)"),
-        ("general_compositions_long", "{:,} to {:,} gradient steps ([records](../results/general_compositions_long"),
+    for folder, seed, words in (
+        ("general_compositions", "*", "{:,} to {:,} gradient steps (eight tasks: 16,900 to 19,700)"),
+        (
+            "general_compositions_long",
+            "1111",
+            "{:,} to {:,} gradient steps ([records](../results/general_compositions_long",
+        ),
+        ("general_compositions_long", "2222", "2,700 seconds, with {:,} and {:,} gradient steps:"),
     ):
-        steps = last_steps(folder)
+        steps = last_steps(folder, seed)
         assert words.format(steps[0], steps[-1]) in page
 
 

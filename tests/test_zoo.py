@@ -54,7 +54,11 @@ def test_the_findings_say_what_the_agent_with_shifted_frames_has(tmp_path, monke
 
 @pytest.mark.parametrize(
     ("suffix", "said"),
-    [("", "have {}% of the bound on the 28 test tasks"), ("_screen", "the screen alone and have {}%")],
+    [
+        ("", "have {}% of the bound on the 28 test tasks"),
+        ("_compositions", "for 45 minutes of one core each, and have {}%"),
+        ("_screen", "the screen alone and have {}%"),
+    ],
 )
 def test_the_mean_over_scenarios_is_that_of_the_score_cards(suffix, said, tmp_path, monkeypatch):
     monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path))
