@@ -229,6 +229,24 @@ def test_the_findings_say_how_many_games_ran_at_once():
     assert "(16,900 to 19,700 gradient steps, 16 games at once)" in page
     assert games("general_short/runs/rainbow_general+sight_loss") == {8}
     assert "with a weight of 0.1. One seed with 8 games at once" in page
-    on_policy = [games(f"gates/runs/{name}/dodge_projectiles") for name in ("ppo_quick+plain", "pqn_quick+plain")]
-    assert [*on_policy, games("gates/runs/rainbow_quick+plain/dodge_projectiles")] == [{8}] * 3
+    on_policy = [games(f"gates/runs/{name}_quick+plain/*_*") for name in ("ppo", "pqn")]
+    rainbow = [games(f"gates/runs/rainbow_quick+plain/{name}") for name in ("dodge_projectiles", "health_gathering")]
+    assert [*on_policy, *rainbow] == [{8}] * 4
     assert "8 games at once; Rainbow on 2026-11-23, the others on 2026-11-26)" in page
+
+
+def test_the_findings_say_how_many_decisions_replay_and_on_policy_agents_took():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+
+    def decisions(agent: str, scenario: str) -> str:
+        files = list((ROOT / "results" / "gates" / "runs" / f"{agent}+plain" / scenario).rglob("metrics.jsonl.gz"))
+        taken = [json.loads(gzip.decompress(file.read_bytes()).splitlines()[-1])["actors/env_steps"] for file in files]
+        assert len(taken) == 2
+        return f"{round(sum(taken) / 2, -3):,.0f}"
+
+    pqn, ppo, rainbow = (
+        [decisions(f"{name}_quick", scenario) for scenario in ("dodge_projectiles", "health_gathering")]
+        for name in ("pqn", "ppo", "rainbow")
+    )
+    assert f"PQN took {pqn[0]} of them in Dodge Projectiles and {pqn[1]} in Health Gathering" in page
+    assert f"PPO {ppo[0]} and {ppo[1]}, Rainbow {rainbow[0]} and {rainbow[1]}." in page
