@@ -132,9 +132,10 @@ def test_what_a_process_has_is_left_alone_while_its_interpreter_has_ended_and_it
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as owner:
         assert owner.stdout is not None
-        assert owner.stdout.readline() == "ended\n"
-        assert (janitor.dead_instances(), janitor.clean_dead_instances()) == ([], [])
+        ended = owner.stdout.readline()
+        found = janitor.dead_instances(), janitor.clean_dead_instances()
         owner.kill()
+    assert (ended, found) == ("ended\n", ([], []))
     assert janitor.clean_dead_instances() == [f"directory {directory}"]
     assert list(registry.iterdir()) == []
 
