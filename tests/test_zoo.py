@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gvz import cli
 from gvz.evaluation.episode_log import read_rows
 from gvz.evaluation.trained import find_checkpoints, read_run_config, trained_player
 from gvz.evaluation.zoo import MAX_BYTES, ZOO_DIRECTORY, run_directory, zoo_names
@@ -41,6 +42,13 @@ def test_a_policy_is_small_readable_and_has_its_score_card(name, tmp_path, monke
     title = config.table.scenarios[0].title
     (line,) = [line for line in PAGE.read_text().splitlines() if line.startswith(f"| {title} | {num_updates:,} | ")]
     assert f"{np.mean(means):.1f} [" in line
+
+
+def test_the_list_counts_most_of_many_training_tasks(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path))
+    assert cli.main(["zoo"]) == 0
+    (head,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("zoo:health_gathering_comp")]
+    assert head.endswith("health_gathering/poison, health_gathering/shaded_kits and 83 more tasks")
 
 
 def test_the_findings_say_what_the_agent_with_shifted_frames_has(tmp_path, monkeypatch):

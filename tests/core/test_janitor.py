@@ -207,6 +207,18 @@ def test_a_process_without_the_instance_id_is_not_killed(directory: Path):
 
 
 @pytest.mark.usefixtures("registry")
+def test_an_engine_is_dead_before_its_shared_memory_is_removed(directory: Path, monkeypatch: pytest.MonkeyPatch):
+    with subprocess.Popen([sys.executable, "-c", "input()", "Abc123"], stdin=subprocess.PIPE) as engine:
+        found: list[int | None] = []
+        monkeypatch.setattr(janitor, "_unlink_shm", lambda _: found.append(janitor.process_start(engine.pid)) or [])
+        start = janitor.process_start(engine.pid)
+        (directory / janitor.INSTANCE_FILE).write_text(f"{engine.pid} {start} Abc123\n")
+        janitor.clean_engine(directory)
+        engine.kill()
+    assert found == [None] * 3
+
+
+@pytest.mark.usefixtures("registry")
 def test_an_instance_file_that_is_not_ours_is_reported(directory: Path):
     (directory / janitor.INSTANCE_FILE).write_text("1 2 ../../etc\n")
     janitor.record(directory)

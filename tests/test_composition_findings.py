@@ -1,0 +1,150 @@
+"""What the findings say of training on compositions of attributes is what its records give."""
+
+import gzip
+import json
+from pathlib import Path
+
+import numpy as np
+
+from gvz.evaluation.episode_log import read_rows
+from gvz.evaluation.statistics import difference, mean_over_scenarios
+from gvz.evaluation.zoo import run_directory
+from gvz.reports.scores import Scores, agent_scores, estimate, estimate_groups
+from gvz.tasks import parse_task, scenario_named, scenarios
+from tests.score_tables import score_cells, task_sets
+from tests.test_results import ROOT, results_of
+
+
+def _means(of_agents: dict[str, Scores]) -> list[str]:
+    """Means over scenarios on each of `task_sets`."""
+    groups = [[(of_agents[name], task_sets(name)[column]) for name in scenarios()] for column in range(4)]
+    return [estimate_groups(group, mean_over_scenarios).text for group in groups]
+
+
+def test_the_findings_say_what_compositions_of_attributes_gave():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    folders = {"8 tasks": "general_short", "compositions": "general_compositions"}
+    scores = {
+        (name, called): agent_scores(results_of(folder).episodes.filter(scenario=name), "rainbow_segmented")
+        for name in scenarios()
+        for called, folder in folders.items()
+    }
+    for (name, called), of_agent in scores.items():
+        assert f"| {scenario_named(name).title} | {called} | {score_cells(of_agent, name)} |" in page
+    for called in folders:
+        *cells, on_level_4 = _means({name: scores[name, called] for name in scenarios()})
+        assert f"| mean | {called} | {' | '.join(cells)} | {on_level_4} |" in page
+    assert f"has {on_level_4} there after the same time" in page
+
+    def gains(column: int) -> list[str]:
+        pairs = [
+            [(scores[name, called], task_sets(name)[column]) for called in reversed(folders)] for name in scenarios()
+        ]
+        return [estimate_groups(pair, difference).text for pair in pairs]
+
+    gate, hardest = gains(1), gains(3)
+    where = "no; level 4 gains with time: `--training-set compositions`"
+    assert f"as tasks, too, beside segmented frames | {' | '.join(gate)} | {where} |" in page
+    assert f"level 4 gains {hardest[0]} points**, though the run" in page
+    assert f"The gate tasks show {gate[0]}." in page
+    assert f"the gate tasks lose**: {gate[2]} and {gate[3]}. On level 4 no gain is shown: {hardest[2]} and" in page
+    assert f"is shown: {hardest[2]} and {hardest[3]}." in page
+    hard = results_of("general_compositions").episodes.filter(task="seek_and_kill/complete")
+    found = [hard.filter(run_seed=seed)["normalized_score"].mean() for seed in (1111, 2222)]
+    assert "have {:.1f} and {:.1f} on `complete`.".format(*found) in page
+
+
+def test_the_findings_say_what_compositions_gave_with_more_time():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    short, longer, eight = rows = (
+        ("compositions", "900 s", "general_compositions"),
+        ("compositions", "2,700 s", "general_compositions_long"),
+        ("8 tasks", "5,400 s", "general"),
+    )
+    of_seed = {
+        (name, row): agent_scores(results_of(row[2]).episodes.filter(scenario=name, run_seed=1111), "rainbow_segmented")
+        for name in scenarios()
+        for row in rows
+    }
+    for (name, (called, seconds, _)), of_agent in of_seed.items():
+        cells = score_cells(of_agent, name)
+        assert f"| {scenario_named(name).title} | {called} | {seconds} | {cells} |" in page
+    for row in rows:
+        *cells, on_level_4 = _means({name: of_seed[name, row] for name in scenarios()})
+        assert f"| mean | {row[0]} | {row[1]} | {' | '.join(cells)} | {on_level_4} |" in page
+        if row == longer:
+            assert f"mean of the scenarios level 4 has {on_level_4}.**" in page
+            assert f"and {on_level_4} after three times the time, with one seed." in page
+
+    def gains(column: int, of: tuple[str, str, str]) -> str:
+        def mean(name: str, row: tuple[str, str, str]) -> float:
+            return float(estimate(of_seed[name, row], task_sets(name)[column]).text.split()[0])
+
+        *most, last = (f"{mean(name, longer) - mean(name, of):.1f}" for name in scenarios())
+        return f"{', '.join(most)} and {last}"
+
+    assert f"the test tasks gain {gains(2, short)} points" in page
+    assert f"and level 4 gains {gains(3, short)}." in page
+    assert f"had twice the time**: by {gains(2, eight)} points." in page
+    assert f"above them by {gains(3, eight)} points." in page
+    assert f"the differences are {gains(0, eight)} points. On the gate tasks they are {gains(1, eight)}." in page
+    in_short = gains(1, eight).replace(" and ", ", ").replace(", ", " | ")
+    assert f"not eight tasks for 5,400 s | {in_short} |" in page
+
+
+def test_the_findings_say_what_second_seeds_of_compositions_gave_with_more_time():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    episodes = results_of("general_compositions_long").episodes
+    second = episodes.filter(run_seed=2222)
+    assert set(second["scenario"]) == {"defend_the_center", "seek_and_kill"}
+    for name in second["scenario"].unique():
+        of_agent = agent_scores(second.filter(scenario=name), "rainbow_segmented")
+        assert f"| {scenario_named(name).title} | {score_cells(of_agent, name)} |" in page
+    *_, on_test, on_level_4 = _means(
+        {name: agent_scores(episodes.filter(scenario=name), "rainbow_segmented") for name in scenarios()}
+    )
+    assert f"With the second seeds the mean is {on_level_4} on level 4 and {on_test} on the test tasks." in page
+
+
+def test_the_findings_say_how_long_agents_of_compositions_learned():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+
+    def last_steps(folder: str, seed: str) -> list[int]:
+        files = (ROOT / "results" / folder / "runs" / "rainbow_segmented").glob(f"*/*/seed_{seed}/metrics.jsonl.gz")
+        rows = [json.loads(gzip.decompress(file.read_bytes()).splitlines()[-1]) for file in files]
+        return sorted(row["num_updates"] for row in rows)
+
+    for folder, seed, words in (
+        ("general", "1111", "{:,} to {:,} gradient steps. All have seed 1111, with"),
+        ("general_compositions", "*", "{:,} to {:,} gradient steps (eight tasks: 16,900 to 19,700)"),
+        (
+            "general_compositions_long",
+            "1111",
+            "{:,} to {:,} gradient steps ([records](../results/general_compositions_long",
+        ),
+        ("general_compositions_long", "2222", "2,700 seconds, with {:,} and {:,} gradient steps:"),
+    ):
+        steps = last_steps(folder, seed)
+        assert words.format(steps[0], steps[-1]) in page
+
+
+def test_the_findings_say_what_trained_agents_have_on_level_4_without_one_attribute():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    lines = gzip.decompress((ROOT / "results" / "zoo" / "without_one_attribute.jsonl.gz").read_bytes()).splitlines()
+    played: dict[str, list[float]] = {}
+    for row in map(json.loads, lines):
+        played.setdefault(row["task"], []).append(row["normalized_score"])
+    assert {len(found) for found in played.values()} == {15}
+    for name, scenario in scenarios().items():
+        missing: dict[str, float] = {}
+        for attribute in scenario.complete:
+            rest = "+".join(other for other in scenario.complete if other != attribute)
+            missing[attribute] = float(np.mean(played.pop(parse_task(f"{name}/{rest}").id)))
+        cells = ", ".join(
+            f"`{one}` {missing[one]:.0f}" for one in sorted(missing, key=missing.__getitem__, reverse=True)
+        )
+        of_zoo = read_rows(run_directory(Path(f"zoo:{name}")) / "evaluation.jsonl")
+        whole = [row["normalized_score"] for row in of_zoo if row["task"] == f"{name}/complete"]
+        assert len(whole) == 100
+        assert f"| {scenario.title} | {np.mean(whole):.0f} | {cells} |" in page
+    assert not played
