@@ -208,7 +208,10 @@ def test_a_process_without_the_instance_id_is_not_killed(directory: Path):
 
 @pytest.mark.usefixtures("registry")
 def test_an_engine_is_dead_before_its_shared_memory_is_removed(directory: Path, monkeypatch: pytest.MonkeyPatch):
-    with subprocess.Popen([sys.executable, "-c", "input()", "Abc123"], stdin=subprocess.PIPE) as engine:
+    command = [sys.executable, "-c", "print(1, flush=True); input()", "Abc123"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as engine:
+        assert engine.stdout is not None
+        engine.stdout.readline()  # the kernel shows a process before its arguments
         found: list[int | None] = []
         monkeypatch.setattr(janitor, "_unlink_shm", lambda _: found.append(janitor.process_start(engine.pid)) or [])
         start = janitor.process_start(engine.pid)
