@@ -46,7 +46,7 @@ QUICK: dict[str, dict[str, Any]] = {
         "noisy": "off",
     },
     "replay": {"capacity": 2_000},
-    "learner": {"warmup_steps": 100, "batch_size": 8},
+    "learner": {"warmup_steps": 100, "batch_size": 8, "env_steps_per_update": 1.0},
     "actors": {"num_actors": 1, "games_per_actor": 4},
 }
 """changes of `rainbow_4task` in a quick run, mainly of parts that XLA compiles slowly"""

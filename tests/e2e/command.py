@@ -16,11 +16,14 @@ import psutil
 from gvz.core import janitor, records
 from tests.processes import arguments
 
+ENV_STEPS_PER_UPDATE = 4
+"""a quarter of the default: engines take most of a small run's time"""
 SMALL = (
     "--actors.num-actors 2 --actors.games-per-actor 2 --env.frame-height 36 "
     "--env.frame-width 44 --env.grayscale --agent.conv-channels 8 8 --agent.conv-kernels 8 4 --agent.conv-strides 4 2 "
     "--agent.hidden-units 32 --replay.capacity 4000 --learner.warmup-steps 300 --learner.batch-size 8 "
-    "--log.period-updates 20 --checkpoint.period-updates 100 --learner.target-period-updates 50"
+    f"--learner.env-steps-per-update {ENV_STEPS_PER_UPDATE} --log.period-updates 20 "
+    "--checkpoint.period-updates 100 --learner.target-period-updates 50"
 ).split()
 
 

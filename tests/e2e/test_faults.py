@@ -12,6 +12,7 @@ import numpy as np
 import psutil
 import pytest
 from command import (
+    ENV_STEPS_PER_UPDATE,
     alive,
     arguments,
     arrays_of,
@@ -165,7 +166,7 @@ def test_a_run_goes_through_every_fault_of_its_actors_and_engines_and_loses_noth
     for lane, missing in enumerate(streams.unrecorded):
         assert missing <= ends[lane // 2], "only the episodes of an actor that died have no row"
     for row in rows(run, "metrics.jsonl"):
-        assert abs(row["actors/env_steps"] - 300 - 16 * row["num_updates"]) <= 256 + 64
+        assert abs(row["actors/env_steps"] - 300 - ENV_STEPS_PER_UPDATE * row["num_updates"]) <= 256 + 64
 
 
 @pytest.mark.slow
@@ -252,7 +253,7 @@ def test_stalls_lose_nothing_and_restart_nobody(tmp_path, pause_s):
     assert code == 0, err
     metrics = rows(run, "metrics.jsonl")
     for row in metrics:
-        assert abs(row["actors/env_steps"] - 300 - 16 * row["num_updates"]) <= 256 + 64
+        assert abs(row["actors/env_steps"] - 300 - ENV_STEPS_PER_UPDATE * row["num_updates"]) <= 256 + 64
     assert metrics[-1]["num_updates"] == 500
     assert metrics[-1]["actors/restarts"] == 0
     assert max(row["actors/wait_share"] for row in metrics) > 0.2, "the actors waited for the learner, and said so"
@@ -269,7 +270,7 @@ def test_a_checkpoint_that_cannot_be_written_is_reported_tried_again_and_at_last
     for step in (100, 300):  # a file where a directory should be: stops root too, as permissions would not
         (run / "policies" / str(step)).parent.mkdir(parents=True, exist_ok=True)
         (run / "policies" / str(step)).touch()
-    flags = (*SYNC, "--learner.total-updates", "300")
+    flags = (*SYNC, "--learner.total-updates", "300", "--learner.env-steps-per-update", "16")
     code, err = finish(launch(run, *flags, patch="gvz.run.saver.SAVE_RETRY_S = 0.0"))
     assert code == 1, err
     assert f"checkpoint failed, tried again within 0 s: checkpoint {run / 'policies' / '100'} could not be" in err

@@ -10,7 +10,18 @@ from pathlib import Path
 import msgpack
 import numpy as np
 import pytest
-from command import alive, arrays_of, descendants, faults, finish, launch, num_updates, rows, wait_until
+from command import (
+    ENV_STEPS_PER_UPDATE,
+    alive,
+    arrays_of,
+    descendants,
+    faults,
+    finish,
+    launch,
+    num_updates,
+    rows,
+    wait_until,
+)
 from scipy import stats
 
 from learner.checkpoint import checkpoint_steps, verify
@@ -155,13 +166,14 @@ def test_a_killed_run_goes_on_from_its_checkpoint_without_a_burst(tmp_path):
     updates = [row["num_updates"] for row in metrics]
     assert updates == list(range(20, 401, 20))  # what the killed run wrote after its checkpoint is set aside
     assert (run / "discarded" / "metrics.jsonl").exists()
-    for row in metrics:  # 300 warm-up decisions, then 16 an update: no second warm-up, no burst
-        assert abs(row["actors/env_steps"] - 300 - 16 * row["num_updates"]) <= 256 + 64
+    for row in metrics:  # 300 warm-up decisions, then 4 an update: no second warm-up, no burst
+        assert abs(row["actors/env_steps"] - 300 - ENV_STEPS_PER_UPDATE * row["num_updates"]) <= 256 + 64
 
 
 def test_a_run_that_acts_on_the_learners_device_goes_on_after_a_kill_and_after_a_stop(tmp_path):
     run = tmp_path / "run"
-    process = launch(run, "--actors.inference", "device", "--learner.total-updates", "1000000")
+    endless = "--learner.total-updates 1000000 --learner.env-steps-per-update 16".split()
+    process = launch(run, "--actors.inference", "device", *endless)
     wait_until(lambda: num_updates(run) >= 20, "20 updates")
     children = descendants(process)
     actors = [child for child in children if "actors.worker" in arguments(child)]
@@ -183,7 +195,7 @@ def test_a_run_that_acts_on_the_learners_device_goes_on_after_a_kill_and_after_a
     for row in rows(run, "metrics.jsonl"):  # 300 warm-up decisions, then 16 an update
         assert abs(row["actors/env_steps"] - 300 - 16 * row["num_updates"]) <= 256 + 64
         assert row["actors/staleness_mean_versions"] < 20
-    process = launch(run, "--learner.total-updates", "1000000")  # now actors act by themselves
+    process = launch(run, *endless)  # now actors act by themselves
     wait_until(lambda: num_updates(run) >= saved + 20, "20 updates more")
     process.send_signal(signal.SIGINT)
     code, err = finish(process)
