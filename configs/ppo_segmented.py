@@ -1,0 +1,21 @@
+"""PPO on what `rainbow_segmented` sees and is rewarded for, with its network and games: no replay (docs/FINDINGS.md).
+
+Settings of PPO are those of `ppo_quick`. It does not shift frames: PPO has no augmentations.
+"""
+
+import dataclasses
+
+from configs.ppo_quick import CONFIG as PPO
+from configs.rainbow_segmented import CONFIG as SEGMENTED
+
+_SHARED = ("conv_channels", "conv_kernels", "conv_strides", "hidden_units", "discount", "game_variables")
+
+CONFIG = dataclasses.replace(
+    SEGMENTED,
+    name="ppo_segmented",
+    agent=dataclasses.replace(PPO.agent, **{name: getattr(SEGMENTED.agent, name) for name in _SHARED}),
+    replay=None,
+    learner=dataclasses.replace(PPO.learner, total_updates=500_000),
+)
+
+SCENARIO_SETTINGS = {"health_gathering": {"agent.discount": 0.98}}

@@ -1,0 +1,14 @@
+"""The experiment `general_segmented_long` with PPO, the better of the two on-policy agents in `gate_on_policy`."""
+
+import dataclasses
+
+from gvz.experiments.general_segmented_long import EXPERIMENT as SEGMENTED
+
+EXPERIMENT = dataclasses.replace(
+    SEGMENTED,
+    name="general_on_policy",
+    title="Generalization without a replay, within 90 minutes of one core",
+    question="How well does PPO play unseen tasks, with the frames, the network and the time of rainbow_segmented?",
+    configs=("ppo_segmented",),
+    seeds=(1111,),
+)
