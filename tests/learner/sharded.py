@@ -33,7 +33,13 @@ TASKS = ("easy", "hard")
 ONES = np.ones(len(TASKS), np.float32)
 REPLAY_SPEC = replace(REPLAY, num_lanes=4, capacity=4 * 40, num_sights=3)
 LEARNER = LearnerConfig(
-    batch_size=16, total_updates=100, warmup_steps=200, target_period_updates=3, learning_rate=1e-3, step_tolerance=1000
+    batch_size=16,
+    total_updates=100,
+    warmup_steps=200,
+    env_steps_per_update=4.0,
+    target_period_updates=3,
+    learning_rate=1e-3,
+    step_tolerance=1000,
 )
 SEVERAL = pytest.mark.parametrize("devices", [2, 4])
 
