@@ -81,8 +81,21 @@ def draw_noise(params: Params, key: PRNGKeyArray, num_rows: int) -> dict[str, Fl
     shapes = {name: layer["kernel"].shape for name, layer in _noisy_layers(params).items()}
     widths = [P + Q for Q, P in shapes.values()]
     e = jax.random.normal(key, (num_rows, sum(widths)))
-    parts = jnp.split(jnp.sign(e) * jnp.sqrt(jnp.abs(e)), np.cumsum(widths)[:-1], axis=1)
+    f = jax.lax.platform_dependent(e, cpu=_scaled_once, default=_scaled)
+    parts = jnp.split(f, np.cumsum(widths)[:-1], axis=1)
     return dict(zip(shapes, parts, strict=True))
+
+
+def _scaled(e: Float[Array, "B N"]) -> Float[Array, "B N"]:
+    return jnp.sign(e) * jnp.sqrt(jnp.abs(e))
+
+
+def _scaled_once(e: Float[Array, "B N"]) -> Float[Array, "B N"]:
+    """`_scaled` in a loop of two steps. On a CPU, XLA else draws and scales the noise anew for each weight of a layer;
+    a barrier or a loop of one step do not keep it from that.
+    """
+    halves = jnp.pad(e.reshape(-1), (0, e.size % 2)).reshape(2, -1)
+    return jax.lax.map(_scaled, halves).reshape(-1)[: e.size].reshape(e.shape)
 
 
 def add_noise(params: Params, key: PRNGKeyArray, noisy: Noisy) -> Params:
