@@ -32,6 +32,17 @@ def oracle(x: np.ndarray, kernel: np.ndarray, stride: int) -> np.ndarray:
     return y
 
 
+def gradients(x: np.ndarray, kernel: np.ndarray, stride: int, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of the sum of g times `oracle`, into x and into the kernel: one window after the other, in float64."""
+    dx, dkernel = np.zeros(x.shape), np.zeros(kernel.shape)
+    k = len(kernel)
+    for i, j in np.ndindex(*g.shape[1:3]):
+        window = np.s_[:, i * stride : i * stride + k, j * stride : j * stride + k]
+        dx[window] += np.tensordot(g[:, i, j].astype(np.float64), kernel.astype(np.float64), axes=(1, 3))
+        dkernel += np.tensordot(x[window].astype(np.float64), g[:, i, j].astype(np.float64), axes=(0, 0))
+    return dx, dkernel
+
+
 @pytest.mark.parametrize("layer", LAYERS, ids=str)
 def test_forms_agree_to_float32_rounding_forward_and_backward(layer: tuple[int, int, int, int, int]):
     size, channels, k, stride, features = layer
@@ -64,13 +75,26 @@ def test_forms_agree_to_float32_rounding_forward_and_backward(layer: tuple[int, 
     channels=st.integers(1, 3),
     features=st.integers(1, 8),
 )
-def test_shifted_equals_the_defining_sum(size: int, k: int, stride: int, channels: int, features: int):
+def test_shifted_and_its_gradients_equal_the_defining_sums(
+    size: int, k: int, stride: int, channels: int, features: int
+):
     k = min(k, size)
     rng = np.random.default_rng(size * 1000 + k * 100 + stride)
     x = rng.normal(size=(1, size, size + 2, channels)).astype(np.float32)
     kernel = rng.normal(size=(k, k, channels, features)).astype(np.float32)
-    y = jax.jit(conv2d, static_argnums=(2, 3))(x, kernel, stride, "shifted")
-    np.testing.assert_allclose(y, oracle(x, kernel, stride), atol=1e-4)
+    wanted = oracle(x, kernel, stride)
+    g = rng.normal(size=wanted.shape).astype(np.float32)
+
+    @jax.jit
+    def shifted(x, kernel, g):
+        y, pull = jax.vjp(lambda x, kernel: conv2d(x, kernel, stride, "shifted"), x, kernel)
+        return y, *pull(g)
+
+    y, dx, dkernel = shifted(x, kernel, g)
+    np.testing.assert_allclose(y, wanted, atol=1e-4)
+    wanted_dx, wanted_dkernel = gradients(x, kernel, stride, g)
+    np.testing.assert_allclose(dx, wanted_dx, atol=1e-4)
+    np.testing.assert_allclose(dkernel, wanted_dkernel, atol=1e-4)
 
 
 @pytest.mark.parametrize("num_images", [1, 2, 5, 8])
