@@ -7,6 +7,7 @@ import dataclasses
 
 from configs.ppo_quick import CONFIG as PPO
 from configs.rainbow_segmented import CONFIG as SEGMENTED
+from configs.rainbow_segmented import SCENARIO_SETTINGS as SEGMENTED_SETTINGS
 
 _SHARED = ("conv_channels", "conv_kernels", "conv_strides", "hidden_units", "discount", "game_variables")
 
@@ -18,4 +19,4 @@ CONFIG = dataclasses.replace(
     learner=dataclasses.replace(PPO.learner, total_updates=500_000),
 )
 
-SCENARIO_SETTINGS = {"health_gathering": {"agent.discount": 0.98}}
+SCENARIO_SETTINGS = {"health_gathering": SEGMENTED_SETTINGS["health_gathering"]}

@@ -11,4 +11,8 @@ EXPERIMENT = dataclasses.replace(
     question="How well does PPO play unseen tasks, with the frames, the network and the time of rainbow_segmented?",
     configs=("ppo_segmented",),
     seeds=(1111,),
+    notes=(
+        "Agents see what the networks that come with GViZDoom take the screen for, and the scenario's game variables. They "
+        "have the discounts and the rewards of rainbow_segmented. No frames are shifted in training.",
+    ),
 )

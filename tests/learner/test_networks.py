@@ -210,6 +210,14 @@ def test_noise_is_different_for_every_key_and_row_and_nothing_without_sigma():
     assert float(np.abs(np.asarray(apply(params, obs, one)) - apply(params, obs, other)).max()) > 1e-3
 
 
+@pytest.mark.parametrize("num_rows", [1, 2, 3])
+def test_factorized_noise_is_the_signed_root_of_normal_draws(num_rows: int):
+    params = {"params": {"layer": {"kernel": jnp.zeros((2, 3)), "kernel_sigma": jnp.zeros((2, 3))}}}
+    found = jax.jit(draw_noise, static_argnums=2)(params, jax.random.key(3), num_rows)["layer"]
+    e = np.asarray(jax.random.normal(jax.random.key(3), (num_rows, 5)), np.float64)
+    np.testing.assert_allclose(found, np.sign(e) * np.sqrt(np.abs(e)), rtol=1e-5)
+
+
 def test_bfloat16_activations_keep_float32_parameters_and_outputs():
     config = replace(TINY, dueling=True, noisy="factorized", distributional=True)
     params, apply, obs = tiny(config)
