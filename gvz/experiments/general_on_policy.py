@@ -12,7 +12,7 @@ EXPERIMENT = dataclasses.replace(
     configs=("ppo_segmented",),
     seeds=(1111,),
     notes=(
-        "Agents see what the networks that come with GViZDoom take the screen for, and the scenario's game variables. They "
-        "have the discounts and the rewards of rainbow_segmented. No frames are shifted in training.",
+        "Agents see what the networks that come with GViZDoom take the screen for, and the scenario's game variables. "
+        "They have the discounts and the rewards of rainbow_segmented. No frames are shifted in training.",
     ),
 )
