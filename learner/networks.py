@@ -91,8 +91,8 @@ def _scaled(e: Float[Array, "B N"]) -> Float[Array, "B N"]:
 
 
 def _scaled_once(e: Float[Array, "B N"]) -> Float[Array, "B N"]:
-    """`_scaled`, in a loop of two steps, which XLA does not merge with what follows. Without it, XLA on a CPU scales the
-    noise again for each weight of a layer. A barrier or a loop of one step does not prevent that.
+    """`_scaled`, in a loop of two steps, which XLA does not merge with what follows. Without it, XLA on a CPU scales
+    the noise again for each weight of a layer. A barrier or a loop of one step does not prevent that.
     """
     halves = jnp.pad(e.reshape(-1), (0, e.size % 2)).reshape(2, -1)
     return jax.lax.map(_scaled, halves).reshape(-1)[: e.size].reshape(e.shape)
