@@ -16,6 +16,8 @@ SCHEMA = 1
 """Part of every record; increased by one when a record's meaning changes."""
 ROOT = Path(__file__).parent.parent
 DIRECTORY = ROOT / "results" / "performance"
+WITHOUT_AN_ENGINE = frozenset({"encoders", "learner_update", "sum_tree"})
+"""benchmarks that play no game, so that the installed engine does not matter"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +45,8 @@ class Record:
         """What sets the record apart from one of a CPU and the released engine: "gpu", "tuned" (the engine), or
         nothing.
         """
-        tuned = "tuned" if "+gvz" in self.versions.get("vizdoom", "") else ""
+        plays = self.benchmark not in WITHOUT_AN_ENGINE
+        tuned = "tuned" if plays and "+gvz" in self.versions.get("vizdoom", "") else ""
         return "_".join(word for word in (self.device if self.device != "cpu" else "", tuned) if word)
 
 
