@@ -1,8 +1,9 @@
 """The files of configurations: a Python file in configs/ or elsewhere, and the JSON of a run directory."""
 
+import contextlib
 import dataclasses
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -51,20 +52,35 @@ def find_config_file(text: str) -> Path:
     raise ConfigError(f"--config: no config {text!r}{hint}; there are {', '.join(names)} (or give a path: ./{text})")
 
 
-def load_config(text: str, scenario: str | None = None) -> RunConfig:
-    """Runs a config file and returns its `CONFIG`.
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ConfigFile:
+    """A config file that has been run."""
 
-    Args:
-        text: a name in configs/, or a path.
-        scenario: whose settings count. A file may define `SCENARIO_SETTINGS`: scenario -> dotted field of RunConfig ->
-            value. They hold for a run that plays tasks of this scenario alone, and flags come after them.
+    path: Path
+    config: RunConfig
+    """its `CONFIG`"""
+    scenario_settings: Mapping[str, Settings]
+    """its `SCENARIO_SETTINGS`, if it has any: scenario -> settings of a run that plays tasks of this scenario alone"""
+
+    def of(self, scenario: str | None) -> RunConfig:
+        """The configuration with the settings of a scenario. Flags come after them.
+
+        Raises:
+            ConfigError: a setting does not fit.
+        """
+        with _named(self.path):
+            return with_settings(self.config, self.scenario_settings.get(scenario or "", {}))
+
+
+def run_config_file(text: str) -> ConfigFile:
+    """Runs a config file: a name in configs/, or a path.
 
     Raises:
-        ConfigError: no such file, it fails, it does not define `CONFIG: RunConfig`, or a setting does not fit.
+        ConfigError: no such file, it fails, it does not define `CONFIG: RunConfig`, or there is no such scenario.
     """
     path = find_config_file(text)
     namespace: dict[str, Any] = {"__name__": f"configs.{path.stem}", "__file__": str(path)}
-    try:
+    with _named(path):
         exec(compile(path.read_text(), str(path), "exec"), namespace)
         config = namespace.get("CONFIG")
         if not isinstance(config, RunConfig):
@@ -73,10 +89,26 @@ def load_config(text: str, scenario: str | None = None) -> RunConfig:
         settings = namespace.get("SCENARIO_SETTINGS", {})
         for name in settings:
             scenario_named(name)  # or an error that names it
-        return with_settings(config, settings.get(scenario, {}))
+        return ConfigFile(path=path, config=config, scenario_settings=settings)
+
+
+def load_config(text: str, scenario: str | None = None) -> RunConfig:
+    """The configuration of a file (see `run_config_file`) with the settings of a scenario.
+
+    Raises:
+        ConfigError: as of `run_config_file` and `ConfigFile.of`.
+    """
+    return run_config_file(text).of(scenario)
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Generator[None]:
+    """Errors of a config file begin with its path. It is the user's own program: anything may come out of it."""
+    try:
+        yield
     except (ConfigError, TaskError) as error:
         raise ConfigError(f"{path}: {error}") from error
-    except Exception as error:  # a config file is the user's own program: anything may come out of it
+    except Exception as error:
         raise ConfigError(f"{path}: {type(error).__name__}: {error}") from error
 
 

@@ -67,6 +67,17 @@ def test_settings_of_a_scenario_hold_for_runs_that_play_it_alone_and_flags_come_
     assert discount("--scenario seek_and_kill --agent.name dqn") == 0.5
 
 
+def test_a_config_file_is_run_once_for_a_command(tmp_path):
+    """A program of the user's own may draw a number or write something."""
+    file, log = tmp_path / "mine.py", tmp_path / "log"
+    file.write_text(
+        "from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='mine')\n"
+        f"with open({str(log)!r}, 'a') as log:\n    log.write('.')\n"
+    )
+    parse(["--config", str(file), "--tasks", "seek_and_kill/red"])
+    assert log.read_text() == "."
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
