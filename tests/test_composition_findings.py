@@ -74,7 +74,6 @@ def test_the_findings_say_what_compositions_gave_with_more_time():
         assert f"| mean | {row[0]} | {row[1]} | {' | '.join(cells)} | {on_level_4} |" in page
         if row == longer:
             assert f"mean of the scenarios level 4 has {on_level_4}.**" in page
-            assert f"and {on_level_4} after three times the time, with one seed." in page
 
     def gains(column: int, of: tuple[str, str, str]) -> str:
         def mean(name: str, row: tuple[str, str, str]) -> float:
@@ -105,6 +104,11 @@ def test_the_findings_say_what_further_seeds_of_compositions_gave_with_more_time
         {name: agent_scores(episodes.filter(scenario=name), "rainbow_segmented") for name in scenarios()}
     )
     assert f"With all seeds the mean is {on_level_4} on level 4 and {on_test} on the test tasks." in page
+    assert episodes.select("scenario", "run_seed").unique().height == 3 * len(scenarios())
+    assert f"and {on_level_4} after three times the time, with three seeds." in page
+    percent, interval = on_test.split(" ", 1)
+    readme = " ".join((ROOT / "README.md").read_text().split())
+    assert f"for 45 minutes, they have {percent}% {interval} (three seeds)." in readme
 
 
 def test_the_findings_say_how_long_agents_of_compositions_learned():
