@@ -17,7 +17,7 @@ import tyro
 from gvz.core.errors import ConfigError, GvzError
 from gvz.core.stop import StopRequest
 from gvz.run.config import RunConfig, with_agent
-from gvz.run.config_files import run_config_file
+from gvz.run.config_files import load_config
 from gvz.run.rundir import RunDir, move_aside
 
 DEFAULT_CONFIG = "rainbow_4task.py"
@@ -61,11 +61,10 @@ def parse(arguments: Sequence[str]) -> Launch:
             config = with_agent(config, agent)
         return tyro.cli(Launch, args=arguments, default=Launch(config=name, run=config), prog="python -m gvz.launch")
 
-    file = run_config_file(name)
-    config = file.of(argument(arguments, "--scenario"))
+    config = load_config(name, argument(arguments, "--scenario"))
     launch = parsed(config)
     played = launch.run.table.scenarios
-    of_played = file.of(played[0].id if len(played) == 1 else None)
+    of_played = load_config(name, played[0].id if len(played) == 1 else None)
     return launch if of_played == config else parsed(of_played)
 
 

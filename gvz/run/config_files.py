@@ -1,10 +1,10 @@
 """The files of configurations: a Python file in configs/ or elsewhere, and the JSON of a run directory."""
 
-import contextlib
 import dataclasses
 import importlib.util
-from collections.abc import Generator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, get_args, get_type_hints
@@ -52,36 +52,20 @@ def find_config_file(text: str) -> Path:
     raise ConfigError(f"--config: no config {text!r}{hint}; there are {', '.join(names)} (or give a path: ./{text})")
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ConfigFile:
-    """A config file that has been run."""
+def load_config(text: str, scenario: str | None = None) -> RunConfig:
+    """Runs a config file and returns its `CONFIG`.
 
-    path: Path
-    config: RunConfig
-    """its `CONFIG`"""
-    scenario_settings: Mapping[str, Settings]
-    """its `SCENARIO_SETTINGS`, if it has any: scenario -> settings of a run that plays tasks of this scenario alone"""
-
-    def of(self, scenario: str | None) -> RunConfig:
-        """The configuration with the settings of a scenario. Flags come after them.
-
-        Raises:
-            ConfigError: a setting does not fit.
-        """
-        with _named(self.path):
-            return with_settings(self.config, self.scenario_settings.get(scenario or "", {}))
-
-
-def run_config_file(text: str) -> ConfigFile:
-    """Runs a config file: a name in configs/, or a path.
+    Args:
+        text: a name in configs/, or a path.
+        scenario: whose settings count. A file may define `SCENARIO_SETTINGS`: scenario -> dotted field of RunConfig ->
+            value. They hold for a run that plays tasks of this scenario alone, and flags come after them.
 
     Raises:
-        ConfigError: no such file, it fails, it does not define `CONFIG: RunConfig`, or there is no such scenario.
+        ConfigError: no such file, it fails, it does not define `CONFIG: RunConfig`, or a setting does not fit.
     """
     path = find_config_file(text)
-    namespace: dict[str, Any] = {"__name__": f"configs.{path.stem}", "__file__": str(path)}
-    with _named(path):
-        exec(compile(path.read_text(), str(path), "exec"), namespace)
+    try:
+        namespace = _run(path, path.read_text())
         config = namespace.get("CONFIG")
         if not isinstance(config, RunConfig):
             raise ConfigError(f"got {type(config).__name__} for CONFIG, want `CONFIG = RunConfig(...)`")
@@ -89,27 +73,19 @@ def run_config_file(text: str) -> ConfigFile:
         settings = namespace.get("SCENARIO_SETTINGS", {})
         for name in settings:
             scenario_named(name)  # or an error that names it
-        return ConfigFile(path=path, config=config, scenario_settings=settings)
-
-
-def load_config(text: str, scenario: str | None = None) -> RunConfig:
-    """The configuration of a file (see `run_config_file`) with the settings of a scenario.
-
-    Raises:
-        ConfigError: as of `run_config_file` and `ConfigFile.of`.
-    """
-    return run_config_file(text).of(scenario)
-
-
-@contextlib.contextmanager
-def _named(path: Path) -> Generator[None]:
-    """Errors of a config file begin with its path. It is the user's own program: anything may come out of it."""
-    try:
-        yield
+        return with_settings(config, settings.get(scenario, {}))
     except (ConfigError, TaskError) as error:
         raise ConfigError(f"{path}: {error}") from error
-    except Exception as error:
+    except Exception as error:  # a config file is the user's own program: anything may come out of it
         raise ConfigError(f"{path}: {type(error).__name__}: {error}") from error
+
+
+@lru_cache(maxsize=1)
+def _run(path: Path, source: str) -> dict[str, Any]:
+    """The names that a config file defines. It is run once, although a command reads it again for its scenario."""
+    namespace: dict[str, Any] = {"__name__": f"configs.{path.stem}", "__file__": str(path)}
+    exec(compile(source, str(path), "exec"), namespace)
+    return namespace
 
 
 def with_settings(config: RunConfig, settings: Mapping[str, Any]) -> RunConfig:
