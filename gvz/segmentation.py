@@ -95,20 +95,21 @@ def segmented_frame(probabilities: np.ndarray, width: int, height: int, temperat
 
 
 def segmenter_names() -> list[str]:
-    """Names of the networks that come with GViZDoom."""
-    return sorted(file.stem for file in SEGMENTERS.glob("*.onnx"))
+    """Names of the networks that come with GViZDoom, and of the sets of one for each scenario."""
+    return sorted({file.relative_to(SEGMENTERS).parts[0].removesuffix(".onnx") for file in SEGMENTERS.rglob("*.onnx")})
 
 
 def segmenter_file(scenario: str, config: EnvConfig) -> Path:
     """The file of a scenario's network: the configured one, or else that of the scenario's name. So it is, too, where a
-    directory is configured that has no file for the scenario.
+    set or a directory is configured that has no file for the scenario.
 
     Raises:
         ConfigError: there is none.
     """
     name, known = config.segmenter or scenario, segmenter_names()
-    if name not in known and Path(name).is_dir():
-        kept = Path(name) / f"{scenario}.onnx"
+    directory = SEGMENTERS / name if name in known else Path(name)
+    if directory.is_dir():
+        kept = directory / f"{scenario}.onnx"
         file = kept if kept.is_file() else SEGMENTERS / kept.name
     else:
         file = Path(name) if name.endswith(".onnx") else SEGMENTERS / f"{name}.onnx"

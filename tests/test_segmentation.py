@@ -1,5 +1,6 @@
 """Segmented frames: what a network takes the screen for, in place of the screen."""
 
+import json
 from pathlib import Path
 
 import jax
@@ -13,6 +14,7 @@ from gvz.segmentation import (
     CLASS_COLOURS,
     INPUT_HEIGHT,
     INPUT_WIDTH,
+    SEGMENTERS,
     Segmenter,
     keep_segmenters,
     network_input,
@@ -22,7 +24,7 @@ from gvz.segmentation import (
     segmenter_of,
     with_kept_segmenters,
 )
-from gvz.tasks import scenarios
+from gvz.tasks import named_tasks, scenarios
 from learner.segmentation import CELL, SegmentationNetwork, write_onnx
 
 
@@ -127,6 +129,15 @@ def test_input_has_the_shape_of_the_network_whatever_the_screen():
     for height, width in ((144, 256), (480, 640), (120, 160)):
         assert network_input(np.zeros((height, width, 3), np.uint8)).shape == (3, INPUT_HEIGHT, INPUT_WIDTH)
     assert np.isfinite(network_input(np.zeros((144, 256, 3), np.uint8))).all(), "a black screen has no deviation"
+
+
+def test_every_scenario_has_a_network_that_has_seen_the_four_training_tasks_alone():
+    for scenario in scenarios():
+        file = segmenter_file(scenario, EnvConfig(frames="segmented", segmenter="train4"))
+        assert file == SEGMENTERS / "train4" / f"{scenario}.onnx"
+        record = json.loads(file.with_suffix(".json").read_text())
+        assert record["tasks"] == [task.id for task in named_tasks(scenario, split="train4")]
+    assert "train4" in segmenter_names()
 
 
 def test_kept_networks_stay_what_they_were(tmp_path: Path, network: str):
