@@ -192,19 +192,18 @@ def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     summary = page.partition("## In short")[2].partition("\n## ")[0]
     named = set(re.findall(r"-?\d+\.\d \[-?\d+\.\d, -?\d+\.\d\]", summary))
-    results, episodes, composed = (
-        results_of("gates"),
-        results_of("general_short").episodes,
-        results_of("general_compositions").episodes,
-    )
+    results, episodes = results_of("gates"), results_of("general_short").episodes
+    composed, four = (results_of(folder).episodes for folder in ("general_compositions", "general_train4"))
     gains = {row[2].text for gate in results.asked for row in comparison_table(results, gate).rows}
-    of_segmented, of_compositions = [], set[str]()
+    of_segmented, of_training_sets = [], set[str]()
     for name in scenarios():
         tasks, mine = [task.id for task in named_tasks(name, split="gate")], episodes.filter(scenario=name)
         agents = [agent_scores(mine, agent) for agent in ("rainbow_segmented", "rainbow_general (8 tasks)")]
         of_segmented.append(estimate_groups([(scores, tasks) for scores in agents], difference).text)
         others = agent_scores(composed.filter(scenario=name), "rainbow_segmented")
-        of_compositions.add(estimate_groups([(scores, tasks) for scores in (others, agents[0])], difference).text)
+        fewer = agent_scores(four.filter(scenario=name), "rainbow_segmented+train4_network")
+        for pair in ((others, agents[0]), (agents[0], fewer)):
+            of_training_sets.add(estimate_groups([(scores, tasks) for scores in pair], difference).text)
     tasks, mine = (
         [task.id for task in named_tasks("seek_and_kill", split="gate")],
         episodes.filter(scenario="seek_and_kill"),
@@ -212,7 +211,7 @@ def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
     agents = [agent_scores(mine, agent) for agent in ("rainbow_segmented+longer_network", "rainbow_segmented")]
     of_network = estimate_groups([(scores, tasks) for scores in agents], difference).text
     assert len(named) > 10
-    assert named <= gains | {*of_segmented, of_network} | of_compositions
+    assert named <= gains | {*of_segmented, of_network} | of_training_sets
     assert f"game variables | {' | '.join(of_segmented)} | no: `rainbow_segmented` |" in summary
 
 
