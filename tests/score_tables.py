@@ -1,13 +1,13 @@
 """The columns that tables of the findings have for an agent."""
 
 from gvz.reports.scores import Scores, estimate
-from gvz.tasks import named_tasks
+from gvz.tasks import TaskSet, named_tasks
 
 
-def task_sets(scenario: str) -> list[list[str]]:
-    """Ids of the eight training tasks, of the gate tasks, of the test tasks, and of level 4."""
+def task_sets(scenario: str, training: TaskSet = "train8") -> list[list[str]]:
+    """Ids of the training tasks, of the gate tasks, of the test tasks, and of level 4."""
     sets = (
-        named_tasks(scenario, split="train8"),
+        named_tasks(scenario, split=training),
         named_tasks(scenario, split="gate"),
         named_tasks(scenario, split="test"),
         named_tasks(scenario, level=4),
@@ -15,6 +15,6 @@ def task_sets(scenario: str) -> list[list[str]]:
     return [[task.id for task in tasks] for tasks in sets]
 
 
-def score_cells(scores: Scores, scenario: str) -> str:
+def score_cells(scores: Scores, scenario: str, training: TaskSet = "train8") -> str:
     """Mean score and interval on each of `task_sets`, as cells of a Markdown table."""
-    return " | ".join(estimate(scores, tasks).text for tasks in task_sets(scenario))
+    return " | ".join(estimate(scores, tasks).text for tasks in task_sets(scenario, training))

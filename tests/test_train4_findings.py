@@ -6,8 +6,9 @@ import json
 import pytest
 
 from gvz.evaluation.statistics import difference, mean_over_scenarios
-from gvz.reports.scores import Scores, agent_scores, estimate, estimate_groups
-from gvz.tasks import named_tasks, scenario_named, scenarios
+from gvz.reports.scores import Scores, agent_scores, estimate_groups
+from gvz.tasks import scenario_named, scenarios
+from tests.score_tables import score_cells, task_sets
 from tests.test_results import ROOT, results_of
 
 AGENTS = {
@@ -30,25 +31,32 @@ def scores() -> dict[tuple[str, str], Scores]:
     }
 
 
-def task_sets(scenario: str) -> list[list[str]]:
-    """Ids of the four training tasks, of the gate tasks, of the test tasks, and of level 4."""
-    splits = (named_tasks(scenario, split="train4"), *(named_tasks(scenario, split=one) for one in ("gate", "test")))
-    return [[task.id for task in tasks] for tasks in (*splits, named_tasks(scenario, level=4))]
-
-
 def test_the_findings_say_what_agents_of_four_training_tasks_have(page: str, scores: dict[tuple[str, str], Scores]):
     for (name, called), of_agent in scores.items():
-        cells = " | ".join(estimate(of_agent, tasks).text for tasks in task_sets(name))
-        assert f"| {scenario_named(name).title} | {called} | {cells} |" in page
+        assert f"| {scenario_named(name).title} | {called} | {score_cells(of_agent, name, 'train4')} |" in page
+    trained = []
     for called in AGENTS:
-        groups = [[(scores[name, called], task_sets(name)[column]) for name in scenarios()] for column in range(4)]
+        groups = [
+            [(scores[name, called], task_sets(name, "train4")[column]) for name in scenarios()] for column in range(4)
+        ]
         means = [estimate_groups(group, mean_over_scenarios).text for group in groups]
         assert f"| mean | {called} | {' | '.join(means)} |" in page
-    gains = [
-        estimate_groups([(scores[name, called], task_sets(name)[1]) for called in reversed(AGENTS)], difference).text
-        for name in scenarios()
-    ]
-    assert f"not four, beside segmented frames | {' | '.join(gains)} | yes |" in page
+        trained.append(means[0].split()[0])
+    assert "agents have {} on the four, those of eight tasks {}.".format(*trained) in page
+
+    def gains(column: int) -> list[str]:
+        """Of eight tasks, by scenario."""
+        pairs = (
+            [(scores[name, called], task_sets(name)[column]) for called in reversed(AGENTS)] for name in scenarios()
+        )
+        return [estimate_groups(pair, difference).text for pair in pairs]
+
+    def rounded(column: int) -> str:
+        return "{:.0f}, {:.0f}, {:.0f} and {:.0f}".format(*(float(gain.split()[0]) for gain in gains(column)))
+
+    assert f"not four, beside segmented frames | {' | '.join(gains(1))} | yes |" in page
+    assert f"they have {rounded(2)} points less**" in page
+    assert f"on the gate tasks {rounded(1)}." in page
 
 
 def test_the_findings_say_what_networks_of_four_training_tasks_find(page: str):
