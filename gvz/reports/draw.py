@@ -25,6 +25,10 @@ from gvz.scenarios.base import Task
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
 """Okabe and Ito's, for readers with any colour vision; brown in place of yellow"""
 GREY = "#777777"
+DASHES = ("-", "--", ":", "-.")
+"""lines after the eighth have the same colours again, dashed"""
+HATCHES = ("", "///", "...", "xxx")
+"""the same of bars"""
 PANEL_INCHES = (4.2, 3.0)
 STYLE: dict[Any, Any] = {
     "font.size": 9,
@@ -67,12 +71,12 @@ def draw_curves(
         for number, curve in enumerate(curves):
             if curve is None:
                 continue
-            line = f"C{number}"
+            colour = f"C{number}"
             if curve.points is not None:
-                axes.plot(*curve.points, ".", markersize=1.5, alpha=0.2, color=line, rasterized=True)
+                axes.plot(*curve.points, ".", markersize=1.5, alpha=0.2, color=colour, rasterized=True)
             mark = "o" if len(curve.updates) <= 20 else ""
-            axes.plot(curve.updates, curve.values, marker=mark, markersize=3, color=line, label=curve.label)
-            axes.fill_between(curve.updates, curve.low, curve.high, color=line, alpha=0.15, linewidth=0)
+            axes.plot(curve.updates, curve.values, marker=mark, markersize=3, label=curve.label, **_line(number))
+            axes.fill_between(curve.updates, curve.low, curve.high, color=colour, alpha=0.15, linewidth=0)
         for number, (name, value) in enumerate((levels or {}).items()):
             axes.axhline(value, color=GREY, linestyle=("--", ":", "-.")[number % 3], linewidth=1, label=name)
         axes.set_ylim(0, None)
@@ -96,7 +100,7 @@ def draw_levels(
         for number, (agent, found) in enumerate(values.items()):
             low, high = ([getattr(estimate, end) for estimate in found] for end in ("low", "high"))
             means = [estimate.value for estimate in found]
-            axes.plot(levels, means, marker="o", markersize=3, color=f"C{number}", label=agent)
+            axes.plot(levels, means, marker="o", markersize=3, label=agent, **_line(number))
             axes.fill_between(levels, low, high, color=f"C{number}", alpha=0.15, linewidth=0)
         axes.set_xticks(levels)
         axes.set_ylim(0, None)
@@ -144,7 +148,7 @@ def draw_histogram(out: Path, id: str, title: str, scores: Mapping[str, np.ndarr
         for number, (agent, values) in enumerate(scores.items()):
             if len(values):
                 share = 100 * np.histogram(values, edges)[0] / len(values)
-                axes.stairs(share, edges, color=f"C{number}", label=agent, linewidth=1.4)
+                axes.stairs(share, edges, label=agent, linewidth=1.4, **_line(number))
         axes.set_ylim(0, None)
         _legend(picture, axes)
         return _written(picture, out, id, caption)
@@ -214,7 +218,17 @@ def draw_rewards(out: Path, id: str, values: Mapping[str, Mapping[str, float]], 
             if not lengths:
                 continue
             at = np.array([bars.index(bar) for bar in lengths]) + (number - (len(values) - 1) / 2) * thick
-            axes.barh(at, list(lengths.values()), height=thick, color=f"C{number}", label=agent)
+            hatch = HATCHES[number // len(COLOURS) % len(HATCHES)]
+            axes.barh(
+                at,
+                list(lengths.values()),
+                height=thick,
+                facecolor=f"C{number}",
+                hatch=hatch,
+                edgecolor="white",
+                linewidth=0,
+                label=agent,
+            )
         axes.set_yticks(range(len(bars)), bars)
         axes.invert_yaxis()
         axes.axvline(0, color="black", linewidth=0.8)
@@ -228,6 +242,11 @@ def _panel(title: str, xlabel: str, ylabel: str, inches: tuple[float, float] = P
     axes = picture.subplots()
     axes.set(title=title, xlabel=xlabel, ylabel=ylabel)
     return picture, axes
+
+
+def _line(number: int) -> dict[str, str]:
+    """How the line of this number looks."""
+    return {"color": f"C{number}", "linestyle": DASHES[number // len(COLOURS) % len(DASHES)]}
 
 
 def _legend(picture: Picture, axes: Axes) -> None:
