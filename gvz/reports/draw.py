@@ -244,7 +244,7 @@ def _panel(title: str, xlabel: str, ylabel: str, inches: tuple[float, float] = P
     return picture, axes
 
 
-def _line(number: int) -> dict[str, str]:
+def _line(number: int) -> dict[str, Any]:
     """How the line of this number looks."""
     return {"color": f"C{number}", "linestyle": DASHES[number // len(COLOURS) % len(DASHES)]}
 

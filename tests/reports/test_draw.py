@@ -21,9 +21,9 @@ def test_no_two_agents_look_alike(tmp_path):
     estimate = Estimate(value=50.0, low=40.0, high=60.0)
     scores = np.linspace(0.0, 100.0, 10)
     figures = [
-        draw_levels(tmp_path, "levels", "levels", (0, 1), dict.fromkeys(AGENTS, [estimate, estimate]), "by level"),
+        draw_levels(tmp_path, "levels", "levels", (0, 1), dict.fromkeys(AGENTS, (estimate, estimate)), "by level"),
         draw_histogram(tmp_path, "histogram", "scores", dict.fromkeys(AGENTS, scores), "scores"),
-        draw_rewards(tmp_path, "rewards", dict.fromkeys(AGENTS, {"moved": 1.0, "kill": 2.0}), "rewards"),
+        draw_rewards(tmp_path, "rewards", {agent: {"moved": 1.0, "kill": 2.0} for agent in AGENTS}, "rewards"),
     ]
     for figure in figures:
         looks = _looks(figure)
