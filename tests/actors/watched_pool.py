@@ -11,6 +11,7 @@ from actors.pool import PoolConfig
 from actors.process_pool import ProcessPool
 from gvz.core import janitor
 from gvz.transport.messages import EpisodeStats, Fault, Message
+from gvz.transport.ring import WriterState
 
 DEADLINE_S = 240.0
 
@@ -45,6 +46,13 @@ class Run:
         """Process ids, by actor."""
         self.until(lambda: self.pool.statistics().actors_ready == 2)
         return [status.pid for status in self.pool.writer_statuses()]
+
+    def until_all_full(self) -> None:
+        """Until every actor waits for space in its ring; nothing is drained."""
+        deadline = time.monotonic() + DEADLINE_S
+        while any(status.state != WriterState.WAITING_FOR_SPACE for status in self.pool.writer_statuses()):
+            assert time.monotonic() < deadline, self.pool.writer_statuses()
+            time.sleep(0.01)
 
 
 def segments() -> dict[int, int]:
