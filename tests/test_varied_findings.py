@@ -1,0 +1,47 @@
+"""What the findings say of agents that trained on varied maps beside segmented frames is what the records give."""
+
+from gvz.evaluation.statistics import difference
+from gvz.reports.scores import agent_scores, estimate, estimate_groups
+from gvz.tasks import scenario_named
+from tests.score_tables import score_cells, task_sets
+from tests.test_results import ROOT, results_of
+
+AGENTS = {"varied maps": "general_varied", "8 tasks": "general_short"}
+SCENARIOS = ("defend_the_center", "seek_and_kill")
+
+
+def test_the_findings_say_what_agents_of_varied_maps_have():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    scores = {
+        (name, called): agent_scores(results_of(folder).episodes.filter(scenario=name), "rainbow_segmented")
+        for name in SCENARIOS
+        for called, folder in AGENTS.items()
+    }
+
+    def lower(name: str, column: int) -> str:
+        """By how much varied maps are below eight tasks, on a column of the table."""
+        tasks = task_sets(name)[column]
+        found = estimate_groups([(scores[name, called], tasks) for called in AGENTS], difference).estimate
+        assert found
+        return f"{-found.value:.1f}"
+
+    def on(task: str) -> tuple[str, str]:
+        name = task.partition("/")[0]
+        found = [estimate(scores[name, called], [task]).estimate for called in AGENTS]
+        varied, eight = (f"{one.value:.0f}" for one in found if one)
+        return varied, eight
+
+    for name in SCENARIOS:
+        for called in AGENTS:
+            cells = score_cells(scores[name, called], name)
+            assert f"| {scenario_named(name).title} | {called} | {cells} |" in page
+    center, seek = SCENARIOS
+    assert f"not eight tasks, beside segmented frames | -{lower(center, 1)} | | | -{lower(seek, 1)} | no |" in page
+    said = "the test tasks are only {} points lower, but the gate tasks {} and level 4 {}."
+    assert said.format(lower(center, 2), lower(center, 1), lower(center, 3)) in page
+    assert f"The test tasks are {lower(seek, 2)} points lower." in page
+    bricks, wall = on(f"{center}/mossy_bricks"), on(f"{center}/fuzzy_enemies+gore+stone_wall")
+    assert f"`mossy_bricks` has {bricks[0]} and `fuzzy_enemies+gore+stone_wall` {wall[0]}, with eight" in page
+    assert f"with eight tasks {bricks[1]} and {wall[1]}." in page
+    assert "no varied map has, have {}, not {}.".format(*on(f"{center}/flying_enemies")) in page
+    assert "`default` has {}, not {}.".format(*on(f"{seek}/default")) in page
