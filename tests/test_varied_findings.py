@@ -1,8 +1,11 @@
 """What the findings say of agents that trained on varied maps beside segmented frames is what the records give."""
 
+import gzip
+import json
+
 from gvz.evaluation.statistics import difference
 from gvz.reports.scores import agent_scores, estimate, estimate_groups
-from gvz.tasks import scenario_named
+from gvz.tasks import named_tasks, scenario_named
 from tests.score_tables import score_cells, task_sets
 from tests.test_results import ROOT, results_of
 
@@ -25,23 +28,36 @@ def test_the_findings_say_what_agents_of_varied_maps_have():
         assert found
         return f"{-found.value:.1f}"
 
-    def on(task: str) -> tuple[str, str]:
+    def on(task: str) -> tuple[float, float]:
+        """Scores of varied maps and of eight tasks."""
         name = task.partition("/")[0]
         found = [estimate(scores[name, called], [task]).estimate for called in AGENTS]
-        varied, eight = (f"{one.value:.0f}" for one in found if one)
+        varied, eight = (one.value for one in found if one)
         return varied, eight
 
+    steps = []
     for name in SCENARIOS:
+        (file,) = (ROOT / "results" / "general_varied" / "runs" / "rainbow_segmented" / name).glob(
+            "**/metrics.jsonl.gz"
+        )
+        steps.append(json.loads(gzip.decompress(file.read_bytes()).splitlines()[-1])["num_updates"])
         for called in AGENTS:
             cells = score_cells(scores[name, called], name)
             assert f"| {scenario_named(name).title} | {called} | {cells} |" in page
+    assert "{:,} gradient steps in Defend the Center and {:,} in Seek and Kill".format(*steps) in page
     center, seek = SCENARIOS
     assert f"not eight tasks, beside segmented frames | -{lower(center, 1)} | | | -{lower(seek, 1)} | no |" in page
     said = "the test tasks are only {} points lower, but the gate tasks {} and level 4 {}."
     assert said.format(lower(center, 2), lower(center, 1), lower(center, 3)) in page
     assert f"The test tasks are {lower(seek, 2)} points lower." in page
     bricks, wall = on(f"{center}/mossy_bricks"), on(f"{center}/fuzzy_enemies+gore+stone_wall")
-    assert f"`mossy_bricks` has {bricks[0]} and `fuzzy_enemies+gore+stone_wall` {wall[0]}, with eight" in page
-    assert f"with eight tasks {bricks[1]} and {wall[1]}." in page
-    assert "no varied map has, have {}, not {}.".format(*on(f"{center}/flying_enemies")) in page
-    assert "`default` has {}, not {}.".format(*on(f"{seek}/default")) in page
+    assert f"`mossy_bricks` has {bricks[0]:.0f} and `fuzzy_enemies+gore+stone_wall` {wall[0]:.0f}, with eight" in page
+    assert f"with eight tasks {bricks[1]:.0f} and {wall[1]:.0f}." in page
+    of_looks = {"gore", "mossy_bricks", "stone_wall", "fuzzy_enemies"}
+    tasks = [task for task in named_tasks(center) if set(task.attributes) <= of_looks]
+    assert len(tasks) > 5
+    for task in tasks:
+        varied, eight = on(task.id)
+        assert varied >= eight, task.id
+    assert "no varied map has, have {:.0f}, not {:.0f}.".format(*on(f"{center}/flying_enemies")) in page
+    assert "`default` has {:.0f}, not {:.0f}.".format(*on(f"{seek}/default")) in page

@@ -8,12 +8,11 @@ EXPERIMENT = dataclasses.replace(
     SEGMENTED,
     name="general_segmented_varied",
     title="Generalization from varied maps with a segmentation network",
-    question="How well does an agent play unseen tasks if every training episode has a map with looks drawn anew?",
+    question="How well does an agent play unseen tasks if it trains on 1,000 maps that differ in their looks?",
     trainings=("varied",),
     columns="training",
     notes=(
         *SEGMENTED.notes,
-        "The agents train on varied maps of their scenario's default task; the networks have seen the eight training "
-        "tasks. All settings were chosen by runs on eight training tasks.",
+        "The agents train on varied maps. All settings were chosen by runs on eight training tasks.",
     ),
 )

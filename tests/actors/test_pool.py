@@ -63,7 +63,7 @@ def test_draining_is_fair_and_bounded(tmp_path: Path):
         pids = run.until_all_ready()
         run.until_all_full()
         for pid in pids:
-            os.kill(pid, signal.SIGSTOP)  # what is drained is not written anew
+            os.kill(pid, signal.SIGSTOP)  # so they do not fill the rings again
         assert sorted(len(block) for block in pool.drain(11)) == [5, 6]
         assert pool.drain(0) == []
         actors = [int(pool.drain(1)[0].steps["lane"][0]) // 2 for _ in range(6)]
