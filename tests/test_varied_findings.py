@@ -2,15 +2,23 @@
 
 import gzip
 import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from gvz.evaluation.statistics import difference
 from gvz.reports.scores import agent_scores, estimate, estimate_groups
-from gvz.tasks import named_tasks, scenario_named
+from gvz.tasks import named_tasks, scenario_named, scenarios
 from tests.score_tables import score_cells, task_sets
 from tests.test_results import ROOT, results_of
 
 AGENTS = {"varied maps": "general_varied", "8 tasks": "general_short"}
 SCENARIOS = ("defend_the_center", "seek_and_kill")
+
+
+def rows_of(file: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
 
 
 def test_the_findings_say_what_agents_of_varied_maps_have():
@@ -40,7 +48,7 @@ def test_the_findings_say_what_agents_of_varied_maps_have():
         (file,) = (ROOT / "results" / "general_varied" / "runs" / "rainbow_segmented" / name).glob(
             "**/metrics.jsonl.gz"
         )
-        steps.append(json.loads(gzip.decompress(file.read_bytes()).splitlines()[-1])["num_updates"])
+        steps.append(rows_of(file)[-1]["num_updates"])
         for called in AGENTS:
             cells = score_cells(scores[name, called], name)
             assert f"| {scenario_named(name).title} | {called} | {cells} |" in page
@@ -61,3 +69,26 @@ def test_the_findings_say_what_agents_of_varied_maps_have():
         assert varied >= eight, task.id
     assert "no varied map has, have {:.0f}, not {:.0f}.".format(*on(f"{center}/flying_enemies")) in page
     assert "`default` has {:.0f}, not {:.0f}.".format(*on(f"{seek}/default")) in page
+
+
+def test_the_findings_say_what_six_times_the_time_on_varied_maps_gave():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    readme = (ROOT / "results" / "general_varied_long" / "README.md").read_text()
+    runs = {"8 tasks": "general/runs/rainbow_segmented/{}/train8/seed_1111"}
+    runs["varied maps"] = "general_varied_long/runs/rainbow_segmented/{}/varied/seed_1111"
+    steps = []
+    for name in scenarios():
+        title = scenario_named(name).title
+        for called, run in runs.items():
+            episodes = rows_of(ROOT / "results" / run.format(name) / "episodes.jsonl.gz")
+            cells = []
+            for first in (10_000, 40_000, 80_000):
+                found = [row["normalized_score"] for row in episodes if first <= row["num_updates"] < first + 10_000]
+                cells.append(f"{np.mean(found):.1f}")
+            assert f"| {title} | {called} | {' | '.join(cells)} |" in page
+        first, *_, last = rows_of(ROOT / "results" / runs["varied maps"].format(name) / "metrics.jsonl.gz")
+        steps.append(last["num_updates"])
+        rate = (steps[-1] - first["num_updates"]) / (last["time_s"] - first["time_s"])
+        counts = f"{steps[-1]:,} | {last['actors/env_steps']:,} | {last['run/processor_s']:,.0f} s | {rate:.1f}"
+        assert f"| {title} | {counts} |" in readme
+    assert f"({min(steps):,} to {max(steps):,} gradient steps)" in page
