@@ -12,7 +12,7 @@ from typing import Literal, TypeVar
 
 from gvz.core.errors import ConfigError
 
-TrainSet = Literal["train4", "train8"]
+TrainSet = Literal["train4", "train8", "varied"]
 _LOOK_PERIOD_STEPS = 20
 """between two looks at the time"""
 _BATCHES_AHEAD = 4
@@ -37,7 +37,7 @@ class TrainSegmenter:
     out: Path
     """the ONNX file to write; beside it comes a .json file with what it was trained on, and its scores"""
     training_set: TrainSet = "train8"
-    """the tasks that it learns from"""
+    """the tasks that it learns from; varied: train8, and what these tasks have but textures on varied maps, too"""
     frames: int = 1500
     """labelled frames of each training task"""
     gate_frames: int = 300
@@ -70,7 +70,7 @@ class TrainSegmenter:
             raise ConfigError("gvz segmenter: the package onnx is missing; pip install 'gvizdoom[segmenter]'")
         from gvz.tasks import named_tasks
 
-        tasks = named_tasks(self.scenario, split=self.training_set)
+        gate_tasks = named_tasks(self.scenario, split="gate")
         import jax
         import numpy as np
 
@@ -82,6 +82,7 @@ class TrainSegmenter:
         from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, Segmenter
         from learner.segmentation import train_segmentation, write_onnx
 
+        tasks = segmentation.training_tasks(self.scenario, self.training_set)
         of_machine = machine.describe()  # with the commit of the code that is loaded now
         begun_s, steps, loss = machine.processor_s(), 0, 0.0
         with Bars(line_period_s=10.0) as bars, contextlib.ExitStack() as until_trained:
@@ -125,7 +126,7 @@ class TrainSegmenter:
             until_trained.close()
             write_onnx(params, self.out, INPUT_HEIGHT, INPUT_WIDTH)
             segment, scores = Segmenter(str(self.out)), {}
-            for task in named_tasks(self.scenario, split="gate"):
+            for task in gate_tasks:
                 show("tasks", len(scores), len(scores) + 1, f"scores on {task.id}")
                 gate = segmentation.labelled_frames(task, self.gate_frames)
                 scores[task.id] = segmentation.score(np.stack([segment(frame) for frame in gate.frames]), gate.labels)

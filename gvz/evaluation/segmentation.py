@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from functools import cache, partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -17,7 +17,9 @@ from gvz.evaluation.play import episode_seed
 from gvz.evaluation.players import Player, RandomPlayer, ScriptedPlayer
 from gvz.scenarios.base import Task, Textures
 from gvz.scenarios.compiler import task_content
+from gvz.scenarios.map_set import VARIED
 from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH
+from gvz.tasks import TaskSet, named_tasks, parse_task, scenario_named
 from learner.segmentation import CELL
 from learner.segmentation_views import (
     OUTLINES,
@@ -42,7 +44,7 @@ class Labelled(NamedTuple):
     style: str | None = None
     """the engine's render style of the task's things, if it shows nothing of them but their outline"""
     textures: Textures | None = None
-    """of the task's walls, floors and ceilings"""
+    """of the task's walls, floors and ceilings; None: every map has its own"""
 
     def shot(self, rng: np.random.Generator) -> Shot:
         """One of the frames, drawn at random."""
@@ -60,6 +62,8 @@ _BASE_SEED = 7
 _DECISIONS_APART = 5
 """between frames of an episode, which hardly differ otherwise"""
 _FRAMES_PER_EPISODE = 60
+_FRAMES_PER_MAP = 20
+"""of a varied map, so that frames show many maps"""
 _CLEAN_SHARE = 0.15
 """of a batch's frames that are only mirrored"""
 _MOVED_SHARE = 0.7
@@ -73,6 +77,20 @@ _MIN_CELLS = 100
 """that show a class, for a score of it"""
 
 
+def training_tasks(scenario: str, training_set: TaskSet | Literal["varied"]) -> list[Task]:
+    """The tasks that a network learns from: a training set, or train8 and, on varied maps, what it has but textures.
+
+    Raises:
+        TaskError: no such scenario, or it has no such set.
+    """
+    if training_set != VARIED:
+        return list(named_tasks(scenario, split=training_set))
+    eight, attribute = named_tasks(scenario, split="train8"), scenario_named(scenario).attribute
+    kept = [task for task in eight if not any("textures" in attribute(name).groups for name in task.attributes)]
+    names = ("+".join((VARIED, *task.attributes)) for task in kept)
+    return [*eight, *(parse_task(f"{scenario}/{name}") for name in names)]
+
+
 def labelled_frames(task: Task, num_frames: int) -> Labelled:
     """Frames of a task that a random player and the scripted one see in turns, an episode each.
 
@@ -82,6 +100,7 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
     frames, labels, depths, episode = [], [], [], 0
     height, width = EnvConfig().render_height, EnvConfig().render_width
     config = EnvConfig(frame_height=height, frame_width=width, buffers=("depth", "labels"))
+    frames_per_episode = _FRAMES_PER_EPISODE if task.maps is None else _FRAMES_PER_MAP
     env = DoomEnv(task, config)
     try:
         while len(frames) < num_frames:
@@ -89,7 +108,7 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
             observation, info = env.reset(options={"episode_seed": seed})
             player: Player = RandomPlayer() if episode % 2 else ScriptedPlayer()
             player.begin(env, observation, info, seed)
-            for decision in range(_FRAMES_PER_EPISODE * _DECISIONS_APART):
+            for decision in range(frames_per_episode * _DECISIONS_APART):
                 assert isinstance(observation, dict)
                 if decision % _DECISIONS_APART == 0:
                     frames.append(observation["screen"])
@@ -215,7 +234,7 @@ def _looks(task: Task) -> tuple[str | None, Textures | None]:
     """`style` and `textures` of a task's frames."""
     styles = (task.scenario.attribute(name).content.entity.get("RenderStyle") for name in task.attributes)
     style = next((str(one) for one in styles if one in OUTLINES), None)
-    return style, task_content(task, EnvConfig().profile).textures
+    return style, task_content(task, EnvConfig().profile).textures if task.maps is None else None
 
 
 def score(probabilities: np.ndarray, labels: np.ndarray) -> Mapping[str, float]:

@@ -53,6 +53,23 @@ def test_a_cell_shows_a_class_if_an_eighth_of_its_pixels_do():
     assert segmentation.score(probabilities, labels)["enemy"] == pytest.approx(expected)
 
 
+def test_the_tasks_of_varied_maps_have_the_attributes_that_are_no_textures():
+    found = [task.id for task in segmentation.training_tasks("seek_and_kill", "varied")]
+    names = ("", "+obstacles", "+resized_enemies", "+shadows", "+mixed_enemies", "+invulnerable")
+    assert found[8:] == [f"seek_and_kill/varied{name}" for name in names]
+    assert found[:8] == [task.id for task in segmentation.training_tasks("seek_and_kill", "train8")]
+    assert found[1:3] == ["seek_and_kill/blue", "seek_and_kill/red"], "of textures alone"
+
+
+@pytest.mark.engine
+def test_frames_of_varied_maps_show_many_of_them():
+    found = segmentation.labelled_frames(parse_task("dodge_projectiles/varied-10"), 60)
+    assert found.textures is None
+    assert segmentation.labelled_frames(parse_task("dodge_projectiles/default"), 1).textures is not None
+    ceilings = {found.frames[first][0].tobytes() for first in (0, 20, 40)}
+    assert len(ceilings) == 3
+
+
 @pytest.mark.engine
 def test_labelled_frames_are_the_same_each_time_and_show_what_the_task_has():
     task = parse_task("defend_the_center/gore")
