@@ -76,19 +76,39 @@ def test_the_findings_say_what_six_times_the_time_on_varied_maps_gave():
     readme = (ROOT / "results" / "general_varied_long" / "README.md").read_text()
     runs = {"8 tasks": "general/runs/rainbow_segmented/{}/train8/seed_1111"}
     runs["varied maps"] = "general_varied_long/runs/rainbow_segmented/{}/varied/seed_1111"
-    steps = []
+    steps, means = [], {}
     for name in scenarios():
         title = scenario_named(name).title
         for called, run in runs.items():
             episodes = rows_of(ROOT / "results" / run.format(name) / "episodes.jsonl.gz")
-            cells = []
             for first in (10_000, 40_000, 80_000):
                 found = [row["normalized_score"] for row in episodes if first <= row["num_updates"] < first + 10_000]
-                cells.append(f"{np.mean(found):.1f}")
-            assert f"| {title} | {called} | {' | '.join(cells)} |" in page
+                means[name, called, first] = float(np.mean(found))
+            cells = " | ".join(f"{means[name, called, first]:.1f}" for first in (10_000, 40_000, 80_000))
+            assert f"| {title} | {called} | {cells} |" in page
         first, *_, last = rows_of(ROOT / "results" / runs["varied maps"].format(name) / "metrics.jsonl.gz")
         steps.append(last["num_updates"])
         rate = (steps[-1] - first["num_updates"]) / (last["time_s"] - first["time_s"])
         counts = f"{steps[-1]:,} | {last['actors/env_steps']:,} | {last['run/processor_s']:,.0f} s | {rate:.1f}"
         assert f"| {title} | {counts} |" in readme
     assert f"({min(steps):,} to {max(steps):,} gradient steps)" in page
+
+    def lower(name: str) -> float:
+        return means[name, "8 tasks", 80_000] - means[name, "varied maps", 80_000]
+
+    learned, (center, seek) = ("dodge_projectiles", "health_gathering"), SCENARIOS
+    assert all(lower(name) <= 0 for name in learned)
+    gain = means[seek, "varied maps", 80_000] - means[seek, "varied maps", 40_000]
+    said = (
+        f"stand {lower(center):.0f} and {lower(seek):.0f} points lower, and Seek and Kill gains only {gain:.0f} points"
+    )
+    assert said in page
+
+
+def test_the_findings_say_what_networks_of_eight_tasks_find_on_varied_maps():
+    page = (ROOT / "docs" / "FINDINGS.md").read_text()
+    file = ROOT / "results" / "gates" / "segmenters" / "varied_maps.json"
+    found = json.loads(file.read_text())["average_precision"]
+    for task in ("default", "varied"):
+        cells = (", ".join(f"{value:.2f}" for value in found[f"{name}/{task}"].values()) for name in scenarios())
+        assert f"| `{task}` | {' | '.join(cells)} |" in page
