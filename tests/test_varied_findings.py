@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gvz.evaluation.statistics import difference
+from gvz.evaluation.statistics import bootstrap, difference
 from gvz.reports.scores import agent_scores, estimate, estimate_groups
 from gvz.tasks import named_tasks, scenario_named, scenarios
 from tests.score_tables import score_cells, task_sets
@@ -112,3 +112,51 @@ def test_the_findings_say_what_networks_of_eight_tasks_find_on_varied_maps():
     for task in ("default", "varied"):
         cells = (", ".join(f"{value:.2f}" for value in found[f"{name}/{task}"].values()) for name in scenarios())
         assert f"| `{task}` | {' | '.join(cells)} |" in page
+
+
+def test_the_findings_say_what_a_network_gave_that_has_seen_varied_maps():
+    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
+    folder, name = ROOT / "results" / "gates" / "segmenters" / "seek_and_kill_varied", "seek_and_kill"
+    network = json.loads((folder / "network.json").read_text())
+    of_eight = json.loads((ROOT / "gvz" / "segmenters" / f"{name}.json").read_text())["average_precision"]
+    gate = [found[task]["enemy"] for found in (network["average_precision"], of_eight) for task in task_sets(name)[1]]
+    unseen = network["average_precision_on_unseen_maps"][f"{name}/varied"]["enemy"]
+    assert "with {:.2f}, {:.2f} and {:.2f} on the gate tasks, not {:.2f}, {:.2f} and {:.2f}.".format(*gate) in page
+    assert f"finds enemies with {unseen:.2f} on varied maps that it has not seen" in page
+    assert f"({network['gradient_steps']:,} gradient steps)" in page
+
+    scores: dict[str, list[float]] = {}
+    for row in rows_of(folder / "evaluation.jsonl.gz"):
+        scores.setdefault(row["task"], []).append(row["normalized_score"])
+    assert {len(of_task) for of_task in scores.values()} == {20}
+    sets = task_sets(name)[:2]
+    cells = [str(bootstrap([np.array(scores[task]) for task in tasks])) for tasks in sets]
+    assert f"| varied maps | varied maps | {' | '.join(cells)} |" in page
+    of_others = {
+        "varied maps | eight tasks": results_of("general_varied").episodes,
+        "8 tasks | eight tasks": results_of("general_short").episodes,
+    }
+    for called, episodes in of_others.items():
+        found = agent_scores(episodes.filter(scenario=name), "rainbow_segmented")
+        assert f"| {called} | {' | '.join(estimate(found, tasks).text for tasks in sets)} |" in page
+
+    def with_eight_tasks(task: str) -> str:
+        found = results_of("general_short").episodes.filter(agent="rainbow_segmented", task=task)
+        return f"{found['normalized_score'].mean():.0f}"
+
+    red, sized, default = (f"{name}/{task}" for task in ("red", "red+resized_enemies", "default"))
+    of_red, of_sized, of_default = (f"{np.mean(scores[task]):.0f}" for task in (red, sized, default))
+    said = f"`red` has {of_red}, not {with_eight_tasks(red)}, and `red+resized_enemies` {of_sized}, not"
+    assert f"{said} {with_eight_tasks(sized)}, as agents of eight tasks have." in page
+    assert sorted(scores, key=lambda task: np.mean(scores[task]))[:2] == [sized, red]
+    blind = ROOT / "results" / "general_varied" / "runs" / "rainbow_segmented" / name / "varied" / "seed_1111"
+    trained = [
+        np.mean([row["normalized_score"] for row in rows_of(run / "episodes.jsonl.gz") if row["num_updates"] >= 10_000])
+        for run in (folder, blind)
+    ]
+    said = "have {:.0f} points from 10,000 gradient steps on, where the agent that hardly saw had {:.0f}, and".format(
+        *trained
+    )
+    assert f"{said} `default` has {of_default} instead of" in page
+    last = rows_of(folder / "metrics.jsonl.gz")[-1]
+    assert f"with {last['num_updates']:,} gradient steps and 20 episodes a task" in page
