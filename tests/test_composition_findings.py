@@ -5,14 +5,12 @@ import json
 from pathlib import Path
 
 import numpy as np
-import polars
 
 from gvz.evaluation.episode_log import read_rows
 from gvz.evaluation.statistics import difference, mean_over_scenarios
-from gvz.evaluation.trained import read_run_config
 from gvz.evaluation.zoo import run_directory
 from gvz.reports.scores import Scores, agent_scores, estimate, estimate_groups
-from gvz.tasks import named_tasks, parse_task, scenario_named, scenarios
+from gvz.tasks import parse_task, scenario_named, scenarios
 from tests.score_tables import score_cells, task_sets
 from tests.test_results import ROOT, results_of
 
@@ -111,16 +109,6 @@ def test_the_findings_say_what_further_seeds_of_compositions_gave_with_more_time
     percent, interval = on_test.split(" ", 1)
     readme = " ".join((ROOT / "README.md").read_text().split())
     assert f"for 45 minutes, they have {percent}% {interval} (three seeds)." in readme
-
-
-def test_policies_of_compositions_are_the_best_of_the_three_on_the_gate_tasks(tmp_path, monkeypatch):
-    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path))
-    episodes = results_of("general_compositions_long").episodes
-    for name in scenarios():
-        on_gate = episodes.filter(episodes["task"].is_in([task.id for task in named_tasks(name, split="gate")]))
-        means = on_gate.group_by("run_seed").agg(polars.col("normalized_score").mean()).sort("normalized_score")
-        kept = read_run_config(run_directory(Path(f"zoo:{name}_compositions")))
-        assert kept.seed == means["run_seed"][-1]
 
 
 def test_the_findings_say_how_long_agents_of_compositions_learned():

@@ -193,7 +193,8 @@ def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
     summary = page.partition("## In short")[2].partition("\n## ")[0]
     named = set(re.findall(r"-?\d+\.\d \[-?\d+\.\d, -?\d+\.\d\]", summary))
     results, episodes = results_of("gates"), results_of("general_short").episodes
-    composed, four = (results_of(folder).episodes for folder in ("general_compositions", "general_train4"))
+    folders = ("general_compositions", "general_train4", "general")
+    composed, four, long = (results_of(folder).episodes for folder in folders)
     gains = {row[2].text for gate in results.asked for row in comparison_table(results, gate).rows}
     of_segmented, of_training_sets = [], set[str]()
     for name in scenarios():
@@ -202,7 +203,8 @@ def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
         of_segmented.append(estimate_groups([(scores, tasks) for scores in agents], difference).text)
         others = agent_scores(composed.filter(scenario=name), "rainbow_segmented")
         fewer = agent_scores(four.filter(scenario=name), "rainbow_segmented+train4_network")
-        for pair in ((others, agents[0]), (agents[0], fewer)):
+        longer = agent_scores(long.filter(scenario=name), "rainbow_segmented")
+        for pair in ((others, agents[0]), (agents[0], fewer), (longer, agents[0])):
             of_training_sets.add(estimate_groups([(scores, tasks) for scores in pair], difference).text)
     tasks, mine = (
         [task.id for task in named_tasks("seek_and_kill", split="gate")],

@@ -204,7 +204,17 @@ def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
     assert f"and {gathering[2]} in Health Gathering**, also above" in page
     assert f"**In Health Gathering the gate tasks lose {gathering[1].lstrip('-')} points**" in page
     assert f"The training tasks gain {gathering[0]} points" in page
-    assert f"beside segmented frames | {center[1]} | -4.0 | {gathering[1]} | {kill[1]} | as you like" in page
+    both = [
+        agent_scores(results_of(folder).episodes.filter(scenario="defend_the_center"), "rainbow_segmented")
+        for folder in ("general", "general_short")
+    ]
+    sets = task_sets("defend_the_center")
+    of_both = [estimate_groups([(scores, tasks) for scores in both], difference).text for tasks in sets]
+    assert f"beside segmented frames | {of_both[1]} | -4.0 | {gathering[1]} | {kill[1]} | as you like" in page
+    assert (
+        "both together have {} points more than 900 seconds on the training tasks, {} on the gate tasks and {} on the "
+        "test tasks; on level 4 {}."
+    ).format(*of_both) in page
     said = []
     for task in ("short_agent", "short_agent+water", "supreme"):
         scores = [one.filter(task=f"health_gathering/{task}")["normalized_score"].mean() for one in (long, short)]

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import polars
 import pytest
 
 from gvz import cli
@@ -10,6 +11,7 @@ from gvz.evaluation.episode_log import read_rows
 from gvz.evaluation.trained import find_checkpoints, read_run_config, trained_player
 from gvz.evaluation.zoo import MAX_BYTES, ZOO_DIRECTORY, run_directory, zoo_names
 from gvz.tasks import named_tasks, scenarios
+from tests.test_results import results_of
 
 PAGE = Path(__file__).parent.parent / "docs" / "FINDINGS.md"
 
@@ -76,3 +78,19 @@ def test_the_mean_over_scenarios_is_that_of_the_score_cards(suffix, said, tmp_pa
     ]
     assert f"| P_norm: mean over scenarios | | {np.mean(means):.1f} [" in PAGE.read_text()
     assert said.format(f"{np.mean(means):.1f}") in " ".join((PAGE.parents[1] / "README.md").read_text().split())
+
+
+@pytest.mark.parametrize(
+    ("folder", "suffix", "names"),
+    [
+        ("general_compositions_long", "_compositions", tuple(scenarios())),
+        ("general", "", ("defend_the_center", "seek_and_kill")),
+    ],
+)
+def test_a_policy_is_the_best_of_its_seeds_on_the_gate_tasks(folder, suffix, names, tmp_path, monkeypatch):
+    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path))
+    for name in names:
+        episodes = results_of(folder).episodes.filter(agent="rainbow_segmented", scenario=name)
+        on_gate = episodes.filter(episodes["task"].is_in([task.id for task in named_tasks(name, split="gate")]))
+        means = on_gate.group_by("run_seed").agg(polars.col("normalized_score").mean()).sort("normalized_score")
+        assert read_run_config(run_directory(Path(f"zoo:{name}{suffix}"))).seed == means["run_seed"][-1]
