@@ -230,6 +230,11 @@ def test_the_findings_say_how_many_games_ran_at_once():
     assert "(16,900 to 19,700 gradient steps, 16 games at once)" in page
     assert games("general_short/runs/rainbow_general+sight_loss") == {8}
     assert "with a weight of 0.1. One seed with 8 games at once" in page
+    readme = (ROOT / "results" / "general" / "README.md").read_text()
+    assert games("general/runs/rainbow_general+sight_loss") == {8}
+    assert games("general/runs/rainbow_segmented") == {16}
+    assert "had 8 games at once, and act on the screen alone" in readme
+    assert "`rainbow_segmented`, with 16 games at once." in readme
     on_policy = [games(f"gates/runs/{name}_quick+plain/*_*") for name in ("ppo", "pqn")]
     rainbow = [games(f"gates/runs/rainbow_quick+plain/{name}") for name in ("dodge_projectiles", "health_gathering")]
     assert [*on_policy, *rainbow] == [{8}] * 4

@@ -76,7 +76,7 @@ def test_the_findings_say_what_six_times_the_time_on_varied_maps_gave():
     readme = (ROOT / "results" / "general_varied_long" / "README.md").read_text()
     runs = {"8 tasks": "general/runs/rainbow_segmented/{}/train8/seed_1111"}
     runs["varied maps"] = "general_varied_long/runs/rainbow_segmented/{}/varied/seed_1111"
-    steps, means = [], {}
+    steps, means, waits, minutes = [], {}, [], []
     for name in scenarios():
         title = scenario_named(name).title
         for called, run in runs.items():
@@ -86,12 +86,20 @@ def test_the_findings_say_what_six_times_the_time_on_varied_maps_gave():
                 means[name, called, first] = float(np.mean(found))
             cells = " | ".join(f"{means[name, called, first]:.1f}" for first in (10_000, 40_000, 80_000))
             assert f"| {title} | {called} | {cells} |" in page
-        first, *_, last = rows_of(ROOT / "results" / runs["varied maps"].format(name) / "metrics.jsonl.gz")
+        run = ROOT / "results" / runs["varied maps"].format(name)
+        first, *_, last = rows = rows_of(run / "metrics.jsonl.gz")
+        waits.append(np.median([row["learner/wait_share"] for row in rows]))
+        minutes.append((last["time_s"] - json.loads((run / "starts.jsonl").read_text())["time_s"]) / 60)
+        assert len({row["lane"] for row in rows_of(run / "episodes.jsonl.gz")}) == 16
         steps.append(last["num_updates"])
         rate = (steps[-1] - first["num_updates"]) / (last["time_s"] - first["time_s"])
         counts = f"{steps[-1]:,} | {last['actors/env_steps']:,} | {last['run/processor_s']:,.0f} s | {rate:.1f}"
         assert f"| {title} | {counts} |" in readme
     assert f"({min(steps):,} to {max(steps):,} gradient steps)" in page
+    assert "four cores and 16 games each" in " ".join(readme.split())
+    assert f"Ctrl-C ended these {np.mean(minutes):.0f} minutes after they had" in readme
+    assert f"ended {np.mean(minutes):.0f} minutes after it had begun" in page
+    assert f"waited for decisions for {100 * np.mean(waits):.0f} percent" in readme
 
     def lower(name: str) -> float:
         return means[name, "8 tasks", 80_000] - means[name, "varied maps", 80_000]

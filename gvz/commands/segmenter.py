@@ -37,7 +37,8 @@ class TrainSegmenter:
     out: Path
     """the ONNX file to write; beside it comes a .json file with what it was trained on, and its scores"""
     training_set: TrainSet = "train8"
-    """the tasks that it learns from; varied: train8, and what these tasks have but textures on varied maps, too"""
+    """the tasks that it learns from; varied: train8, and varied maps, alone and with each attribute of train8 but
+    textures"""
     frames: int = 1500
     """labelled frames of each training task"""
     gate_frames: int = 300

@@ -78,7 +78,11 @@ _MIN_CELLS = 100
 
 
 def training_tasks(scenario: str, training_set: TaskSet | Literal["varied"]) -> list[Task]:
-    """The tasks that a network learns from: a training set, or train8 and, on varied maps, what it has but textures.
+    """The tasks that a network learns from.
+
+    Args:
+        scenario: whose tasks.
+        training_set: a training set; or varied: train8, and its tasks without other textures on varied maps.
 
     Raises:
         TaskError: no such scenario, or it has no such set.
