@@ -46,11 +46,41 @@ def test_a_policy_is_small_readable_and_has_its_score_card(name, tmp_path, monke
     assert f"{np.mean(means):.1f} [" in line
 
 
-def test_the_list_counts_most_of_many_training_tasks(tmp_path, monkeypatch, capsys):
+def test_the_list_has_a_line_for_each_policy(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path))
     assert cli.main(["zoo"]) == 0
-    (head,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("zoo:health_gathering_comp")]
-    assert head.endswith("health_gathering/poison, health_gathering/shaded_kits and 83 more tasks")
+    head, *lines = capsys.readouterr().out.partition("\n\n")[0].splitlines()
+    assert [line.split()[0] for line in lines] == [f"zoo:{name}" for name in zoo_names()]
+    (line,) = [line for line in lines if line.startswith("zoo:health_gathering_compositions ")]
+    name = "health_gathering"
+    directory = run_directory(Path(f"zoo:{name}_compositions"))
+    mean = np.mean(scores_of(read_rows(directory / "evaluation.jsonl"), name))
+    said = f" segmented    91 tasks   45,500         2,707 s  {mean:.1f} ["
+    assert said in line
+    assert line.index(f"{mean:.1f} [") == head.index("% of the bound, test tasks")
+
+
+def test_the_card_of_a_policy_has_its_tasks_and_scores(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path))
+    assert cli.main(["zoo", "health_gathering", "zoo:seek_and_kill_screen"]) == 0
+    first, second = capsys.readouterr().out.split("\n\n")
+    assert first.startswith("zoo:health_gathering: rainbow_segmented, seed 3333, 17,600 updates, 903 s of processor")
+    assert second.startswith("zoo:seek_and_kill_screen: rainbow_general, seed 1111, 25,800 updates")
+    for card, name in ((first, "health_gathering"), (second, "seek_and_kill")):
+        trained_on = ", ".join(task.id for task in named_tasks(name, split="train8"))
+        assert f"trained on {trained_on} mean score" in " ".join(card.split())
+        for task in named_tasks(name, split="test"):
+            assert f"  {task.id}\n" in card
+
+
+def test_a_name_that_is_no_policy_is_told(capsys):
+    assert cli.main(["zoo", "seek_and_kil"]) == 2
+    assert "zoo:seek_and_kil: no such policy (did you mean 'seek_and_kill'?)" in capsys.readouterr().err
+
+
+def test_a_policy_is_added_by_one_name_alone(capsys):
+    assert cli.main(["zoo", "mine", "--add", "runs/mine", "--name", "mine"]) == 2
+    assert "zoo: got mine beside --add" in capsys.readouterr().err
 
 
 def test_the_findings_say_what_the_agent_with_shifted_frames_has(tmp_path, monkeypatch):

@@ -1,22 +1,36 @@
 """`gvz zoo`: the trained policies that come with GViZDoom."""
 
+import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import tyro
 
 from gvz.core.errors import ConfigError
 from gvz.evaluation.zoo import PREFIX, pack, run_directory, zoo_names
 
+if TYPE_CHECKING:
+    from gvz.run.config import RunConfig
+
 
 @dataclass(frozen=True, kw_only=True)
 class Zoo:
-    """List the trained policies that come with GViZDoom, with the tasks, the budget and the scores of each.
+    """List the trained policies that come with GViZDoom. With names: what each was trained on, and its score on each
+    test task.
 
     `zoo:NAME` stands for a policy wherever a command takes a run directory.
 
-    Examples: gvz watch zoo:dodge_projectiles --task dodge_projectiles/mancubus
+    Examples: gvz zoo seek_and_kill
+              gvz watch zoo:dodge_projectiles --task dodge_projectiles/mancubus
               gvz zoo --add runs/rainbow_general/seed_1111 --name seek_and_kill
     """
 
+    names: Annotated[
+        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[NAME ...]", help_behavior_hint="")
+    ] = ()
+    """policies to show in detail"""
     add: Path | None = None
     """run directory whose policy is put into the zoo of this checkout, rounded; with `zoo:NAME`, its score card is
     renewed by the episodes that were evaluated of it"""
@@ -28,33 +42,45 @@ class Zoo:
     """the Python file of the run's agent, if it is in a file of its own"""
 
     def run(self) -> int:
-        """Prints the table, or what was added."""
+        """Prints the policies, or what was added."""
         if (self.add is None) != (self.name is None):
             raise ConfigError("zoo: want --add and --name together")
         if self.add is not None and self.name is not None:
+            if self.names:
+                raise ConfigError(f"zoo: got {' '.join(self.names)} beside --add; the policy's name is that of --name")
             packed = pack(run_directory(self.add), self.name, self.checkpoint, self.agent)
             print(f"{packed.file}: {packed.num_updates:,} updates, {packed.num_bytes:,} bytes")
             if not packed.num_episodes:
                 print(f"no score card yet: gvz evaluate {PREFIX}{self.name}, then add {PREFIX}{self.name} again")
-            return 0
-        names = zoo_names()
-        if not names:
+        elif self.names:
+            print("\n\n".join(_card(_read(name.removeprefix(PREFIX))) for name in self.names))
+        elif known := zoo_names():
+            print(_table([_read(name) for name in known]))
+        else:
             print("the zoo is empty")
-        for name in names:
-            print("\n".join(_card(name)))
         return 0
 
 
 COMMAND = Zoo
-_NAMED_TASKS = 8
-"""of those that a policy was trained on; of more, their number is said"""
 
 
-def _card(name: str) -> list[str]:
-    """A policy's lines: what it was trained on, for how long, and its scores."""
+class _Policy(NamedTuple):
+    """What a policy's file says."""
+
+    name: str
+    config: "RunConfig"
+    num_updates: int
+    processor_s: float | None
+    """that training took; None: not recorded"""
+    num_test_tasks: int
+    scores: list[dict[str, Any]]
+    """`score_rows` of those that were evaluated"""
+
+
+def _read(name: str) -> _Policy:
     from gvz.core import records
     from gvz.evaluation.selection import TaskSelection
-    from gvz.evaluation.table import score_lines, score_rows
+    from gvz.evaluation.table import score_rows
     from gvz.evaluation.trained import find_checkpoints, read_run_config
 
     directory = run_directory(Path(f"{PREFIX}{name}"))
@@ -62,13 +88,40 @@ def _card(name: str) -> list[str]:
     [num_updates] = find_checkpoints(directory, ["newest"])
     rows, _ = records.read_stored(directory / "evaluation.jsonl")
     metrics, _ = records.read_stored(directory / "metrics.jsonl")
-    spent = f", {metrics[-1]['run/processor_s']:,.0f} s of processor time" if metrics else ""
-    trained_on, others = ", ".join(config.table.ids[:_NAMED_TASKS]), len(config.table.ids[_NAMED_TASKS:])
-    more = f" and {others} more tasks" if others else ""
-    head = (
-        f"{PREFIX}{name}: {config.name}, seed {config.seed}, {num_updates:,} updates{spent}, "
-        f"trained on {trained_on}{more}"
-    )
     tasks = TaskSelection(split="test").of_run([scenario.id for scenario in config.table.scenarios])
-    found = score_rows(rows, {}, tasks, episodes=10**9)
-    return [head, *(f"  {line}" for line in (score_lines(found) if found else ["no evaluation"])), ""]
+    scores = score_rows(rows, {}, tasks, episodes=10**9)
+    spent_s = metrics[-1]["run/processor_s"] if metrics else None
+    return _Policy(name, config, num_updates, spent_s, len(tasks), scores)
+
+
+def _table(policies: Sequence[_Policy]) -> str:
+    """A line for each policy; the score is the mean over the test tasks."""
+    from gvz.evaluation.table import interval_text
+
+    width = max(len(policy.name) for policy in policies) + len(PREFIX)
+    lines = [f"{'policy':{width}}  {'frames':9}  trained on  updates  processor time  % of the bound, test tasks [95%]"]
+    for policy in policies:
+        tasks = f"{len(policy.config.table.ids)} tasks"
+        spent = "" if policy.processor_s is None else f"{policy.processor_s:,.0f} s"
+        played, of_all = sum(row["task"] is not None for row in policy.scores), policy.num_test_tasks
+        score = f"{played} of {of_all} tasks evaluated"
+        if played == of_all:
+            score = interval_text(policy.scores[-1], "normalized_score")
+        lines.append(
+            f"{PREFIX + policy.name:{width}}  {policy.config.env.frames:9}  {tasks:>10}  {policy.num_updates:7,}  "
+            f"{spent:>14}  {score}"
+        )
+    return "\n".join([*lines, "", "gvz zoo NAME shows a policy's training tasks, and its score on each test task."])
+
+
+def _card(policy: _Policy) -> str:
+    """A policy's lines: what it was trained on, for how long, and its scores."""
+    from gvz.evaluation.table import score_lines
+
+    spent = "" if policy.processor_s is None else f", {policy.processor_s:,.0f} s of processor time"
+    config, trained_on = policy.config, f"trained on {', '.join(policy.config.table.ids)}"
+    lines = [
+        f"{PREFIX}{policy.name}: {config.name}, seed {config.seed}, {policy.num_updates:,} updates{spent}",
+        textwrap.fill(trained_on, 120, subsequent_indent="  ", break_on_hyphens=False),
+    ]
+    return "\n".join([*lines, *(score_lines(policy.scores) if policy.scores else ["no evaluation"])])

@@ -57,17 +57,19 @@ def score_lines(found: Sequence[Mapping[str, Any]]) -> list[str]:
     Where the score of a task is kills, a column has those by the player itself.
     """
 
-    def text(row: Mapping[str, Any], name: str) -> str:
-        value, low, high = row[name], row[f"{name}_low"], row[f"{name}_high"]
-        return "" if value is None else f"{value:.1f} [{low:.1f}, {high:.1f}]"
-
     kills = any(row["player_kills"] is not None for row in found)
     own = f"{'own kills [95%]':20}  " if kills else ""
     lines = [f"{'mean score [95%]':23}  {'% of the bound [95%]':20}  {own}episodes  level  task"]
     for row in found:
         name = row["task"] or f"mean of {len(found) - 1} tasks"
         level = "" if row["level"] is None else row["level"]
-        own = f"{text(row, 'player_kills'):20}  " if kills else ""
-        means = f"{text(row, 'score'):23}  {text(row, 'normalized_score'):20}"
+        own = f"{interval_text(row, 'player_kills'):20}  " if kills else ""
+        means = f"{interval_text(row, 'score'):23}  {interval_text(row, 'normalized_score'):20}"
         lines.append(f"{means}  {own}{row['episodes']:8}  {level!s:>5}  {name}")
     return lines
+
+
+def interval_text(row: Mapping[str, Any], name: str) -> str:
+    """An estimate of a row of `score_rows`, with its interval; empty where it is not known."""
+    value, low, high = row[name], row[f"{name}_low"], row[f"{name}_high"]
+    return "" if value is None else f"{value:.1f} [{low:.1f}, {high:.1f}]"

@@ -89,8 +89,11 @@ def test_it_is_evaluated_recorded_and_listed_with_its_score_card(run, tmp_path, 
     assert [row["task"] for row in rows] == [task] * 2
     capsys.readouterr()
     assert cli.main(["zoo"]) == 0
+    _, line, *_ = capsys.readouterr().out.splitlines()
+    assert line.split() == "zoo:one screen 4 tasks 100 1 of 7 tasks evaluated".split()
+    assert cli.main(["zoo", "one"]) == 0
     shown = capsys.readouterr().out
-    assert "zoo:one: small, seed 7, 100 updates, trained on defend_the_center/default" in shown
+    assert shown.startswith("zoo:one: small, seed 7, 100 updates\ntrained on defend_the_center/default, ")
     assert task in shown
     assert cli.main(["record", "zoo:one", "--out", "episode.gif", "--seconds", "0.5"]) == 0
     assert (tmp_path / "episode.gif").stat().st_size > 1000
