@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Zoo:
-    """List the trained policies that come with GViZDoom. With names: what each was trained on, and its score on each
-    test task.
+    """List the trained policies that come with GViZDoom; with names, show their training tasks and their scores.
 
     `zoo:NAME` stands for a policy wherever a command takes a run directory.
 
