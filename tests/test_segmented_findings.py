@@ -152,6 +152,9 @@ def test_the_findings_say_what_pairs_gave_beside_segmented_frames():
 
 def test_the_findings_say_what_six_times_the_time_gave():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
+    files = (ROOT / "results" / "general" / "runs" / "rainbow_segmented").glob("**/metrics.jsonl.gz")
+    steps = [json.loads(gzip.decompress(file.read_bytes()).splitlines()[-1])["num_updates"] for file in files]
+    assert f"of [segmented frames](#segmented-frames-yes), {min(steps):,} to {max(steps):,} gradient steps." in page
     agents = {"rainbow_general+sight_loss": "loss of sight", "rainbow_segmented": "segmented"}
     long = results_of("general").episodes
     of_1111, further = long.filter(run_seed=1111), long.filter(long["run_seed"] != 1111)
@@ -204,17 +207,19 @@ def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
     assert f"and {gathering[2]} in Health Gathering**, also above" in page
     assert f"**In Health Gathering the gate tasks lose {gathering[1].lstrip('-')} points**" in page
     assert f"The training tasks gain {gathering[0]} points" in page
-    both = [
-        agent_scores(results_of(folder).episodes.filter(scenario="defend_the_center"), "rainbow_segmented")
-        for folder in ("general", "general_short")
-    ]
-    sets = task_sets("defend_the_center")
-    of_both = [estimate_groups([(scores, tasks) for scores in both], difference).text for tasks in sets]
-    assert f"beside segmented frames | {of_both[1]} | -4.0 | {gathering[1]} | {kill[1]} | as you like" in page
+    of_both = []
+    for name in ("defend_the_center", "seek_and_kill"):
+        both = [
+            agent_scores(results_of(folder).episodes.filter(scenario=name), "rainbow_segmented")
+            for folder in ("general", "general_short")
+        ]
+        of_both += [estimate_groups([(scores, tasks) for scores in both], difference).text for tasks in task_sets(name)]
+    assert f"beside segmented frames | {of_both[1]} | -4.0 | {gathering[1]} | {of_both[5]} | as you like" in page
     assert (
         "both together have {} points more than 900 seconds on the training tasks, {} on the gate tasks and {} on the "
         "test tasks; on level 4 {}."
-    ).format(*of_both) in page
+    ).format(*of_both[:4]) in page
+    assert "both together have {}, {} and {} points more, and on level 4 {}.".format(*of_both[4:]) in page
     said = []
     for task in ("short_agent", "short_agent+water", "supreme"):
         scores = [one.filter(task=f"health_gathering/{task}")["normalized_score"].mean() for one in (long, short)]
