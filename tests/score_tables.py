@@ -1,4 +1,6 @@
-"""The columns that tables of the findings have for an agent."""
+"""The columns that tables of the findings have for an agent, and the runs that they compare."""
+
+import polars
 
 from gvz.reports.scores import Scores, estimate
 from gvz.tasks import TaskSet, named_tasks
@@ -18,3 +20,8 @@ def task_sets(scenario: str, training: TaskSet = "train8") -> list[list[str]]:
 def score_cells(scores: Scores, scenario: str, training: TaskSet = "train8") -> str:
     """Mean score and interval on each of `task_sets`, as cells of a Markdown table."""
     return " | ".join(estimate(scores, tasks).text for tasks in task_sets(scenario, training))
+
+
+def of_first_seed(episodes: polars.DataFrame) -> polars.DataFrame:
+    """Those of the first training seed that each scenario has."""
+    return episodes.filter(polars.col("run_seed") == polars.col("run_seed").min().over("scenario"))
