@@ -256,3 +256,14 @@ def test_the_findings_say_how_many_decisions_replay_and_on_policy_agents_took():
     )
     assert f"PQN took {pqn[0]} of them in Dodge Projectiles and {pqn[1]} in Health Gathering" in page
     assert f"PPO {ppo[0]} and {ppo[1]}, Rainbow {rainbow[0]} and {rainbow[1]}." in page
+
+
+@pytest.mark.parametrize("name", scenarios())
+def test_agents_on_segmented_frames_that_are_compared_differ_in_training_set_and_time_alone(name):
+    found = {}
+    for file in (ROOT / "results").glob(f"general*/runs/rainbow_segmented*/{name}/**/config.json"):
+        config = json.loads(file.read_text())["config"]
+        rewards = {component: weight for component, weight in config["env"]["reward_weights"] if name in component}
+        learned = {**config["agent"], **config["replay"], **config["learner"], **rewards}
+        found.setdefault(json.dumps(learned, sort_keys=True), []).append(file.relative_to(ROOT))
+    assert len(found) == 1, found.values()
