@@ -124,7 +124,7 @@ def test_the_findings_say_how_long_agents_of_compositions_learned():
         (
             "general",
             ("*/*/seed_1111", "dodge_projectiles/*/seed_2222"),
-            "{:,} to {:,} gradient steps. Seeds are 1111, of eight tasks in Dodge Projectiles 2222, with",
+            "{:,} to {:,} gradient steps. The training seed is 1111; that of eight tasks in Dodge",
         ),
         ("general_compositions", ("*/*/*",), "{:,} to {:,} gradient steps (eight tasks: 16,900 to 19,700)"),
         (

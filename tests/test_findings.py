@@ -259,11 +259,12 @@ def test_the_findings_say_how_many_decisions_replay_and_on_policy_agents_took():
 
 
 @pytest.mark.parametrize("name", scenarios())
-def test_agents_on_segmented_frames_that_are_compared_differ_in_training_set_and_time_alone(name):
+def test_agents_on_segmented_frames_that_are_compared_have_the_same_settings(name):
     found = {}
     for file in (ROOT / "results").glob(f"general*/runs/rainbow_segmented*/{name}/**/config.json"):
         config = json.loads(file.read_text())["config"]
         rewards = {component: weight for component, weight in config["env"]["reward_weights"] if name in component}
-        learned = {**config["agent"], **config["replay"], **config["learner"], **rewards}
-        found.setdefault(json.dumps(learned, sort_keys=True), []).append(file.relative_to(ROOT))
+        seen = {key: value for key, value in config["env"].items() if key not in ("reward_weights", "segmenter")}
+        settings = (rewards, seen, *(config[part] for part in ("agent", "replay", "learner")))
+        found.setdefault(json.dumps(settings, sort_keys=True), []).append(file.relative_to(ROOT))
     assert len(found) == 1, found.values()
