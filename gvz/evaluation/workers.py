@@ -3,32 +3,36 @@
 import contextlib
 import multiprocessing
 import os
+import queue
 import signal
-from collections.abc import Generator
-from concurrent.futures import ProcessPoolExecutor
+import traceback
+from collections.abc import Callable, Generator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from multiprocessing.connection import Connection
+from typing import Any, ParamSpec, TypeVar
 
 from gvz.core import janitor
 from gvz.core.errors import GvzError
 from gvz.transport.child import one_core
 
+P = ParamSpec("P")
+T = TypeVar("T")
+_SPAWN = multiprocessing.get_context("spawn")
+
 
 @contextlib.contextmanager
-def worker_processes(num_workers: int, died: str) -> Generator[ProcessPoolExecutor, None, None]:
+def worker_processes(num_workers: int, died: str) -> Generator[Executor, None, None]:
     """An executor with this number of processes. They end with the block.
 
-    If an exception leaves the block, the processes are killed. They also end if this process is killed.
+    If an exception leaves the block, the processes are killed. They also end if this process is killed, and nothing of
+    them is left then: not even if all processes are killed at once.
 
     Raises:
         GvzError: one of them died; `died` is its text.
     """
-    others = set(multiprocessing.active_children())
-    executor = ProcessPoolExecutor(
-        max_workers=num_workers,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_begin,
-        initargs=(os.getpid(),),
-    )
+    executor = _Processes(num_workers)
     ended = False
     try:
         yield executor
@@ -37,14 +41,72 @@ def worker_processes(num_workers: int, died: str) -> Generator[ProcessPoolExecut
         raise GvzError(died) from error
     finally:
         if not ended:  # what they do is not wanted any more, and one of them may hang
-            for worker in set(multiprocessing.active_children()) - others:
-                worker.kill()
+            executor.kill()
         executor.shutdown(wait=True, cancel_futures=True)
         if not ended:
             janitor.clean_dead_instances()
 
 
-def _begin(parent_pid: int) -> None:
+class _Processes(Executor):
+    """Spawned processes, and for each a thread that hands it calls over a pipe.
+
+    Differs: the standard library's ProcessPoolExecutor has five named semaphores. They stay in /dev/shm if its process
+    group is killed, since Python's tracker of such names dies with the group.
+    """
+
+    def __init__(self, num_workers: int):
+        self._processes, self._pipes = [], [_SPAWN.Pipe() for _ in range(num_workers)]
+        self._idle: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self._threads = ThreadPoolExecutor(num_workers)
+        for number, (_, theirs) in enumerate(self._pipes):
+            # in this thread: the kernel ends a process with the thread that started it
+            process = _SPAWN.Process(target=_work, args=(os.getpid(), theirs), daemon=True)
+            process.start()
+            theirs.close()
+            self._processes.append(process)
+            self._idle.put(number)
+
+    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        return self._threads.submit(self._call, partial(fn, *args, **kwargs))
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        self._threads.shutdown(wait=wait, cancel_futures=cancel_futures)
+        for ours, _ in self._pipes:
+            ours.close()  # a process ends when it finds its pipe closed
+        for process in self._processes:
+            process.join()
+
+    def kill(self) -> None:
+        """Ends the processes at once."""
+        for process in self._processes:
+            process.kill()
+
+    def _call(self, call: Callable[[], Any]) -> Any:
+        number = self._idle.get_nowait()  # there are no more threads than processes
+        pipe, _ = self._pipes[number]
+        try:
+            pipe.send(call)
+            result, error = pipe.recv()
+        except (EOFError, ConnectionError) as error:
+            raise BrokenProcessPool("a worker process died") from error
+        finally:
+            self._idle.put(number)
+        if error is not None:
+            raise error
+        return result
+
+
+def _work(parent_pid: int, pipe: Connection) -> None:
+    """The life of a process: calls come over the pipe, results or errors go back."""
     janitor.die_with_parent(parent_pid)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    os.set_inheritable(pipe.fileno(), False)  # it is to close with this process, not with its engines
     os.environ |= one_core()
+    with contextlib.suppress(EOFError, ConnectionError):
+        while True:
+            call = pipe.recv()
+            try:
+                pipe.send((call(), None))
+            except Exception as error:  # the process boundary: whatever it is, the caller is to hear of it
+                error.add_note("in a worker process:\n" + traceback.format_exc())
+                pipe.send((None, error))

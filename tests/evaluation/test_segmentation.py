@@ -3,11 +3,18 @@
 import itertools
 import multiprocessing
 import os
+import signal
+import subprocess
+import sys
+import threading
+import time
 from contextlib import closing
 from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
+import psutil
 import pytest
 
 from gvz.core.env_config import LABEL_CLASSES
@@ -176,6 +183,37 @@ def test_a_worker_that_dies_is_told_and_the_others_end():
     with pytest.raises(GvzError, match="one of them died"), worker_processes(2, "one of them died") as executor:
         executor.submit(os._exit, 1).result()
     assert set(multiprocessing.active_children()) <= before
+
+
+def test_a_worker_s_error_is_raised_here_and_the_worker_goes_on():
+    with worker_processes(1, "died") as executor:
+        with pytest.raises(ZeroDivisionError) as raised:
+            executor.submit(divmod, 1, 0).result()
+        assert "in a worker process" in raised.value.__notes__[0]
+        with pytest.raises(TypeError, match="pickle"):
+            executor.submit(threading.Lock).result()
+        assert executor.submit(divmod, 7, 2).result() == (3, 1)
+
+
+def test_workers_have_nothing_in_shared_memory_that_a_kill_of_all_processes_would_leave():
+    code = (
+        "import os; from gvz.evaluation.workers import worker_processes\n"
+        "if __name__ == '__main__':\n"
+        "    with worker_processes(2, 'died') as executor:\n"
+        "        print(*{executor.submit(os.getpid).result() for _ in range(9)}, flush=True); input()"
+    )
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True) as client:
+        assert client.stdout is not None
+        workers = [int(pid) for pid in client.stdout.readline().split()]
+        mapped = [Path(f"/proc/{pid}/maps").read_text() for pid in (client.pid, *workers)]
+        os.killpg(client.pid, signal.SIGKILL)
+    assert workers
+    assert not any("/dev/shm" in maps for maps in mapped)
+    deadline = time.monotonic() + 60
+    while any(map(psutil.pid_exists, workers)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(map(psutil.pid_exists, workers))
 
 
 def test_a_screen_is_normalized_in_training_as_it_is_later():
