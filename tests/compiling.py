@@ -9,7 +9,19 @@ from typing import Any
 import jax
 from jax._src import compiler
 
-LITTLE = {"xla_cpu_use_fusion_emitters": False}
+
+def _known(option: str) -> bool:
+    """Whether this version of XLA has an option: another one would refuse to compile anything with it."""
+    try:
+        jax.jit(lambda: 0, compiler_options={option: False}).lower().compile()
+    except jax.errors.JaxRuntimeError as error:
+        if "No such compile option" not in str(error):
+            raise
+        return False
+    return True
+
+
+LITTLE = {name: False for name in ("xla_cpu_use_fusion_emitters",) if _known(name)}
 """beside jax_disable_most_optimizations: a large program compiles in less than half of the time and runs as fast"""
 TRAINING = {"xla_backend_optimization_level": 0, **LITTLE}
 """of a loop that runs for seconds"""
