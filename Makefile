@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 INTEROP := .venv-interop
+OLDEST := .venv-oldest
 PEERS  := .venv-peers
 ARGS   ?=
 ISAS   ?= AVX2 SSE4_2
@@ -11,7 +12,7 @@ EXPERIMENTS ?= training_difficulty training_set_size algorithm_comparison rainbo
 # Tests start hundreds of Python processes: what one has compiled is kept, also where the environment says otherwise.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: help install engine install-cuda train test test-fast test-slow test-isa test-browser test-interop learning-seeds pipeline lint format lock bench bench-peers bench-micro soak soak-hosts fuzz docs clean
+.PHONY: help install engine install-cuda train test test-fast test-slow test-isa test-browser test-interop test-oldest learning-seeds pipeline lint format lock bench bench-peers bench-micro soak soak-hosts fuzz docs clean
 
 help:            ## show this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -71,6 +72,19 @@ $(INTEROP)/.installed: examples/requirements.txt
 	$(INTEROP)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
 	@touch $@
 
+test-oldest: $(OLDEST)/.installed ## test-fast with the oldest packages that pyproject.toml allows, in .venv-oldest
+	$(OLDEST)/bin/python -m pytest -m "not slow and not engine and not e2e and not browser" -n 2 --dist loadfile $(ARGS)
+
+$(OLDEST)/.installed: pyproject.toml requirements.lock | install
+	$(PYTHON) -m venv $(OLDEST)
+	$(BIN)/uv pip compile --quiet --resolution lowest-direct --extra cluster --extra segmenter --extra video \
+	  pyproject.toml --no-emit-index-url --no-emit-package opencv-python --output-file $(OLDEST)/oldest.txt
+	for file in requirements.lock $(OLDEST)/oldest.txt; do \
+	  $(BIN)/uv pip install --quiet --python $(OLDEST)/bin/python --no-deps -r $$file || exit 1; \
+	done
+	$(BIN)/uv pip install --quiet --python $(OLDEST)/bin/python --no-deps --no-build-isolation --editable .
+	@touch $@
+
 lint: install    ## format check, lint, types
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
@@ -121,4 +135,4 @@ lock: install    ## resolve requirements.lock from pyproject.toml
 	  --no-emit-index-url --no-header --no-annotate --no-emit-package opencv-python --output-file requirements.lock
 
 clean:           ## remove the virtual environment and caches
-	rm -rf $(VENV) $(INTEROP) $(PEERS) $(PEERS)-dopamine .pytest_cache .ruff_cache .hypothesis build dist
+	rm -rf $(VENV) $(INTEROP) $(OLDEST) $(PEERS) $(PEERS)-dopamine .pytest_cache .ruff_cache .hypothesis build dist

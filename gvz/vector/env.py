@@ -47,6 +47,9 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         batch_size: games that `recv` waits for, B.
     """
 
+    closed = True
+    """there is nothing to close, yet or any more"""
+
     def __init__(
         self,
         tasks: Task | str | Sequence[Task | str],
@@ -135,6 +138,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         ]
         self._crew = Crew(specs, self._frames)
         self._end = weakref.finalize(self, self._crew.close)  # also when the interpreter exits
+        self.closed = False
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
