@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.util
+import stat
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -41,8 +42,10 @@ def find_config_file(text: str) -> Path:
     if is_name:
         path = configs_directory() / (text if text.endswith(".py") else f"{text}.py")
     try:
-        if path.is_file():
+        if stat.S_ISREG(path.stat().st_mode):
             return path
+    except (FileNotFoundError, NotADirectoryError):
+        pass  # said below
     except OSError as error:  # a name too long, a directory that may not be entered
         raise ConfigError(f"--config: {text!r} cannot be read: {error.strerror}") from error
     if not is_name:

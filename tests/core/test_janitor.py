@@ -127,7 +127,8 @@ def test_what_a_process_has_is_left_alone_while_its_interpreter_has_ended_and_it
     code = (
         "import ctypes; from pathlib import Path; from gvz.core import janitor\n"
         f"janitor.record(Path({str(directory)!r})); libc = ctypes.CDLL(None)\n"
-        "libc.__cxa_atexit(libc.pause, None, None); libc.__cxa_atexit(libc.puts, b'ended', None)\n"
+        "libc.strdup.restype = ctypes.c_void_p; text = ctypes.c_void_p(libc.strdup(b'ended'))  # Python frees its own\n"
+        "libc.__cxa_atexit(libc.pause, None, None); libc.__cxa_atexit(libc.puts, text, None)\n"
         "libc.setbuf(ctypes.c_void_p.in_dll(libc, 'stdout'), None)"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as owner:
