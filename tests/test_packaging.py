@@ -7,6 +7,7 @@ import subprocess
 import sys
 import sysconfig
 import tarfile
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -147,3 +148,10 @@ def test_environments_and_their_evaluation_need_no_jax(tmp_path):
     assert task in run(*gvz, "tasks", **here)
     playing = ("--player", "random", "--tasks", task, "--episodes", "1", "--workers", "1", "--out", "random.jsonl")
     assert task in run(*gvz, "evaluate", *playing, **here)
+
+
+def test_the_examples_need_the_same_versions_as_the_package():
+    wanted = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    lines = (ROOT / "examples" / "requirements.txt").read_text().splitlines()
+    own = lines[lines.index("# of GViZDoom itself, which is installed there without its other dependencies") + 1 :]
+    assert {line for line in own if not line.startswith("pytest")} <= set(wanted)
