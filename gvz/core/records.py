@@ -106,6 +106,11 @@ def lock(file: IO[Any]) -> bool:
     return True
 
 
+def unlock(file: IO[Any]) -> None:
+    """Takes back the lock of an open file, also from forks that have it open."""
+    fcntl.flock(file, fcntl.LOCK_UN)
+
+
 def is_locked(path: Path) -> bool:
     """Whether a process holds the lock of this file."""
     if not path.exists():

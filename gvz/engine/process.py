@@ -145,10 +145,11 @@ def one_of(lock_names: Sequence[str], deadline: float) -> Generator[None, None, 
     """
     with contextlib.ExitStack() as stack:
         files = [stack.enter_context((janitor.runtime_dir() / f"{name}.lock").open("w")) for name in lock_names]
-        while not any(records.lock(file) for file in files):
+        while (locked := next(filter(records.lock, files), None)) is None:
             if time.monotonic() > deadline:
                 raise EngineError(f"engine: other processes held {', '.join(lock_names)} for the whole time-out")
             time.sleep(0.005)
+        stack.callback(records.unlock, locked)  # a fork that is not an engine yet would hold it
         yield
 
 
