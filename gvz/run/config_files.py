@@ -44,7 +44,7 @@ def find_config_file(text: str) -> Path:
     try:
         if stat.S_ISREG(path.stat().st_mode):
             return path
-    except (FileNotFoundError, NotADirectoryError):
+    except (FileNotFoundError, NotADirectoryError, ValueError):  # the last: a null byte
         pass  # said below
     except OSError as error:  # a name too long, a directory that may not be entered
         raise ConfigError(f"--config: {text!r} cannot be read: {error.strerror}") from error

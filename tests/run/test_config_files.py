@@ -100,6 +100,12 @@ def test_a_name_that_no_file_can_have_is_refused():
         find_config_file("a" * 300)
 
 
+@pytest.mark.parametrize("name", ["rainbow\0", "./rainbow\0.py"])
+def test_a_null_byte_is_in_no_name(name):
+    with pytest.raises(ConfigError, match="--config: no (config|file) '"):
+        find_config_file(name)
+
+
 def test_a_near_miss_is_suggested():
     with pytest.raises(ConfigError, match="did you mean 'rainbow_4task'"):
         load_config("rainbow_4tasks")
