@@ -102,7 +102,7 @@ def test_a_name_that_no_file_can_have_is_refused():
 
 @pytest.mark.parametrize("name", ["rainbow\0", "./rainbow\0.py"])
 def test_a_null_byte_is_in_no_name(name):
-    with pytest.raises(ConfigError, match="--config: no (config|file) '"):
+    with pytest.raises(ConfigError, match=r"--config: no (config|file) '"):
         find_config_file(name)
 
 
