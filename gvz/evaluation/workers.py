@@ -11,6 +11,7 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from typing import Any, ParamSpec, TypeVar
 
 from gvz.core import janitor
@@ -30,11 +31,12 @@ def worker_processes(num_workers: int, died: str) -> Generator[Executor, None, N
     them is left then: not even if all processes are killed at once.
 
     Raises:
-        GvzError: one of them died; `died` is its text.
+        GvzError: one of them died, and `died` is its text; or one could not be started.
     """
     executor = _Processes(num_workers)
     ended = False
     try:
+        executor.start()
         yield executor
         ended = True
     except BrokenProcessPool as error:
@@ -55,14 +57,30 @@ class _Processes(Executor):
     """
 
     def __init__(self, num_workers: int):
-        self._processes, self._pipes = [], [_SPAWN.Pipe() for _ in range(num_workers)]
+        self._num_workers = num_workers
+        self._processes: list[SpawnProcess] = []
+        self._pipes: list[Any] = []  # a Connection to each
         self._idle: queue.SimpleQueue[int] = queue.SimpleQueue()
         self._threads = ThreadPoolExecutor(num_workers)
-        for number, (_, theirs) in enumerate(self._pipes):
-            # in this thread: the kernel ends a process with the thread that started it
-            process = _SPAWN.Process(target=_work, args=(os.getpid(), theirs), daemon=True)
-            process.start()
-            theirs.close()
+
+    def start(self) -> None:
+        """Starts the processes, in this thread: the kernel ends a process with the thread that started it.
+
+        Raises:
+            GvzError: one cannot be started. Those before it run.
+        """
+        for number in range(self._num_workers):
+            try:
+                ours, theirs = _SPAWN.Pipe()
+                self._pipes.append(ours)
+                with theirs:
+                    process = _SPAWN.Process(target=_work, args=(os.getpid(), theirs), daemon=True)
+                    process.start()
+            except OSError as error:
+                raise GvzError(
+                    f"worker process {number + 1} of {self._num_workers} cannot be started: {error.strerror}; use "
+                    "fewer, or raise the limits of processes and open files (ulimit -u, ulimit -n)"
+                ) from error
             self._processes.append(process)
             self._idle.put(number)
 
@@ -71,8 +89,8 @@ class _Processes(Executor):
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         self._threads.shutdown(wait=wait, cancel_futures=cancel_futures)
-        for ours, _ in self._pipes:
-            ours.close()  # a process ends when it finds its pipe closed
+        for pipe in self._pipes:
+            pipe.close()  # a process ends when it finds its pipe closed
         for process in self._processes:
             process.join()
 
@@ -83,7 +101,7 @@ class _Processes(Executor):
 
     def _call(self, call: Callable[[], Any]) -> Any:
         number = self._idle.get_nowait()  # there are no more threads than processes
-        pipe, _ = self._pipes[number]
+        pipe = self._pipes[number]
         try:
             pipe.send(call)
             result, error = pipe.recv()

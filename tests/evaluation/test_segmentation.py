@@ -3,6 +3,7 @@
 import itertools
 import multiprocessing
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -182,6 +183,19 @@ def test_a_worker_that_dies_is_told_and_the_others_end():
     before = set(multiprocessing.active_children())
     with pytest.raises(GvzError, match="one of them died"), worker_processes(2, "one of them died") as executor:
         executor.submit(os._exit, 1).result()
+    assert set(multiprocessing.active_children()) <= before
+
+
+def test_a_worker_that_cannot_be_started_is_told_and_those_before_it_end():
+    before = set(multiprocessing.active_children())
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    message = r"worker process ([2-9]|1\d) of 40 cannot be started: Too many open files; use fewer"
+    resource.setrlimit(resource.RLIMIT_NOFILE, (psutil.Process().num_fds() + 20, limits[1]))
+    try:
+        with pytest.raises(GvzError, match=message), worker_processes(40, "died"):
+            pytest.fail("the block ran")
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
     assert set(multiprocessing.active_children()) <= before
 
 
