@@ -80,6 +80,37 @@ def test_the_findings_say_what_more_decisions_for_each_gradient_step_take():
     assert f"{wait} percent of their time, with 16 still {wait_16}." in page
 
 
+def test_the_findings_say_how_training_went_with_more_gradient_steps_beside_segmented_frames():
+    page = (ROOT / "docs" / "FINDINGS.md").read_text()
+    rows = []
+    for variant in ("decisions_4", "decisions_8", "decisions_16", "batch_64"):
+        folder = ROOT / "results" / "gates" / "runs" / f"rainbow_segmented+{variant}" / "defend_the_center"
+        (run,) = folder.glob("train8/*")
+        metrics, episodes = (
+            [json.loads(line) for line in gzip.decompress((run / f"{name}.jsonl.gz").read_bytes()).splitlines()]
+            for name in ("metrics", "episodes")
+        )
+        spent_s = np.interp(
+            [row["num_updates"] for row in episodes],
+            [row["num_updates"] for row in metrics],
+            [row["run/processor_s"] for row in metrics],
+        )
+        scores = np.array([row["normalized_score"] for row in episodes])
+        within = [
+            f"{scores[(spent_s >= low) & (spent_s < high)].mean():.1f}"
+            for low, high in ((100, 300), (300, 600), (600, 900))
+        ]
+        decisions = round(metrics[-1]["actors/env_steps"], -3)
+        rows.append((f"{metrics[-1]['num_updates']:,}", f"{decisions:,}", *within))
+    titles = (
+        "gradient steps",
+        "decisions",
+        *(f"training episodes, {w} s" for w in ("100 to 300", "300 to 600", "600 to 900")),
+    )
+    for title, cells in zip(titles, zip(*rows, strict=True), strict=True):
+        assert f"| {title} | {' | '.join(cells)} |" in page
+
+
 def test_the_findings_say_what_seven_minutes_of_a_gpu_gave():
     page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     folder, short = ROOT / "results" / "general_gpu", results_of("general_short").episodes
