@@ -123,8 +123,8 @@ def test_the_findings_say_how_long_agents_of_compositions_learned():
     for folder, runs, words in (
         (
             "general",
-            ("*/*/seed_1111", "dodge_projectiles/*/seed_2222"),
-            "{:,} to {:,} gradient steps. The training seed is 1111; that of eight tasks in Dodge",
+            ("*/*/seed_1111",),
+            "{:,} to {:,} gradient steps. The training seed is 1111. Intervals",
         ),
         ("general_compositions", ("*/*/*",), "{:,} to {:,} gradient steps (eight tasks: 16,900 to 19,700)"),
         (

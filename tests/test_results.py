@@ -143,6 +143,7 @@ def test_the_hour_of_the_main_job_says_what_its_records_give():
         ("general_compositions", None, 50),
         ("general_compositions_long", None, 50),
         ("general", None, 100),
+        ("general_on_policy", None, 100),
         ("gates", "gate", 20),
     ],
 )
