@@ -1,5 +1,11 @@
 """The columns that tables of the findings have for an agent, and the runs that they compare."""
 
+import gzip
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 import polars
 
 from gvz.reports.scores import Scores, estimate
@@ -25,3 +31,20 @@ def score_cells(scores: Scores, scenario: str, training: TaskSet = "train8") -> 
 def of_first_seed(episodes: polars.DataFrame) -> polars.DataFrame:
     """Those of the first training seed that each scenario has."""
     return episodes.filter(polars.col("run_seed") == polars.col("run_seed").min().over("scenario"))
+
+
+def metrics_of(run: Path) -> list[dict[str, Any]]:
+    """The rows of a run's metrics."""
+    return _rows(run / "metrics.jsonl.gz")
+
+
+def training_episodes(run: Path, low_s: float, high_s: float) -> list[dict[str, Any]]:
+    """Rows of the training episodes that ended within these seconds of the run's processor time."""
+    metrics, episodes = metrics_of(run), _rows(run / "episodes.jsonl.gz")
+    updates, spent_s = ([row[key] for row in metrics] for key in ("num_updates", "run/processor_s"))
+    ended_s = np.interp([row["num_updates"] for row in episodes], updates, spent_s)
+    return [row for row, second in zip(episodes, ended_s, strict=True) if low_s <= second < high_s]
+
+
+def _rows(file: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]

@@ -13,7 +13,7 @@ from gvz.reports.experiment_section import comparison_table, result_table
 from gvz.reports.results import read_results
 from gvz.reports.scores import agent_scores, estimate, estimate_groups
 from gvz.tasks import named_tasks, scenario_named, scenarios
-from tests.score_tables import score_cells
+from tests.score_tables import metrics_of, score_cells, training_episodes
 from tests.test_results import ROOT, results_of
 
 
@@ -82,33 +82,25 @@ def test_the_findings_say_what_more_decisions_for_each_gradient_step_take():
 
 def test_the_findings_say_how_training_went_with_more_gradient_steps_beside_segmented_frames():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
-    rows = []
-    for variant in ("decisions_4", "decisions_8", "decisions_16", "batch_64"):
-        folder = ROOT / "results" / "gates" / "runs" / f"rainbow_segmented+{variant}" / "defend_the_center"
-        (run,) = folder.glob("train8/*")
-        metrics, episodes = (
-            [json.loads(line) for line in gzip.decompress((run / f"{name}.jsonl.gz").read_bytes()).splitlines()]
-            for name in ("metrics", "episodes")
-        )
-        spent_s = np.interp(
-            [row["num_updates"] for row in episodes],
-            [row["num_updates"] for row in metrics],
-            [row["run/processor_s"] for row in metrics],
-        )
-        scores = np.array([row["normalized_score"] for row in episodes])
-        within = [
-            f"{scores[(spent_s >= low) & (spent_s < high)].mean():.1f}"
-            for low, high in ((100, 300), (300, 600), (600, 900))
-        ]
-        decisions = round(metrics[-1]["actors/env_steps"], -3)
-        rows.append((f"{metrics[-1]['num_updates']:,}", f"{decisions:,}", *within))
-    titles = (
-        "gradient steps",
-        "decisions",
-        *(f"training episodes, {w} s" for w in ("100 to 300", "300 to 600", "600 to 900")),
-    )
-    for title, cells in zip(titles, zip(*rows, strict=True), strict=True):
+    periods_s, columns, variants = ((100, 300), (300, 600), (600, 900)), [], ("4", "8", "16", "batch_64")
+    for variant in variants:
+        agent = f"rainbow_segmented+{variant if variant == 'batch_64' else f'decisions_{variant}'}"
+        (run,) = (ROOT / "results" / "gates" / "runs" / agent / "defend_the_center" / "train8").iterdir()
+        metrics = metrics_of(run)
+        if variant == "16":
+            wait = 100 * np.mean([row["learner/wait_share"] for row in metrics if "learner/wait_share" in row])
+            assert f"with 16, the learner waits {wait:.0f} percent of its time." in " ".join(page.split())
+        scores = [[row["normalized_score"] for row in training_episodes(run, *period)] for period in periods_s]
+        last = metrics[-1]
+        counts = (f"{last['num_updates']:,}", f"{round(last['actors/env_steps'], -3):,}")
+        columns.append((*counts, *(f"{np.mean(found):.1f}" for found in scores)))
+    titles = ("gradient steps", "decisions", *(f"training episodes, {low} to {high} s" for low, high in periods_s))
+    for title, cells in zip(titles, zip(*columns, strict=True), strict=True):
         assert f"| {title} | {' | '.join(cells)} |" in page
+    for row in (2, 3):
+        assert max(columns, key=lambda column: float(column[row])) == columns[0], (
+            "4 decisions are ahead for 600 seconds"
+        )
 
 
 def test_the_findings_say_what_seven_minutes_of_a_gpu_gave():

@@ -1,15 +1,10 @@
 """What the findings say of PPO on segmented frames is what its records give."""
 
-import gzip
-import json
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 
 from gvz.evaluation.statistics import difference
 from gvz.reports.scores import agent_scores, estimate_groups
-from tests.score_tables import score_cells, task_sets
+from tests.score_tables import metrics_of, score_cells, task_sets, training_episodes
 from tests.test_results import ROOT, results_of
 
 CENTER = "defend_the_center"
@@ -19,11 +14,6 @@ RUNS = {
     "Rainbow, seed 2222": f"general/runs/rainbow_segmented/{CENTER}/train8/seed_2222",
     "PPO, seed 1111": f"general_on_policy/runs/ppo_segmented/{CENTER}/train8/seed_1111",
 }
-
-
-def rows_of(run: str, name: str) -> list[dict[str, Any]]:
-    file = Path(ROOT / "results" / run / f"{name}.jsonl.gz")
-    return [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
 
 
 def test_the_findings_say_what_ppo_has_beside_segmented_frames():
@@ -42,20 +32,17 @@ def test_the_findings_say_what_ppo_has_beside_segmented_frames():
     assert said.format(*gains) in words
     summary = page.partition("## In short")[2].partition("\n## ")[0]
     assert f"not Rainbow, beside segmented frames | {gains[1].split()[0]} | | | | no |" in summary
-    last = rows_of(RUNS["PPO, seed 1111"], "metrics")[-1]
+    last = metrics_of(ROOT / "results" / RUNS["PPO, seed 1111"])[-1]
     assert f"{last['num_updates']:,} gradient steps and {round(last['actors/env_steps'], -4):,} decisions" in words
 
 
 def test_the_findings_say_how_ppo_learned_beside_segmented_frames():
     page = (ROOT / "docs" / "FINDINGS.md").read_text()
     for title, run in RUNS.items():
-        metrics, episodes = (rows_of(run, name) for name in ("metrics", "episodes"))
-        assert len({row["lane"] for row in episodes}) == 16
-        updates, spent_s = ([row[key] for row in metrics] for key in ("num_updates", "run/processor_s"))
-        ended_s = np.interp([row["num_updates"] for row in episodes], updates, spent_s)
         cells = []
-        for low, high in PERIODS_S:
-            found = [row for row, s in zip(episodes, ended_s, strict=True) if low <= s < high]
+        for low_s, high_s in PERIODS_S:
+            found = training_episodes(ROOT / "results" / run, low_s, high_s)
+            assert len({row["lane"] for row in found}) == 16
             scores, kills = (
                 np.mean([row["normalized_score"] for row in found]),
                 np.mean([row["reward_components"]["kill"] for row in found]),
