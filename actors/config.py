@@ -15,7 +15,8 @@ class ActorsConfig:
     """How many processes play, and how patiently they are watched. Times in seconds, sizes in step records."""
 
     num_actors: int | None = None
-    """actor processes, of each host if there are some (cluster.hosts); default one per CPU core of this machine"""
+    """actor processes, of each host if there are some (cluster.hosts); default one per CPU core of this machine, or
+    fewer if the replay or the warm-up has no room for their games"""
     games_per_actor: int | None = None
     """games each actor plays and acts on in one batch; default the smallest number >= 4 that gives every actor
     every task, with more than 16 tasks that gives every task a game in the run"""

@@ -38,13 +38,14 @@ class Launch:
 
 
 def argument(arguments: Sequence[str], flag: str) -> str | None:
-    """The value of a flag that decides the defaults of other flags; None if it is not given."""
+    """The value of a flag that decides the defaults of other flags: the last one, or None if it is not given."""
+    value = None
     for i, text in enumerate(arguments):
         if text == flag and i + 1 < len(arguments):
-            return arguments[i + 1]
-        if text.startswith(f"{flag}="):
-            return text.removeprefix(f"{flag}=")
-    return None
+            value = arguments[i + 1]
+        elif text.startswith(f"{flag}="):
+            value = text.removeprefix(f"{flag}=")
+    return value
 
 
 def parse(arguments: Sequence[str]) -> Launch:

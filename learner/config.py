@@ -9,6 +9,10 @@ from gvz.core.errors import ConfigError
 from gvz.core.registry import find
 
 ConvForm = Literal["auto", "direct", "shifted", "paired"]
+Augmentation = Literal["shift", "vertical_shift", "random_conv", "contrast", "gamma", "inversion", "cutout", "grey"]
+"""a function of learner/augment.py"""
+MOST_UPDATES = 2**31 - 1
+"""gradient steps of a run: they are counted with 32 bits"""
 
 
 class Range(NamedTuple):
@@ -136,9 +140,9 @@ class ValueConfig(EpsilonConfig):
 
     n_steps: Annotated[int, Range(1, 64)] = 1
     """n of the n-step return (eq. 4.15); 1 switches it off"""
-    augmentations: tuple[str, ...] = ()
-    """random changes of the online network's frames in training (learner/augment.py), in this order: shift
-    vertical_shift random_conv contrast gamma inversion cutout grey. Targets see clean frames"""
+    augmentations: tuple[Augmentation, ...] = ()
+    """random changes of the online network's frames in training (learner/augment.py), in this order. Targets see clean
+    frames"""
     augmentation_strength: Share = 1.0
     """0..1, of every augmentation"""
     augmentation_clean_share: Share = 0.5
@@ -201,7 +205,7 @@ class ReplayConfig:
 class LearnerConfig:
     """The update loop. A gradient step is one update; steps are decisions of the agent. Source: Tables 5.1, 5.2."""
 
-    total_updates: Annotated[int, Range(1, 10**12)] = 200_000
+    total_updates: Annotated[int, Range(1, MOST_UPDATES)] = 200_000
     """gradient steps of the whole run"""
     warmup_steps: Annotated[int, Range(1, 10**12)] = 10_000
     """decisions gathered before the first update, by uniformly random actions"""
@@ -230,7 +234,7 @@ class LearnerConfig:
     every target_period_updates"""
     average_ema: Annotated[float | None, Range(0.0, 1.0)] = None
     """likewise of a moving average of the parameters, which checkpoints keep for evaluation; default: no average"""
-    target_period_updates: Annotated[int, Range(1, 10**12)] = 3_000
+    target_period_updates: Annotated[int, Range(1, MOST_UPDATES)] = 3_000
     """gradient steps between copies into the target network"""
     publish_period_updates: Annotated[int, Range(1, 10**9)] = 10
     """gradient steps between publications of the parameters to the actors"""
@@ -252,7 +256,7 @@ class OnPolicyConfig:
     Defaults: PPO's for Atari, Schulman et al. 2017, Table 5 (its 3 epochs, and batches of a quarter of a rollout).
     """
 
-    total_updates: Annotated[int, Range(1, 10**12)] = 200_000
+    total_updates: Annotated[int, Range(1, MOST_UPDATES)] = 200_000
     """gradient steps of the whole run"""
     rollout_steps: Annotated[int, Range(1, 10**6)] = 128
     """steps of a window; a rollout is as many windows as there are games"""

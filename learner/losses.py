@@ -184,6 +184,7 @@ def munchausen_target(
     r_t: Float[Array, "B"],
     discount_t: Float[Array, "B"],
     z_t: Float[Array, "B A M"],
+    q_t: Float[Array, "B A"],
     alpha: float = 0.9,
     temperature: float = 0.03,
     lowest: float = -1.0,
@@ -199,11 +200,12 @@ def munchausen_target(
 
     Args:
         q_tm1: action values at t - 1 that pi(a|s) comes of: the target network's in the paper. BTR takes the online
-            network's, which saves a forward pass. No gradient flows through them.
+            network's, which saves a forward pass. No gradient flows through them. Minus infinity for masked actions.
         a_tm1: actions taken.
         r_t: (n-step) reward.
         discount_t: 0 where terminated.
         z_t: target network's values at t.
+        q_t: their means, which pi(.|s') comes of; minus infinity for masked actions, which pi never takes.
         alpha: scale of the bonus.
         temperature: T, the paper's tau; in units of the return.
         lowest: bound of the bonus, the paper's l0.
@@ -211,12 +213,12 @@ def munchausen_target(
     Source: Vieillard, Pietquin and Geist 2020, eq. 1 and 2, appendix B (M-IQN, the default values); Clark et al. 2024
     (BTR).
     """
-    chex.assert_rank([q_tm1, a_tm1, r_t, discount_t, z_t], [2, 1, 1, 1, 3])
-    chex.assert_equal_shape([q_tm1, z_t[:, :, 0]])
+    chex.assert_rank([q_tm1, a_tm1, r_t, discount_t, z_t, q_t], [2, 1, 1, 1, 3, 2])
+    chex.assert_equal_shape([q_tm1, z_t[:, :, 0], q_t])
     bonus = temperature * take_action(jax.nn.log_softmax(q_tm1 / temperature), a_tm1)
-    log_pi_t = jax.nn.log_softmax(z_t.mean(axis=-1) / temperature)
-    soft = z_t - temperature * log_pi_t[:, :, None]
-    value = jnp.einsum("ba,bam->bm", jnp.exp(log_pi_t), soft, precision=jax.lax.Precision.HIGHEST)
+    pi_t = jax.nn.softmax(q_t / temperature)
+    value = jnp.einsum("ba,bam->bm", pi_t, z_t, precision=jax.lax.Precision.HIGHEST)
+    value += temperature * jax.scipy.special.entr(pi_t).sum(axis=1, keepdims=True)  # 0 ln 0 is 0 there
     reward = r_t + alpha * jnp.clip(bonus, lowest, 0.0)
     return jax.lax.stop_gradient(reward[:, None] + discount_t[:, None] * value)
 

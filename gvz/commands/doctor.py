@@ -6,6 +6,8 @@ from pathlib import Path
 
 from gvz.core.errors import ConfigError
 
+MAX_HOLD_S = 86_400.0
+
 
 @dataclass(frozen=True, kw_only=True)
 class Doctor:
@@ -28,8 +30,10 @@ class Doctor:
         from gvz.core import janitor
         from gvz.run import doctor, shared_directory
 
-        if self.hold is not None and (self.shared is None or self.hold <= 0):
-            raise ConfigError(f"--hold: got {self.hold:g}, want more than 0 seconds, and --shared DIR")
+        if self.hold is not None and (self.shared is None or not 0 < self.hold <= MAX_HOLD_S):
+            raise ConfigError(
+                f"--hold: got {self.hold:g}, want more than 0 and at most {MAX_HOLD_S:g} seconds, and --shared DIR"
+            )
         if self.clean:
             for line in janitor.clean_dead_instances():
                 done = line if line.startswith("left alone") else f"removed {line}"

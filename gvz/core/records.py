@@ -188,6 +188,7 @@ def cut(path: Path, length: int, rest: Path) -> int:
     with path.open("r+b") as file, rest.open("ab") as kept:
         file.seek(length)
         num_bytes = kept.write(file.read())
+        kept.flush()  # on a full disk this fails, and nothing is cut
         file.truncate(length)
     return num_bytes
 

@@ -197,19 +197,18 @@ class RunConfig:
                     f"learner.devices: got {learner.devices}, want a divisor of {name}, which is {value}: every device "
                     "has an equal part of it; change the one or the other"
                 )
-        n_steps = self.agent.n_steps if isinstance(self.agent, ValueConfig) else 1
-        smallest = self.num_lanes * 4 * (max(self.agent.stack_size, self.agent.past_actions + 1) + n_steps)
+        smallest = self.num_lanes * self._slots_per_game
         if replay.capacity < smallest:
             raise ConfigError(
                 f"replay.capacity: got {replay.capacity}, want at least {smallest} for {self.num_lanes} games "
                 "(each keeps a stream of its own)"
             )
         # a game can hold n_steps records and no complete transition; the first update comes after one decision more
-        fewest = self.num_lanes * n_steps
+        fewest = self.num_lanes * self._n_steps
         if learner.warmup_steps < fewest:
             raise ConfigError(
                 f"learner.warmup_steps: got {learner.warmup_steps}, want at least {fewest}, which is "
-                f"agent.n_steps ({n_steps}) for each of {self.num_lanes} games; with fewer decisions there "
+                f"agent.n_steps ({self._n_steps}) for each of {self.num_lanes} games; with fewer decisions there "
                 "may be no complete transition to draw; raise it, or lower actors.num_actors or actors.games_per_actor"
             )
 
@@ -253,27 +252,55 @@ class RunConfig:
 
     @property
     def actors_per_host(self) -> int:
-        """Actor processes of a machine that plays, one per core by default: of this machine's cores."""
+        """Actor processes of a machine that plays. By default one per core of this machine, but no more than the run
+        has room for, and enough to give every task a game.
+        """
         if self.actors.num_actors is not None:
             return self.actors.num_actors
-        # a synchronous run must not depend on the machine it is on
-        return 1 if self.mode == "sync" else len(os.sched_getaffinity(0))
+        if self.mode == "sync":  # it must not depend on the machine it is on
+            return 1
+        num_tasks, hosts, most_lanes = len(self.table), max(1, self.cluster.hosts), self._most_lanes
+        counts = range(len(os.sched_getaffinity(0)), 1, -1)
+        fitting = (n for n in counts if n * hosts * self._games_of_each(n * hosts, num_tasks) <= most_lanes)
+        fewest = math.ceil(num_tasks / (hosts * (self.actors.games_per_actor or num_tasks)))
+        return max(next(fitting, 1), fewest if self.curriculum.kind == "fixed" else 1)
 
     @property
     def games_per_actor(self) -> int:
         """Games of one actor process; in sync mode all games of the run."""
-        num_tasks, games = len(self.table), self.actors.games_per_actor
+        num_tasks = len(self.table)
         actors = self.actors_per_host * max(1, self.cluster.hosts)
-        if games is None and num_tasks > _FEW_TASKS:
-            games = max(4, math.ceil(num_tasks / actors))
-        elif games is None:
-            games = num_tasks * math.ceil(4 / num_tasks)
+        games = self._games_of_each(actors, num_tasks)
         if games * actors < num_tasks and self.curriculum.kind == "fixed":
             raise ConfigError(
                 f"actors.games_per_actor: got {games} games for each of {actors} actors, but there are {num_tasks} "
                 f"tasks; every task needs a game: want at least {math.ceil(num_tasks / actors)}"
             )
         return games * actors if self.mode == "sync" else games
+
+    def _games_of_each(self, actors: int, num_tasks: int) -> int:
+        if self.actors.games_per_actor is not None:
+            return self.actors.games_per_actor
+        if num_tasks > _FEW_TASKS:
+            return max(4, math.ceil(num_tasks / actors))
+        return num_tasks * math.ceil(4 / num_tasks)
+
+    @property
+    def _most_lanes(self) -> int:
+        """Games that the step records, the replay and the warm-up have room for."""
+        if not isinstance(self.learner, LearnerConfig) or self.replay is None:
+            return MAX_LANES
+        slots = max(self._slots_per_game, MIN_CLUSTER_SLOTS if self.cluster.hosts else 1)
+        return min(MAX_LANES, self.replay.capacity // slots, self.learner.warmup_steps // self._n_steps)
+
+    @property
+    def _n_steps(self) -> int:
+        return self.agent.n_steps if isinstance(self.agent, ValueConfig) else 1
+
+    @property
+    def _slots_per_game(self) -> int:
+        """Step records of the replay that a game needs: it keeps a stream of its own."""
+        return 4 * (max(self.agent.stack_size, self.agent.past_actions + 1) + self._n_steps)
 
     @property
     def num_lanes(self) -> int:

@@ -161,15 +161,17 @@ def config_from_dict(saved: Any, agent_file: Path | None = None) -> RunConfig:
             kind = agent_config_class(name)
         case _:  # what is wrong is said below
             pass
-    config = build_config(plain, "config", kind)
     resolved = _from_plain(_Resolved, saved.get("resolved"), "resolved")
+    match plain:  # what this machine has room for is no matter: the run had these
+        case {"mode": "async", "actors": {**actors}}:
+            numbers = {"num_actors": resolved.num_actors, "games_per_actor": resolved.games_per_actor}
+            plain = {**plain, "actors": {**actors, **numbers}}
+        case _:
+            pass
+    config = build_config(plain, "config", kind)
     if resolved.tasks != (tasks := config.table.ids):
         raise ConfigError(f"resolved.tasks: got {list(resolved.tasks)}, but the configuration has {list(tasks)}")
-    config = config.with_support(resolved.support)
-    if config.mode == "sync":
-        return config
-    numbers = {"num_actors": resolved.num_actors, "games_per_actor": resolved.games_per_actor}
-    return dataclasses.replace(config, actors=dataclasses.replace(config.actors, **numbers))
+    return config.with_support(resolved.support)
 
 
 def build_config(plain: Any, where: str, agent: type[AgentConfig]) -> RunConfig:

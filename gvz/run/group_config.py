@@ -28,10 +28,11 @@ class GroupConfig:
         check_ranges("group", self)
         if self.num_processes == 1:
             return
-        if self.coordinator is None or not self.coordinator.rpartition(":")[2].isdecimal() or not self.address[0]:
+        host, _, port = (self.coordinator or "").rpartition(":")
+        if not host or not port.isdecimal() or not 0 < int(port) < 2**16:
             raise ConfigError(
                 f"group.coordinator: got {self.coordinator!r} for {self.num_processes} processes, want HOST:PORT, "
-                "where process 0 can listen and the others reach it"
+                "where process 0 can listen and the others reach it, with a port of 1..65535"
             )
         if not self.own_id < self.num_processes:
             raise ConfigError(f"group.process_id: got {self.own_id}, want 0..{self.num_processes - 1}")

@@ -7,10 +7,12 @@ The directory is private to its user. The lengths of its record files stand in e
 `discarded/` what a killed one wrote after its last checkpoint.
 """
 
+import contextlib
 import json
 import os
 import shutil
 import time
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -36,12 +38,10 @@ class RunDir:
             ResumeError: another live process holds it, or it cannot be created.
         """
         self.path = path
-        try:
+        with disk_checked(path):
             path.mkdir(parents=True, exist_ok=True, mode=0o700)
             self._lock = os.fdopen(os.open(path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600), "a+")
             locked = records.lock(self._lock)
-        except OSError as error:
-            raise ResumeError(f"run directory {path}: {error.strerror}; choose another with --run-dir") from error
         if not locked:
             self._lock.close()
             raise ResumeError(f"run directory {path}: another running process uses it; wait or use --run-dir")
@@ -89,12 +89,17 @@ class RunDir:
             )
 
     def write_config(self, config: RunConfig) -> None:
-        """Writes config.json atomically: after a power cut too it is the old one or the new one."""
+        """Writes config.json atomically: after a power cut too it is the old one or the new one.
+
+        Raises:
+            ResumeError: the disk does not take it.
+        """
         temporary = self.path / "config.json.tmp"
-        temporary.write_text(json.dumps(config_to_dict(config), indent=2) + "\n")
-        fsync(temporary)
-        temporary.replace(self.path / "config.json")
-        fsync(self.path)
+        with disk_checked(self.path):
+            temporary.write_text(json.dumps(config_to_dict(config), indent=2) + "\n")
+            fsync(temporary)
+            temporary.replace(self.path / "config.json")
+            fsync(self.path)
 
     def append(self, name: str, row: dict[str, Any]) -> None:
         """Adds a row to a record file. On a full disk rows wait in memory, and are written with the next one.
@@ -117,11 +122,15 @@ class RunDir:
         """Cuts the records to the lengths a checkpoint vouches for, keeping the rest in `discarded/`.
 
         Returns: number of bytes moved.
+
+        Raises:
+            ResumeError: the disk does not take them; the records are as they were.
         """
         known = {name: length for name, length in lengths.items() if name in RECORD_FILES}
-        return sum(
-            records.cut(self.path / name, length, self.path / "discarded" / name) for name, length in known.items()
-        )
+        with disk_checked(self.path):
+            return sum(
+                records.cut(self.path / name, length, self.path / "discarded" / name) for name, length in known.items()
+            )
 
     def close(self) -> None:
         """Closes the record files and releases the lock. Can be repeated.
@@ -150,6 +159,21 @@ class RunDir:
         self.close()
 
 
+@contextlib.contextmanager
+def disk_checked(path: Path) -> Generator[None]:
+    """Within it, an error of the disk is one of the run directory `path`.
+
+    Raises:
+        ResumeError: says what the disk cannot do.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise ResumeError(
+            f"run directory {path}: {error.strerror}; mend this, or choose another with --run-dir"
+        ) from error
+
+
 def move_aside(path: Path) -> Path | None:
     """Moves an old run out of the way for `--fresh`: never overwrites, never deletes.
 
@@ -157,15 +181,18 @@ def move_aside(path: Path) -> Path | None:
 
     Raises:
         ConfigError: the directory holds something that is not a run of ours.
-        ResumeError: a live process uses it.
+        ResumeError: a live process uses it, or it cannot be moved.
     """
-    if not path.exists() or not any(path.iterdir()):
-        return None
+    path = Path(os.path.abspath(path))  # noqa: PTH100  # "." has no name, and a link to a run is moved, not the run
+    with disk_checked(path):
+        if not path.exists() or not any(path.iterdir()):
+            return None
     if not (path / "config.json").exists() and not (path / "lock").exists():
         raise ConfigError(f"--fresh: {path} is not a run directory (no config.json); choose another --run-dir")
     with RunDir(path):  # refuses a directory in use
         target = path.with_name(f"{path.name}.{time.strftime('%Y%m%d-%H%M%S')}")
         while target.exists():
             target = target.with_name(target.name + "+")
-        path.rename(target)
+        with disk_checked(path):
+            path.rename(target)
     return target

@@ -56,6 +56,11 @@ class Saver:
         """A checkpoint is being written."""
         return self._checkpointer.busy
 
+    @property
+    def behind(self) -> bool:
+        """There are gradient steps that no checkpoint has."""
+        return self._counts.saved_updates != self._counts.updates or self._num_failed > 0
+
     def save_when_due(self, group: Group) -> None:
         """Begins a checkpoint at every multiple of the period, and again some time after one failed.
 
@@ -82,7 +87,7 @@ class Saver:
         """
         failure = self.wait()
         for _ in range(_LAST_ATTEMPTS):
-            if self._counts.saved_updates == self._counts.updates and not self._num_failed:
+            if not self.behind:
                 break
             self._begin()
             begun()

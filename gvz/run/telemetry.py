@@ -26,7 +26,7 @@ from tensorboardX.summary import scalar
 from gvz.core.errors import ConfigError
 from gvz.run.config import LogConfig
 from gvz.run.progress import TaskStatus
-from gvz.run.rundir import RunDir
+from gvz.run.rundir import RunDir, disk_checked
 from gvz.task_table import TaskTable
 from gvz.transport.messages import EpisodeStats, Fault
 
@@ -55,16 +55,18 @@ class Rates:
 class Telemetry:
     """Writes the records of one run and remembers the recent score of each task."""
 
-    def __init__(self, run: RunDir, table: TaskTable, config: LogConfig, num_updates: int):
-        """Opens the records. Events of a killed run that come after `num_updates` gradient steps are hidden.
+    def __init__(self, run: RunDir, table: TaskTable, config: LogConfig, logged_updates: int):
+        """Opens the records. Events of a stopped run that come after `logged_updates` gradient steps, its last row that
+        stays, are hidden.
 
         Raises:
-            ConfigError: wandb is wanted, and not installed or not logged in.
+            ConfigError: wandb is wanted, and not installed or not logged in. ResumeError: the disk is full.
         """
         self._run, self._table = run, table
         self._recent: list[deque[float]] = [deque(maxlen=RECENT_EPISODES) for _ in table.rows]
         self._episodes = [0] * len(table)
-        self._events = start_events(run.tensorboard, num_updates) if config.tensorboard else None
+        with disk_checked(run.path):
+            self._events = start_events(run.tensorboard, logged_updates + 1) if config.tensorboard else None
         self._wandb = start_wandb(run) if config.wandb else None
 
     def episode(self, stats: EpisodeStats, *, num_updates: int, env_steps: int) -> None:
@@ -154,7 +156,7 @@ class Telemetry:
 
 
 def start_events(directory: Path, num_updates: int) -> io.FileIO:
-    """A new file of TensorBoard events, which hides older events from `num_updates` on: a killed run wrote them.
+    """A new file of TensorBoard events, which hides older events from `num_updates` on: a stopped run wrote them.
 
     (tensorboardX's own `SummaryWriter` writes in a thread, which ends at the first error. Its queue then blocks the
     logging thread for ever.)

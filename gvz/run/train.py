@@ -25,7 +25,7 @@ from gvz.run.group import Group, join
 from gvz.run.monitor import Counts, Monitor
 from gvz.run.progress import Progress
 from gvz.run.restore import note_start, restore, state_checked
-from gvz.run.rundir import RunDir
+from gvz.run.rundir import RunDir, disk_checked
 from gvz.run.saver import Saver, Snapshot
 from gvz.run.telemetry import Telemetry
 from gvz.segmentation import KEPT_SEGMENTERS, keep_segmenters, with_kept_segmenters
@@ -63,7 +63,7 @@ class Trainer:
         self._processor_start_s = machine.processor_s() - self._counts.processor_s
         self._learner = parts.learner.make(jax.random.key(config.seed), parts.table.ids, run.path, restored)
         self._published_params = self._learner.acting_params() if restored is None else restored.arrays["acting"]
-        self._telemetry = Telemetry(run, parts.table, config.log, self._counts.updates)
+        self._telemetry = Telemetry(run, parts.table, config.log, self._counts.logged_updates)
         if host is not None:
             self._telemetry.restore(host["telemetry"])
         self._curriculum = Curriculum(config.curriculum, parts.table, config.games_seed, host and host["curriculum"])
@@ -77,7 +77,7 @@ class Trainer:
         """Trains until the last update, the end of its processor time, or a stop; then writes a checkpoint.
 
         The last row of metrics of an interrupted run stands after what its checkpoint vouches for: a resumed run sets
-        it aside, and its next row has the whole log period.
+        it aside, and the means of its learner in the next row are of the whole log period.
 
         Raises:
             WorkerError, WaitTimeoutError: the actors failed for good; a checkpoint is written first.
@@ -100,7 +100,8 @@ class Trainer:
             with contextlib.suppress(CheckpointError, WaitTimeoutError):  # already reported; the first error is raised
                 self._saver.save_last(self._record_row)
             raise
-        self._progress.say("stopping: writing a checkpoint" if stop.requested else "done: writing the last checkpoint")
+        last = "writing the last checkpoint" if self._saver.behind else "no new gradient steps to save"
+        self._progress.say(f"{'stopping' if stop.requested else 'done'}: {last}")
         self._saver.save_last(self._record_row)
 
     def close(self, *, abandon_save: bool = False) -> None:
@@ -211,7 +212,8 @@ def with_own_segmenters(config: RunConfig, run: RunDir) -> RunConfig:
     use the networks that are installed.
     """
     own = run.path / KEPT_SEGMENTERS
-    keep_segmenters([scenario.id for scenario in config.table.scenarios], config.env, own)
+    with disk_checked(run.path):
+        keep_segmenters([scenario.id for scenario in config.table.scenarios], config.env, own)
     if config.cluster.hosts:
         return config
     return dataclasses.replace(config, env=with_kept_segmenters(config.env, own))

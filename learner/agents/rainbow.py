@@ -152,13 +152,14 @@ class Rainbow(NetworkAgent):
         config = self.config
         if not config.munchausen:
             return losses.quantile_target(batch.r_t, batch.discount_t, logits_t, q_t_selector)
-        q_tm1 = self.q_values(self.outputs(target, batch.obs_tm1))
+        q_tm1, q_t = self.q_values(self.outputs(target, batch.obs_tm1)), self.q_values(logits_t)
         return losses.munchausen_target(
-            q_tm1,
+            allowed_values(q_tm1, batch.obs_tm1.mask),
             batch.a_tm1,
             batch.r_t,
             batch.discount_t,
             logits_t,
+            allowed_values(q_t, batch.obs_t.mask),
             config.munchausen_alpha,
             config.munchausen_temperature,
         )

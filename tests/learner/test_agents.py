@@ -1,5 +1,6 @@
 """Agents: the contract of all there are, DQN as Rainbow without its parts, each part's effect, agents in files."""
 
+import copy
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -118,6 +119,42 @@ def test_only_the_online_network_sees_augmented_frames_and_hidden_inputs(agent_n
     assert np.abs(np.asarray(found[0].q_tm1 - found[2].q_tm1)).max() > 0.01
     before, after = (np.asarray(result.td_error + result.q_tm1) for result in (found[0], found[2]))
     np.testing.assert_allclose(before, after, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {},
+        {"double": True},
+        {"distributional": True},
+        {"distributional": True, "num_quantiles": 5},
+        {"munchausen": True},
+        {"distributional": True, "num_quantiles": 5, "munchausen": True},
+        {"name": "in a file"},
+    ],
+    ids=str,
+)
+def test_no_target_reads_the_value_of_a_masked_action(parts: dict, agent_file: Path):
+    """Another value of a masked action leaves loss and priority as they are, to the last bit."""
+    config = plain_config(str(agent_file)) if "name" in parts else replace(ALL_OFF, **parts)
+    agent, _, _, loss = jitted(config)
+    params = made_up_params(agent, 0)
+    of_last_action = slice(-(len(params["params"]["q_output"]["bias"]) // A), None)
+    changed = copy.deepcopy(params)
+    changed["params"]["q_output"]["kernel"][of_last_action] *= -20
+    allowed = jnp.broadcast_to(jnp.arange(A) < A - 1, (B, A))
+    open_to_all = batch()
+    masked = replace(
+        open_to_all,
+        a_tm1=jnp.minimum(open_to_all.a_tm1, A - 2),
+        obs_tm1=replace(open_to_all.obs_tm1, mask=allowed),
+        obs_t=replace(open_to_all.obs_t, mask=allowed),
+    )
+    for b, is_equal in ((masked, True), (open_to_all, False)):
+        before, after = (loss(p, p, jax.random.key(3), b) for p in (params, changed))
+        assert np.isfinite(before.loss).all()
+        assert np.array_equal(before.loss, after.loss) == is_equal
+        assert np.array_equal(before.priority, after.priority) == is_equal
 
 
 def test_parts_that_do_not_fit_together_are_refused():

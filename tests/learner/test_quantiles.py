@@ -102,7 +102,7 @@ def test_quantile_loss_equals_finite_differences_and_stops_at_the_target():
 
     def loss(z_t):
         target = losses.quantile_target(b["r_t"], b["discount_t"], z_t)
-        munchausen = losses.munchausen_target(z_t.mean(2), b["a_tm1"], b["r_t"], b["discount_t"], z_t)
+        munchausen = losses.munchausen_target(z_t.mean(2), b["a_tm1"], b["r_t"], b["discount_t"], z_t, z_t.mean(2))
         return sum(losses.quantile_huber(b["z_tm1"][:, 0], b["fractions"], t).sum() for t in (target, munchausen))
 
     assert not jax.grad(loss)(b["z_t"]).any()
@@ -144,7 +144,7 @@ def test_quantile_q_learning_agrees_with_rlax(rlax: ModuleType, double: bool):
 def test_munchausen_target_is_the_hand_worked_number():
     # Of two equal actions ln pi = -ln 2, and the soft value of two zeros is ln 2: 1 - ln 2 + 0.5 ln 2.
     zeros = jnp.zeros((1, 2))
-    args = (zeros, jnp.array([0]), jnp.array([1.0]), jnp.array([0.5]), zeros[:, :, None])
+    args = (zeros, jnp.array([0]), jnp.array([1.0]), jnp.array([0.5]), zeros[:, :, None], zeros)
     target = losses.munchausen_target(*args, alpha=1.0, temperature=1.0, lowest=-10.0)
     np.testing.assert_allclose(target, [[1 - 0.5 * np.log(2)]], rtol=1e-6)
     clipped = losses.munchausen_target(*args, alpha=0.5, temperature=1.0, lowest=-0.4)
@@ -158,15 +158,27 @@ def test_munchausen_target_is_the_float64_oracle(alpha: float, temperature: floa
         b = random_batch(seed)
         args = (b["q_tm1"], b["a_tm1"], b["r_t"], b["discount_t"])
         for z_t in (b["z_t"], b["z_t"][:, :, :1]):  # quantiles, and Munchausen-DQN
-            found = losses.munchausen_target(*args, z_t, alpha, temperature, lowest)
+            found = losses.munchausen_target(*args, z_t, z_t.mean(2), alpha, temperature, lowest)
             wanted = munchausen_oracle(b | {"z_t": z_t}, alpha, temperature, lowest)
             np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("temperature", [0.03, 2.0])
+def test_a_masked_action_changes_nothing_in_munchausens_target(temperature: float):
+    """Whatever its value is, the target is that of the same batch without this action."""
+    b = random_batch(3)
+    args = (jnp.minimum(b["a_tm1"], A - 2), b["r_t"], b["discount_t"])
+    fewer_z, fewer_q = b["z_t"][:, :-1], b["q_tm1"][:, :-1]
+    wanted = losses.munchausen_target(fewer_q, *args, fewer_z, fewer_z.mean(2), temperature=temperature)
+    q_tm1, q_t = (q.at[:, -1].set(-jnp.inf) for q in (b["q_tm1"], b["z_t"].mean(2)))
+    found = losses.munchausen_target(q_tm1, *args, b["z_t"].at[:, -1].set(50.0), q_t, temperature=temperature)
+    np.testing.assert_allclose(found, wanted, rtol=1e-6)
 
 
 def test_without_bonus_and_temperature_munchausen_is_quantile_q_learning():
     b = random_batch(0)
     found = losses.munchausen_target(
-        b["q_tm1"], b["a_tm1"], b["r_t"], b["discount_t"], b["z_t"], alpha=0.0, temperature=1e-6
+        b["q_tm1"], b["a_tm1"], b["r_t"], b["discount_t"], b["z_t"], b["z_t"].mean(2), alpha=0.0, temperature=1e-6
     )
     np.testing.assert_allclose(found, losses.quantile_target(b["r_t"], b["discount_t"], b["z_t"]), atol=1e-4)
 
@@ -176,4 +188,6 @@ def test_shapes_that_do_not_belong_together_are_refused():
     with pytest.raises(AssertionError, match="equal_shape"):
         losses.quantile_target(b["r_t"], b["discount_t"], b["z_t"], b["selector"][:, :2])
     with pytest.raises(AssertionError, match="equal_shape"):
-        losses.munchausen_target(b["q_tm1"][:, :2], b["a_tm1"], b["r_t"], b["discount_t"], b["z_t"])
+        losses.munchausen_target(
+            b["q_tm1"][:, :2], *(b[name] for name in ("a_tm1", "r_t", "discount_t", "z_t", "q_tm1"))
+        )

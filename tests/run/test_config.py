@@ -2,9 +2,11 @@
 
 import dataclasses
 import json
+import os
 import re
 import subprocess
 import sys
+from typing import get_args
 
 import pytest
 
@@ -12,13 +14,15 @@ from actors.config import ActorsConfig
 from gvz.actions import UNIFIED_V1
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError, TaskError
-from gvz.launch import main, parse
+from gvz.launch import main, parse, resumed_config
 from gvz.run.config import RunConfig
 from gvz.run.config_files import config_from_dict, config_to_dict, configs_directory, load_config
 from gvz.run.resume import differences
+from gvz.run.rundir import RunDir
 from gvz.tasks import scenario_named
 from learner.agents.configs.ppo import PPOConfig
-from learner.config import LearnerConfig, OnPolicyConfig, ReplayConfig
+from learner.augment import AUGMENTATIONS
+from learner.config import Augmentation, LearnerConfig, OnPolicyConfig, ReplayConfig
 
 ALL_CONFIGS = sorted(p.stem for p in configs_directory().glob("*.py") if p.stem != "__init__")
 
@@ -29,6 +33,63 @@ def test_every_config_loads_and_survives_json(name):
     assert config.name == name
     saved = json.loads(json.dumps(config_to_dict(config)))
     assert differences(config_from_dict(saved), config) == []
+
+
+@pytest.mark.parametrize("name", ALL_CONFIGS)
+@pytest.mark.parametrize("cores", [1, 3, 96, 512])
+def test_every_config_fits_any_number_of_cores(name, cores, monkeypatch):
+    """By default there is an actor for each core, unless the replay or the warm-up has no room for their games."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+    config = load_config(name)
+    assert len(config.table) <= config.num_lanes
+    if config.actors.num_actors is None and cores < 16:
+        assert config.num_actors == cores
+
+
+def test_a_saved_run_has_its_actors_and_games_on_any_machine(tmp_path, monkeypatch):
+    """More tasks than one actor of its two has games for; and more games than its replay has room for on 96 cores."""
+    for name, flags in (("rainbow_4task", ["--actors.games-per-actor", "2"]), ("rainbow_segmented", [])):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+        config = parse(["--config", name, *flags]).run
+        saved, numbers = config_to_dict(config), (config.num_actors, config.games_per_actor)
+        for cores in (1, 96):
+            monkeypatch.setattr(os, "sched_getaffinity", lambda _, cores=cores: set(range(cores)))
+            read = config_from_dict(saved)
+            assert (read.num_actors, read.games_per_actor) == numbers
+            again = parse(["--config", name, *flags]).run
+            with RunDir(tmp_path / name) as run:
+                run.write_config(read)
+                resumed = resumed_config(run, again)
+            assert (resumed.num_actors, resumed.games_per_actor) == numbers
+
+
+def test_the_last_of_two_equal_flags_holds_also_for_what_it_decides():
+    """`make train ARGS="--config ..."` gives two."""
+    launch = parse(["--config", "rainbow_4task.py", "--config=rainbow_quick.py"])
+    assert launch.run == load_config("rainbow_quick")
+    launch = parse(["--agent.name", "dqn", "--agent.name", "rainbow"])
+    assert launch.run == load_config("rainbow_4task")
+
+
+def test_numbers_that_the_learner_cannot_count_to_are_refused_at_once():
+    for make in (
+        lambda: LearnerConfig(target_period_updates=2**31),
+        lambda: LearnerConfig(total_updates=2**31),
+        lambda: OnPolicyConfig(total_updates=2**31),
+    ):
+        with pytest.raises(ConfigError, match=r"learner\.\w+_updates: got 2147483648, want 1\.\."):
+            make()
+
+
+@pytest.mark.parametrize("field", ["augmentations", "sight_augmentations"])
+def test_an_unknown_augmentation_is_refused_at_once(field, capfd):
+    with pytest.raises(SystemExit, match="2"):
+        main(["--config", "rainbow_quick", "--agent.sight-weight", "0.1", f"--agent.{field}", "shfit"])
+    assert "invalid choice 'shfit'" in "".join(capfd.readouterr())
+
+
+def test_the_names_of_augmentations_are_those_of_its_functions():
+    assert get_args(Augmentation) == tuple(AUGMENTATIONS)
 
 
 def test_the_main_config_plays_the_four_tasks():

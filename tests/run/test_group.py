@@ -219,6 +219,7 @@ def test_a_forwarded_connection_outlives_the_other_end():
     [
         ({}, r"group\.coordinator: got None for 2 processes, want HOST:PORT"),
         ({"coordinator": "here", "process_id": 0}, r"group\.coordinator: got 'here'"),
+        ({"coordinator": "here:65536", "process_id": 0}, r"group\.coordinator: got 'here:65536'.* port of 1\.\.65535"),
         ({"coordinator": "here:1", "process_id": 2}, r"group\.process_id: got 2, want 0\.\.1"),
         (
             {"coordinator": "here:1"},

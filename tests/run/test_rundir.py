@@ -4,6 +4,7 @@ import dataclasses
 import gzip
 import json
 import stat
+from pathlib import Path
 
 import pytest
 
@@ -26,7 +27,7 @@ def test_it_is_private_and_held_by_one(tmp_path):
 
 def test_a_path_that_cannot_be_made_says_so(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(ResumeError, match=r"file/run: Not a directory; choose another with --run-dir"):
+    with pytest.raises(ResumeError, match=r"file/run: Not a directory; mend this, or choose another with --run-dir"):
         RunDir(tmp_path / "file" / "run")
 
 
@@ -167,6 +168,37 @@ def test_fresh_refuses_what_is_no_run_or_in_use(tmp_path):
         move_aside(tmp_path)
     with RunDir(tmp_path / "run"), pytest.raises(ResumeError, match="another running process"):
         move_aside(tmp_path / "run")
+
+
+def test_fresh_moves_the_directory_that_one_is_in(tmp_path, monkeypatch):
+    with RunDir(tmp_path / "run") as run:
+        run.write_config(CONFIG)
+    monkeypatch.chdir(run.path)
+    moved = move_aside(Path())
+    assert moved is not None
+    assert [path for path in tmp_path.iterdir() if (path / "config.json").exists()] == [moved]
+
+
+def test_fresh_says_what_it_cannot_move(tmp_path):
+    (tmp_path / "file").write_text("precious")
+    with pytest.raises(ResumeError, match=r"file: Not a directory; mend this"):
+        move_aside(tmp_path / "file")
+    assert (tmp_path / "file").read_text() == "precious"
+
+
+def test_a_run_that_starts_on_a_full_disk_says_so_and_keeps_its_records(tmp_path):
+    with RunDir(tmp_path) as run:
+        run.write_config(CONFIG)
+        before = (tmp_path / "config.json").read_bytes()
+        run.append("episodes.jsonl", {"text": "x" * 500})
+        with full_disk(100):
+            for action in (lambda: run.write_config(CONFIG), lambda: run.truncate_records({"episodes.jsonl": 0})):
+                with pytest.raises(
+                    ResumeError, match=r"run directory .*: (File too large|No space left on device); mend"
+                ):
+                    action()
+        assert (tmp_path / "config.json").read_bytes() == before
+        assert len(records.read(tmp_path / "episodes.jsonl")[0]) == 1
 
 
 def test_rows_wait_for_room_on_a_full_disk_and_none_is_lost_or_torn(tmp_path):

@@ -85,8 +85,9 @@ def test_an_old_lock_file_says_nothing(tmp_path):
     ("flags", "text"),
     [
         (["--shared", "/nowhere"], "/nowhere is no directory that you can write to"),
-        (["--hold", "5"], "--hold: got 5, want more than 0 seconds, and --shared DIR"),
-        (["--shared", "/tmp", "--hold", "0"], "--hold: got 0, want more than 0 seconds"),
+        (["--hold", "5"], "--hold: got 5, want more than 0 and at most 86400 seconds, and --shared DIR"),
+        (["--shared", "/tmp", "--hold", "0"], "--hold: got 0, want more than 0 and at most 86400 seconds"),
+        (["--shared", "/tmp", "--hold", "inf"], "--hold: got inf, want more than 0 and at most 86400 seconds"),
     ],
 )
 def test_what_cannot_be_is_refused(flags, text, capsys):

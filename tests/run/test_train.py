@@ -1,6 +1,7 @@
 """The training loop in this process, on real Doom: what a resumed run goes on with, and the last row of its metrics."""
 
 import re
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from learner.agents.configs.pqn import PQNConfig
 from learner.agents.configs.rainbow import RainbowConfig
 from learner.config import LearnerConfig, OnPolicyConfig, ReplayConfig
 from tests.e2e.command import arrays_of
+from tests.tensorboard_events import read_events
 from tests.test_segmentation import write_network
 
 pytestmark = pytest.mark.engine
@@ -161,6 +163,33 @@ def test_an_on_policy_run_goes_on_bit_for_bit_between_two_rollouts(tmp_path, age
         assert row["rollout/age_max_versions"] == 1
         assert row["rollout/age_mean_versions"] < 0.2, "only a window's first action is of the parameters before"
         assert row["learner/loss"] == row["learner/loss"]
+
+
+def test_tensorboard_shows_the_rows_of_the_records_after_every_kind_of_stop(tmp_path):
+    """A stop between two rows, whose last row is set aside, and one at a row, which stays."""
+    config = replace(DQN, log=replace(DQN.log, tensorboard=True))
+    for updates in (50, 80, 100):
+        go_on(tmp_path, config, updates)
+    shown: set[int] = set()
+    for event in read_events(tmp_path / "tensorboard"):
+        if event.HasField("session_log"):  # TensorBoard hides what it has of these steps and later ones
+            shown = {step for step in shown if step < event.step}
+        shown |= {event.step} if event.summary.value else set()
+    rows, _ = records.read(tmp_path / "metrics.jsonl")
+    assert sorted(shown) == [row["num_updates"] for row in rows] == [20, 40, 50, 60, 80, 100]
+
+
+def test_a_run_says_whether_its_end_has_anything_to_save(tmp_path, capsys):
+    stopped = StopRequest()
+    stopped.signal = signal.SIGINT
+    with RunDir(tmp_path) as run:
+        assert train(DQN, run, stopped) == 130
+    assert "stopping: no new gradient steps to save" in capsys.readouterr().err
+    assert list((tmp_path / "checkpoints").iterdir()) == []
+    go_on(tmp_path, DQN, 20)
+    assert "done: writing the last checkpoint" in capsys.readouterr().err
+    go_on(tmp_path, DQN, 20)
+    assert "done: no new gradient steps to save" in capsys.readouterr().err
 
 
 def test_an_on_policy_run_learns_from_what_was_chosen_on_the_learners_device(tmp_path):

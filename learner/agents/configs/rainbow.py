@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
 from gvz.core.errors import ConfigError
-from learner.config import Range, Share, ValueConfig
+from learner.config import Augmentation, Range, Share, ValueConfig
 
 Noisy = Literal["off", "factorized", "independent"]
 
@@ -52,7 +52,7 @@ class RainbowConfig(ValueConfig):
     sight_weight: Annotated[float, Range(0.0, 1000.0)] = 0.0
     """weight of a further loss: tell from the encoder's features what is in sight, by class and column, as the engine's
     labels have it (game features, Lample and Chaplot 2017). Labels are needed in training alone; 0: off"""
-    sight_augmentations: tuple[str, ...] = ()
+    sight_augmentations: tuple[Augmentation, ...] = ()
     """random changes of the frames that this loss alone learns from, as `augmentations`, and with their strength and
     clean share. The values learn from frames without these. Empty: this loss reads what the values read"""
     noisy_epsilon: Share = 0.0
