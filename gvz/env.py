@@ -139,7 +139,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         else:
             self.action_space = Discrete(len(self.action_meanings))
         self.observation_space = observation_space(config)
-        fuzzy = "STYLE_Fuzzy" in task_content(self.task, config.profile).entity.values()
+        looks = task_content(self.task, config.profile).entity.values()
+        fuzzy = any("STYLE_Fuzzy" in (look, getattr(look, "value", None)) for look in looks)  # of all, or of a share
         if recycle_episodes is None or (fuzzy and recycle_episodes > 0):
             recycle_episodes = int(fuzzy)
         self._recycle_episodes = recycle_episodes

@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 
 from gvz.core.errors import ConfigError, TaskError
-from gvz.env import DoomEnv
+from gvz.env import EPISODE_SEEDS, DoomEnv
 from gvz.observation import Observation
 from gvz.scenarios.base import Task
 
@@ -81,7 +81,8 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
 
         Args:
             seed: starts a new sequence of tasks and episodes; without it the sequence continues.
-            options: {"task": id} chooses the task; {"episode_seed": n} as in DoomEnv.
+            options: {"task": id} chooses the task; {"episode_seed": n} as in DoomEnv. With both, the
+                sequence does not advance.
 
         Raises:
             TaskError: the task is none of the environment's.
@@ -98,7 +99,8 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         elif len(self._running) == self._max_engines:
             self._running.pop(0).close()
         self._running.append(game)
-        rest.setdefault("episode_seed", int(self.np_random.integers(2**31)))
+        if "episode_seed" not in rest:
+            rest["episode_seed"] = int(self.np_random.integers(EPISODE_SEEDS))
         return game.reset(options=rest)
 
     def step(self, action: int | np.integer | np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

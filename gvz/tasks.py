@@ -84,6 +84,23 @@ def parse_task(text: str) -> Task:
     return Task(scenario, tuple(one for one, _ in graded), maps, severities=tuple(graded))
 
 
+def id_for_processes(task: Task | str) -> str:
+    """The task's id, by which other processes make it.
+
+    Raises:
+        TaskError: they would make another task, because its scenario is not the one in gvz/scenarios.
+    """
+    if isinstance(task, str):
+        return task
+    known = all_scenarios().get(task.scenario.id)
+    if task.scenario != known:
+        raise TaskError(
+            f"{task.id}: its scenario {'is not' if known is None else 'differs from that'} in gvz/scenarios, where "
+            "other processes look for it; put the scenario into a file there, or play the task with gvz.make"
+        )
+    return task.id
+
+
 def _severity(scenario: Scenario, word: str) -> tuple[str, float]:
     """(Attribute, severity) of a word in a task's id: "gore", "gore=0.5"."""
     name, equals, value = word.partition("=")

@@ -12,11 +12,14 @@ _UNSEEN_DRIVERS = ("dummy", "offscreen")
 
 
 class Window:
-    """One window; shows frames enlarged by an integer factor, so that pixels stay sharp.
+    """A window; shows frames enlarged by an integer factor, so that pixels stay sharp. A process has one at a time: it
+    shows whatever was drawn last, and stays until the last `Window` is closed.
 
     Attributes:
         closed: the user has closed it or pressed Escape; the caller must react to this.
     """
+
+    _num_open = 0
 
     def __init__(self, title: str, width: int, height: int):
         """Opens the window, for frames of this width and height, pixels.
@@ -34,7 +37,7 @@ class Window:
         scale = max(1, -(-_MIN_HEIGHT // height))
         try:
             pygame.display.init()
-            self._surface = pygame.display.set_mode((width * scale, height * scale))
+            pygame.display.set_mode((width * scale, height * scale))
             driver = pygame.display.get_driver()
             if driver in _UNSEEN_DRIVERS and "SDL_VIDEODRIVER" not in os.environ:
                 pygame.display.quit()
@@ -42,11 +45,15 @@ class Window:
         except pygame.error as error:
             raise ResourceError(f"render_mode human: no window can be opened ({error}); use rgb_array") from error
         pygame.display.set_caption(title)
+        self._open = True
+        Window._num_open += 1
 
     def show(self, frame: np.ndarray) -> None:
         """Draws a frame, uint8 [H, W, 3]."""
         picture = self._pygame.surfarray.make_surface(frame.swapaxes(0, 1))
-        self._pygame.transform.scale(picture, self._surface.get_size(), self._surface)
+        surface = self._pygame.display.get_surface()
+        assert surface is not None, "it is there as long as a Window is open"
+        self._pygame.transform.scale(picture, surface.get_size(), surface)
         self._pygame.display.flip()
         self._read_events()  # else the desktop would call the window unresponsive
 
@@ -59,8 +66,12 @@ class Window:
         return found
 
     def close(self) -> None:
-        """Closes the window."""
-        self._pygame.display.quit()
+        """Closes the window. Can be repeated."""
+        if self._open:
+            self._open = False
+            Window._num_open -= 1
+            if Window._num_open == 0:
+                self._pygame.display.quit()
 
     def _read_events(self) -> None:
         pygame = self._pygame

@@ -223,7 +223,14 @@ def test_sticky_actions_hold_the_buttons_of_the_decision_before_with_their_proba
     assert played(was_held, 0.0) == frames
 
 
-@pytest.mark.parametrize("task", ["defend_the_center/complete", "health_gathering/lava+supreme+short_agent"])
+@pytest.mark.parametrize(
+    "task",
+    [
+        "defend_the_center/complete",
+        "defend_the_center/fuzzy_enemies=0.5",
+        "health_gathering/lava+supreme+short_agent",
+    ],
+)
 def test_an_episode_is_replayed_from_its_seed_alone(task: str):
     env = DoomEnv(task)
     first = fingerprint(env, 7)
@@ -380,7 +387,7 @@ def test_human_mode_shows_a_window_at_game_speed(monkeypatch: pytest.MonkeyPatch
     start = time.monotonic()  # at once: what a busy machine loses from here on, the game catches up
     window = env._window
     assert window is not None
-    shown = window._pygame.surfarray.array3d(window._surface).swapaxes(0, 1)
+    shown = window._pygame.surfarray.array3d(window._pygame.display.get_surface()).swapaxes(0, 1)
     assert env._engine is not None
     scale = len(shown) // 144
     np.testing.assert_array_equal(shown[::scale, ::scale], env._engine.screen)

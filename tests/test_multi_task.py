@@ -44,6 +44,10 @@ def test_the_sampler_chooses_and_the_seed_repeats_the_sequence():
         assert pairs[0] == pairs[1]
         assert len(set(pairs[0])) == 6
         assert len({task for task, _ in pairs[0]}) > 1
+        for n in range(6):
+            info = env.reset(seed=3 if n == 0 else None)[1]
+            assert (info["task"], info["episode_seed"]) == pairs[0][n], "episodes between are none of the sequence"
+            env.reset(options={"task": TASKS[0], "episode_seed": 5})
     with gvz.make(TASKS[:2], action_set="unified_v1", sampler=lambda _rng: TASKS[1]) as env:
         assert env.reset(seed=1)[1]["task"] == TASKS[1]
 

@@ -49,9 +49,10 @@ class Record:
         from gvz.evaluation.play import Episode
         from gvz.evaluation.playback import perform
         from gvz.evaluation.video import add_to_tensorboard, check_video_file, write_video
+        from gvz.evaluation.zoo import run_directory
         from gvz.run.bars import Bar, Bars
 
-        if self.seconds is not None and self.seconds <= 0:
+        if self.seconds is not None and not 0 < self.seconds < math.inf:
             raise ConfigError(f"--seconds: got {self.seconds:g}, want more than 0")
         if self.tensorboard and (self.out.suffix != ".gif" or self.choice.run_dir is None):
             raise ConfigError("--tensorboard: want a run directory and an --out that ends with .gif, which it can show")
@@ -84,7 +85,7 @@ class Record:
             print("interrupted; nothing was written", file=sys.stderr)
             return EXIT_INTERRUPTED
         if self.tensorboard and self.choice.run_dir is not None:
-            events = self.choice.run_dir / "tensorboard" / "episodes"
+            events = run_directory(self.choice.run_dir) / "tensorboard" / "episodes"
             add_to_tensorboard(self.out, events, f"episode/{task.id}", player_spec.identity["num_updates"])
         [last] = shown
         print(f"{self.out}: {name} {last.ending}")

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -61,7 +62,7 @@ class TrainSegmenter:
         for name, least in (("frames", 1), ("gate_frames", 1), ("batch_size", 1), ("workers", 0)):
             if getattr(self, name) < least:
                 raise ConfigError(f"--{name.replace('_', '-')}: got {getattr(self, name)}, want at least {least}")
-        if self.processor_s <= 0:
+        if not 0 < self.processor_s < math.inf:
             raise ConfigError(f"--processor-s: got {self.processor_s:g}, want more than 0")
         if self.out.suffix != ".onnx":
             raise ConfigError(f"--out: got {self.out}, want a name that ends in .onnx")

@@ -1,6 +1,7 @@
 """`gvz watch`: an episode in a window."""
 
 import contextlib
+import math
 import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
@@ -36,7 +37,7 @@ class Watch:
         """Plays and shows; a line for each episode that ends."""
         if self.episodes is not None and self.episodes < 1:
             raise ConfigError(f"--episodes: got {self.episodes}, want at least 1")
-        if self.speed <= 0:
+        if not 0 < self.speed < math.inf:
             raise ConfigError(f"--speed: got {self.speed:g}, want more than 0")
         player_spec, task = self.choice.resolve()
         from gvz.evaluation.window import open_window

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import tyro
 
 from gvz.core.errors import ConfigError
-from gvz.evaluation.zoo import PREFIX, pack, run_directory, zoo_names
+from gvz.evaluation.zoo import EVALUATION, PREFIX, pack, run_directory, score_card, zoo_names
 
 if TYPE_CHECKING:
     from gvz.run.config import RunConfig
@@ -85,7 +85,7 @@ def _read(name: str) -> _Policy:
     directory = run_directory(Path(f"{PREFIX}{name}"))
     config = read_run_config(directory)
     [num_updates] = find_checkpoints(directory, ["newest"])
-    rows, _ = records.read_stored(directory / "evaluation.jsonl")
+    rows = score_card(records.read_stored(directory / EVALUATION)[0])
     metrics, _ = records.read_stored(directory / "metrics.jsonl")
     tasks = TaskSelection(split="test").of_run([scenario.id for scenario in config.table.scenarios])
     scores = score_rows(rows, {}, tasks, episodes=10**9)

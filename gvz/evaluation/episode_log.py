@@ -11,7 +11,7 @@ from gvz.core.stop import StopRequest
 from gvz.evaluation.play import Episode, PlayerSpec, Row, play
 from gvz.evaluation.players import CLASSES, Player
 from gvz.evaluation.simple import SimplePlayerName, player_env
-from gvz.tasks import Task, parse_task
+from gvz.tasks import Task, id_for_processes, parse_task
 
 _ANOTHER_FILE = "move the file aside or give another with --out"
 
@@ -80,6 +80,8 @@ class RecordFile(records.Writer):
             ConfigError: it cannot be opened, another process uses it, or it holds something else.
         """
         super().__init__(path)
+        if path.suffix == ".gz":
+            raise ConfigError(f"--out: got {path}, want a name without .gz: rows are appended as plain text")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             locked = self.lock()
@@ -152,19 +154,19 @@ def evaluate_player(
         name: of the player, unique in the file: with agent, seed and checkpoint.
         episodes: of each task.
         base_seed: another one draws other episodes; comparisons use 0.
-        env: what it plays in; default the thesis's.
+        env: what it plays in; default the thesis's. Actions are not repeated by chance, whatever it says.
         num_workers: processes that play; 0 plays in this one.
 
     Returns:
         The rows of all these episodes, by task and episode, with those that the file held before.
 
     Raises:
-        ConfigError, TaskError: an unknown task, or a file that cannot be written.
+        ConfigError, TaskError: an unknown task, one that only this process knows, or a file that cannot be written.
         GvzError: an episode could not be played.
     """
     env = EnvConfig() if env is None else env
     player_spec = PlayerSpec(make_player=make_player, env=env, identity=row_identity({"player": name}, env))
-    parsed = [parse_task(task) if isinstance(task, str) else task for task in tasks]
+    parsed = [parse_task(id_for_processes(task)) for task in tasks]
     wanted = wanted_episodes(parsed, episodes, [base_seed])
     file = RecordFile(Path(out))
     try:

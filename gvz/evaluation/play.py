@@ -188,7 +188,8 @@ class _Worker:
         return play_episode(self._game(player_spec, episode.task), self._player[1], episode.episode, episode.base_seed)
 
     def _game(self, player_spec: PlayerSpec, task: str) -> "DoomEnv":
-        env = dataclasses.replace(player_spec.env, reward_weights=())
+        # what is for training alone
+        env = dataclasses.replace(player_spec.env, reward_weights=(), repeat_action_probability=0.0)
         wanted = (task, env, player_spec.recycle_episodes)
         if self._env is None or (self._env.task.id, self._env.config, self._recycle_episodes) != wanted:
             from gvz.env import DoomEnv

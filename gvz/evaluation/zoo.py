@@ -13,9 +13,10 @@ import math
 import shutil
 import tempfile
 import zipfile
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gvz.core.cache import cache_directory
 from gvz.core.errors import ConfigError, nearest
@@ -27,7 +28,8 @@ ZOO_DIRECTORY = Path(__file__).parent.parent / "zoo"
 PREFIX = "zoo:"
 MAX_BYTES = 2_000_000
 """of a file"""
-RECORDS = ("config.json", "metrics.jsonl", "episodes.jsonl", "starts.jsonl", "evaluation.jsonl")
+EVALUATION = "evaluation.jsonl"
+RECORDS = ("config.json", "metrics.jsonl", "episodes.jsonl", "starts.jsonl", EVALUATION)
 MAX_ROWS = {"metrics.jsonl": 100, "episodes.jsonl": 4_000}
 """that are kept of a run's records of training, at equal distances, the last one among them"""
 
@@ -113,8 +115,9 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", agent_file: Path 
         (packed / RECORDS[0]).write_text(json.dumps(saved, indent=2) + "\n")
         checkpoints.write(packed / "policies" / str(num_updates), _rounded(params), {"num_updates": num_updates})
         player = trained_player(packed, read_run_config(packed, agent_file), num_updates)
-        rows = [row for row in records.read_stored(run_dir / RECORDS[-1])[0] if player.identity.items() <= row.items()]
-        (packed / RECORDS[-1]).write_text("".join(json.dumps(row) + "\n" for row in rows))
+        rows = score_card(records.read_stored(run_dir / EVALUATION)[0])
+        rows = [row for row in rows if player.identity.items() <= row.items()]
+        (packed / EVALUATION).write_text("".join(json.dumps(row) + "\n" for row in rows))
         file = packed.with_suffix(".zip")
         with zipfile.ZipFile(file, "w", zipfile.ZIP_BZIP2) as archive:  # records take half of what deflate leaves
             for path in sorted(packed.rglob("*")):
@@ -126,6 +129,11 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", agent_file: Path 
         ZOO_DIRECTORY.mkdir(exist_ok=True)
         shutil.copy(file, ZOO_DIRECTORY)
     return Packed(file=ZOO_DIRECTORY / file.name, num_updates=num_updates, num_bytes=size, num_episodes=len(rows))
+
+
+def score_card(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The episodes that scores are published of: those of base seed 0."""
+    return [row for row in rows if row.get("base_seed", 0) == 0]
 
 
 def _rounded(params: object) -> object:

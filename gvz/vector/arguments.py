@@ -10,18 +10,19 @@ from gvz.core.env_config import typed
 from gvz.core.errors import ConfigError
 from gvz.env import EPISODE_SEEDS
 from gvz.scenarios.base import Task
+from gvz.tasks import id_for_processes
 
 
 def task_ids(tasks: Task | str | Sequence[Task | str]) -> list[str]:
     """Ids of one task or of several.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: there is none. TaskError: as `id_for_processes`.
     """
     several = [tasks] if isinstance(tasks, Task | str) else list(tasks)
     if not several:
         raise ConfigError("make_vec: got no task, want at least one, for example 'defend_the_center/gore'")
-    return [task.id if isinstance(task, Task) else task for task in several]
+    return [id_for_processes(task) for task in several]
 
 
 def number(name: str, value: int | None, *, default: int, most: int | None = None) -> int:

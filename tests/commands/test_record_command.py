@@ -24,6 +24,8 @@ from tests.tensorboard_events import read_events
         ("{run} --out v.avi", "--out: got v.avi, want a name that ends with .mp4, .gif, .webp"),
         ("{run} --out {file}/v.webp", "cannot be made: File exists"),
         ("{run} --out v.webp --seconds 0", "--seconds: got 0, want more than 0"),
+        ("{run} --out v.webp --seconds nan", "--seconds: got nan, want more than 0"),
+        ("{run} --out {tmp_path}/d.webp", "d.webp is a directory; want the name of a file"),
         ("{run} --out v.webp --episode -1", "--episode: got -1, want at least 0"),
         ("{run} --out v.webp --seed -1", "--seed: got -1, want at least 0"),
         ("{run} --out v.webp --checkpoint 30", "--checkpoints: got '30', want newest"),
@@ -37,7 +39,9 @@ from tests.tensorboard_events import read_events
 def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, tmp_path, small_run, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
-    assert cli.main(["record", *arguments.format(file=tmp_path / "file", run=small_run).split()]) == 2
+    (tmp_path / "d.webp").mkdir()
+    places = {"file": tmp_path / "file", "run": small_run, "tmp_path": tmp_path}
+    assert cli.main(["record", *arguments.format(**places).split()]) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith("error: ")

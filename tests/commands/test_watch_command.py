@@ -68,3 +68,16 @@ def test_a_window_notices_that_it_is_closed(monkeypatch, event):
     window.show(frame)
     assert window.closed
     window.close()
+
+
+def test_a_window_stays_until_the_last_game_that_draws_in_it_is_closed(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    import pygame
+
+    frame = np.zeros((48, 64, 3), np.uint8)
+    first, second = Window("first", 64, 48), Window("second", 64, 48)
+    for _ in range(2):
+        first.close()
+        second.show(frame)
+    second.close()
+    assert not pygame.display.get_init()

@@ -1,9 +1,11 @@
 """Record files of evaluations: what is there is not played again, what is half there is."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
+import gvz
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError, TaskError
 from gvz.evaluation.episode_log import (
@@ -16,9 +18,9 @@ from gvz.evaluation.episode_log import (
     wanted_episodes,
 )
 from gvz.evaluation.play import Episode
-from gvz.evaluation.players import IdlePlayer, RandomPlayer
+from gvz.evaluation.players import IdlePlayer, RandomPlayer, SweepPlayer
 from gvz.evaluation.simple import player_env
-from gvz.tasks import parse_task
+from gvz.tasks import Task, parse_task
 
 TASK = parse_task("defend_the_center/fast_enemies")
 IDLE = simple_player("idle", EnvConfig())
@@ -158,6 +160,32 @@ def test_anybody_s_player_is_evaluated_by_the_same_protocol(tmp_path):
     # nothing is left to play: IdlePlayer would fail, since this action set has no idle action
     assert evaluate_player(IdlePlayer, [TASK], path, name="mine", episodes=2, env=env) == mine
     assert len(read_rows(path)) == 4
+
+
+@pytest.mark.engine
+def test_actions_are_never_repeated_by_chance_in_an_evaluation(tmp_path):
+    task, env = "dodge_projectiles/default", player_env("sweep", EnvConfig())
+    plain, sticky = (
+        evaluate_player(SweepPlayer, [task], tmp_path / name, name="mine", episodes=1, env=one)
+        for name, one in (("plain", env), ("sticky", replace(env, repeat_action_probability=0.9)))
+    )
+    assert plain == sticky
+
+
+def test_a_task_that_other_processes_do_not_know_is_refused(tmp_path):
+    changed = Task(replace(TASK.scenario, timeouts={"thesis": 100, "levdoom": 100}))
+    elsewhere = Task(replace(TASK.scenario, id="elsewhere"))
+    for task, message in ((changed, "differs from that in gvz/scenarios"), (elsewhere, "is not in gvz/scenarios")):
+        with pytest.raises(TaskError, match=message):
+            evaluate_player(RandomPlayer, [task], tmp_path / "rows.jsonl", name="mine")
+        with pytest.raises(TaskError, match=message):
+            gvz.make_vec([TASK, task])
+
+
+def test_a_compressed_file_is_not_written_to(tmp_path):
+    with pytest.raises(ConfigError, match=r"rows\.jsonl\.gz, want a name without \.gz"):
+        RecordFile(tmp_path / "rows.jsonl.gz")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_player_is_not_evaluated_on_an_unknown_task(tmp_path):

@@ -70,7 +70,7 @@ def test_a_directory_is_made_or_it_is_an_error(tmp_path):
     check_video_file(tmp_path / "deep" / "below" / "video.gif")
     assert (tmp_path / "deep" / "below").is_dir()
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match="file cannot be made: File exists"):
+    with pytest.raises(ConfigError, match=r"video\.gif cannot be made: File exists"):
         check_video_file(tmp_path / "file" / "video.gif")
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from gvz import cli
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError
 from gvz.evaluation import zoo
-from gvz.evaluation.episode_log import read_rows
+from gvz.evaluation.episode_log import RecordFile, read_rows
 from gvz.evaluation.trained import read_params, read_run_config, trained_player
 from gvz.evaluation.zoo import pack, run_directory, zoo_names
 from gvz.run.rundir import RunDir
@@ -93,6 +94,12 @@ def test_it_is_evaluated_recorded_and_listed_with_its_score_card(run, tmp_path, 
     assert line.split() == "zoo:one screen 4 tasks 100 1 of 7 tasks evaluated".split()
     assert cli.main(["zoo", "one"]) == 0
     shown = capsys.readouterr().out
+    with closing(
+        RecordFile(run_directory("zoo:one") / "evaluation.jsonl")
+    ) as file:  # as by `gvz evaluate zoo:one --seeds 1`
+        file.append({name: value for name, value in rows[0].items() if name != "schema"} | {"base_seed": 1})
+    assert cli.main(["zoo", "one"]) == 0
+    assert capsys.readouterr().out == shown, "the score card is of base seed 0"
     assert shown.startswith("zoo:one: small, seed 7, 100 updates\ntrained on defend_the_center/default, ")
     assert task in shown
     assert cli.main(["record", "zoo:one", "--out", "episode.gif", "--seconds", "0.5"]) == 0
