@@ -13,6 +13,7 @@ from gvz import cli, launch
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("**/*.md"))]
 RECORDS = sorted((ROOT / "results").glob("*/README.md"))
+REPORTS = sorted((ROOT / "results").glob("*/report/report.md"))
 EXAMPLES = [
     pytest.param(block, id=f"{page.name}-{number}")
     for page in PAGES
@@ -57,10 +58,12 @@ def test_commands_have_the_flags_they_are_given(page, tmp_path, monkeypatch):
         if train is not None and "--help" not in words:
             launch.parse(words[train:])
         elif train is None and words[0] == "gvz":
-            cli.parse(words[1:])
+            command = cli.parse(words[1:])
+            if words[1:3] in (["experiment", "plan"], ["experiment", "run"]):
+                assert command.action.ask.plan().runs()
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [*PAGES, *RECORDS, *REPORTS], ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_to_files_lead_somewhere(page):
     for target in re.findall(r"\]\((?!https?://|#)([^)#]+)", page.read_text()):
         assert (page.parent / target).exists(), f"{page.name} links to {target}, which is not there"

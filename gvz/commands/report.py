@@ -30,9 +30,10 @@ class Report:
         """Writes the report and says where it is, and what it could not read."""
         if not self.results:
             raise ConfigError("report: got nothing to report on; want results directories, run directories or records")
+        from gvz.evaluation.zoo import run_directory
         from gvz.reports.page import make_report
 
-        files, problems = make_report(self.results, self.out, self.title)
+        files, problems = make_report([run_directory(path) for path in self.results], self.out, self.title)
         for problem in problems:
             print(f"note: {problem}", file=sys.stderr)
         for file in files[:2]:

@@ -187,6 +187,14 @@ class Experiment:
             )
         if self.compares_training and self.columns == "level":
             yield f"evaluate_on {self.evaluate_on!r} wants columns 'config' or 'training'"
+        if self.evaluate_on != "own":
+            mixed = {
+                "trainings": self.trainings if self.columns != "training" else (),
+                "agents": self.agents if self.columns != "config" else (),
+            }
+            for name, several in mixed.items():
+                if len(several) > 1 or EACH_TASK in several:
+                    yield f"{name}: got {', '.join(several)}, want one: columns {self.columns!r} would mix them"
         if self.evaluate_on == "own" and self.trainings != (EACH_TASK,):
             yield f"evaluate_on 'own' wants trainings ('{EACH_TASK}',)"
         for scenario in self.scenarios:

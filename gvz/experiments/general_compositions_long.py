@@ -11,4 +11,5 @@ EXPERIMENT = dataclasses.replace(
     question="What do three times the time of general_compositions give?",
     max_processor_s=2_700.0,
 )
-"""Runs of `general_compositions` go on from where they ended, if they are in the same results directory."""
+"""Runs of `general_compositions` in the same results directory go on from where they ended. Its plan.json must be moved
+aside first: in one plan, a run has one budget."""

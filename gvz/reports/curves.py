@@ -7,7 +7,7 @@ import numpy as np
 import polars as pl
 
 from gvz.evaluation.statistics import bootstrap_runs
-from gvz.reports.results import Run
+from gvz.reports.results import ONE_RUN, Run
 from gvz.reports.scores import Scores, pick, redraw
 from gvz.tasks import LEVELS, parse_task
 
@@ -104,7 +104,7 @@ def evaluation_curve(label: str, episodes: pl.DataFrame, tasks: Sequence[str]) -
     Returns: the curve, or None if no checkpoint has all tasks.
     """
     rows = episodes.filter(pl.col("task").is_in(tasks)).with_columns(
-        nth=pl.col("num_updates").rank("dense").over("run_dir")
+        nth=pl.col("num_updates").rank("dense").over(ONE_RUN)
     )
     updates, estimates = [], []
     for (_,), checkpoint in sorted(rows.drop_nulls("num_updates").group_by("nth")):

@@ -33,6 +33,10 @@ TRAINING_SETS: dict[TrainingSet, str] = {
 """what to call a training set: "4 tasks" for train4"""
 
 
+ONE_RUN = ("run_dir", "run", "run_seed", "scenario")
+"""columns of episodes that tell trained agents apart: a record file, and so its directory, may have several"""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Run:
     """A run directory of the trainer."""
@@ -94,8 +98,8 @@ class Run:
         for split, words in TRAINING_SETS.items():
             if set(self.tasks) == set().union(*(_task_ids(one, split) for one in self.scenarios)):
                 return words if len(self.scenarios) == 1 else f"{words} of each scenario"
-        one = self.tasks[0].partition("/")[2]
-        return f"{one} alone" if len(self.tasks) == 1 else f"{len(self.tasks)} chosen tasks"
+        names = [task.partition("/")[2] for task in self.tasks]
+        return f"{names[0]} alone" if len(names) == 1 else f"{len(names)} chosen tasks: {', '.join(names)}"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -149,11 +153,11 @@ def read_results(paths: Sequence[Path]) -> Results:
             asked += [
                 PlannedExperiment(results=file.parent, experiment=e, scale=plan.scale) for e in plan.experiments()
             ]
-    evaluated = set(episodes["run_dir"])
+    evaluated = {path: set(rows["task"]) for (path,), rows in episodes.group_by("run_dir")}
     for run in runs.values():
         if str(run.path) not in evaluated:
             problems.append(f"{run.path}: no evaluation of this run yet; make one with `gvz evaluate {run.path}`")
-    agents = _agents(list(runs.values()))
+    agents = _agents(list(runs.values()), evaluated)
     return Results(
         paths=tuple(paths),
         episodes=_with_agents(episodes, agents),
@@ -202,16 +206,28 @@ def _task_ids(scenario: str, split: TrainingSet) -> set[str]:
     return {task.id for task in named_tasks(scenario, split=split)} if scenario in all_scenarios() else set()
 
 
-def _agents(runs: Sequence[Run]) -> dict[str, str]:
-    """Run directory -> agent: the configuration's name, and what it was trained on where that tells agents apart."""
-    alone: dict[tuple[str, tuple[str, ...]], set[str]] = {}
+def _agents(runs: Sequence[Run], evaluated: Mapping[object, set[str]]) -> dict[str, str]:
+    """Run directory -> agent: the configuration's name, and what it was trained on where that tells agents apart.
+
+    Runs that were each trained on one task, and were evaluated on no common one, are one agent (EACH).
+
+    Args:
+        runs: of any configurations.
+        evaluated: run directory -> ids of the tasks that it was evaluated on.
+    """
+    alone: dict[tuple[str, tuple[str, ...]], dict[str, set[str]]] = {}
     for run in runs:
         if len(run.tasks) == 1:
-            alone.setdefault((run.name, run.scenarios), set()).add(run.training)
+            played = alone.setdefault((run.name, run.scenarios), {}).setdefault(run.training, set())
+            if not _is_of_a_set(run):
+                played |= evaluated.get(str(run.path), set())
 
     def training(run: Run) -> str:
-        several = len(run.tasks) == 1 and len(alone[run.name, run.scenarios]) > 2  # more than default and one other
-        return EACH if several and not run.id.count("/train") else run.training
+        if len(run.tasks) > 1 or _is_of_a_set(run):
+            return run.training
+        played = alone[run.name, run.scenarios].values()
+        apart = sum(map(len, played)) == len(set().union(*played))
+        return EACH if apart and len(played) > 2 else run.training  # more than default and one other
 
     trainings = {name: {training(run) for run in runs if run.name == name} for name in {run.name for run in runs}}
     return {
@@ -219,15 +235,29 @@ def _agents(runs: Sequence[Run]) -> dict[str, str]:
     }
 
 
+def _is_of_a_set(run: Run) -> bool:
+    """An experiment has trained it on a training set, if only of one task."""
+    return "/train" in run.id
+
+
 def _with_agents(episodes: pl.DataFrame, agents: dict[str, str]) -> pl.DataFrame:
     """Adds the columns `agent` and `final`."""
     named = pl.col("run_dir").replace_strict(agents, default=pl.col("run"), return_dtype=pl.String)
     age = pl.col("num_updates").rank("dense", descending=True)  # 1: the newest checkpoint
     num_checkpoints = pl.col("num_updates").n_unique()
-    return episodes.with_columns(
-        agent=pl.coalesce(named, "player"),
-        final=(age <= (num_checkpoints / 4).ceil()).over("run_dir").fill_null(value=True),
-    )
+    final = (age <= (num_checkpoints / 4).ceil()).over(ONE_RUN).fill_null(value=True)
+    agent = pl.coalesce(named, "player")
+    return episodes.with_columns(agent=agent, final=final).with_columns(agent=pl.concat_str("agent", *_other_rules()))
+
+
+def _other_rules() -> list[pl.Expr]:
+    """ " (levdoom)" for rows of an agent that played by several rules, for each kind of rule; else nothing."""
+    return [
+        pl.when(pl.col(rule).drop_nulls().n_unique().over("agent") > 1)
+        .then(pl.format(" ({})", pl.col(rule).fill_null("unknown " + rule)))
+        .otherwise(pl.lit(""))
+        for rule in ("profile", "action_set")
+    ]
 
 
 _METRICS = {

@@ -15,7 +15,7 @@ from gvz.reports.curves import learning_curve, level_curves
 from gvz.reports.document import Block, Cell, Figure, Section, Table, count, missing, words
 from gvz.reports.draw import draw_curves, draw_heat_map, draw_histogram, draw_rewards
 from gvz.reports.experiment_section import what_id
-from gvz.reports.results import Results, Run
+from gvz.reports.results import ONE_RUN, Results, Run
 from gvz.reports.scores import Scores, agent_scores, estimate, pick
 from gvz.scenarios.base import Scenario, Task
 from gvz.tasks import LEVELS, all_scenarios, named_tasks, parse_task, scenario_named
@@ -159,12 +159,10 @@ def _solved(scenario: Scenario, final: pl.DataFrame) -> set[tuple[str, str]]:
     """(agent, task) where each seed's newest checkpoint survived ten episodes in a row; only survival counts."""
     if scenario.metric != "frames_alive":
         return set()
-    newest = final.filter((pl.col("num_updates").max().over("run_dir") == pl.col("num_updates")).fill_null(value=True))
-    by_seed = (
-        newest.sort("episode").group_by("agent", "task", "run_dir").agg(pl.col("truncated").fill_null(value=False))
-    )
+    newest = final.filter((pl.col("num_updates").max().over(ONE_RUN) == pl.col("num_updates")).fill_null(value=True))
+    by_run = newest.sort("episode").group_by("agent", "task", *ONE_RUN).agg(pl.col("truncated").fill_null(value=False))
     done = {}
-    for agent, task, _, timed_out in by_seed.iter_rows():
+    for agent, task, *_, timed_out in by_run.iter_rows():
         done[agent, task] = done.get((agent, task), True) and solved(np.array(timed_out))
     return {key for key, value in done.items() if value}
 
@@ -173,7 +171,7 @@ def gap_table(
     results: Results, scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task]
 ) -> Table | None:
     """How much lower agents score on other tasks than on their training tasks, and on levels 2 to 4 than on 0 and 1."""
-    trained_on = {results.agents[str(r.path)]: r.tasks for r in results.runs}
+    trained_on = {results.agents[str(r.path)]: r.tasks for r in results.runs if scenario.id in r.scenarios}
     test = [task.id for task in named_tasks(scenario.id, split="test")]
     low, high = [t.id for t in tasks if t.level <= 1], [t.id for t in tasks if t.level >= 2]
     rows = []

@@ -37,7 +37,8 @@ def test_the_thesis_s_four_are_there():
 
 
 def test_varied_maps_are_a_training_of_every_scenario():
-    runs = make_experiment(trainings=("varied", "varied-10"), seeds=(1,), evaluate_on="gate").runs()
+    trainings = {"trainings": ("varied", "varied-10"), "columns": "training", "configs": ("rainbow_quick",)}
+    runs = make_experiment(**trainings, seeds=(1,), evaluate_on="gate").runs()
     assert {run.tasks for run in runs} == {("defend_the_center/varied",), ("defend_the_center/varied-10",)}
     with pytest.raises(TaskError, match="want 'varied-<number of maps>'"):
         make_experiment(trainings=("varied-0",)).runs()
@@ -183,6 +184,12 @@ def test_settings_change_their_fields_alone_and_another_agent_comes_first():
         ({"max_processor_s": 9.0}, "max_processor_s 9 and num_checkpoints 2, want more than 0 and exactly 1"),
         ({"evaluate_on": "gate", "columns": "level"}, "'gate' wants columns 'config' or 'training'"),
         ({"evaluate_on": "own"}, "evaluate_on 'own' wants trainings"),
+        (
+            {"trainings": ("train4", "train8")},
+            "trainings: got train4, train8, want one: columns 'config' would mix them",
+        ),
+        ({"trainings": ("each",)}, "trainings: got each, want one: columns 'config' would mix them"),
+        ({"columns": "training"}, "agents: got dqn_quick, rainbow_quick, want one: columns 'training' would mix them"),
         ({"published": {"thesis": {"seek_and_kill": (1.0,)}}}, r"seek_and_kill: got 1 numbers, want 2, one for each"),
         ({"scenarios": ("defend_the_centre",)}, "unknown scenario 'defend_the_centre'"),
         ({"players": ("ghost",)}, "players: got ghost, want some of random, idle, sweep, scripted"),

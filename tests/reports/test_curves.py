@@ -63,6 +63,7 @@ def test_an_evaluation_curve_takes_the_nth_checkpoints_together():
         ("r1", 1, updates, task, score) for updates, score in ((100, 10.0), (200, 30.0)) for task in ("a/x", "a/y")
     ] + [("r2", 2, updates, task, score) for updates, score in ((110, 20.0), (200, 50.0)) for task in ("a/x", "a/y")]
     frame = pl.DataFrame(rows, ["run_dir", "run_seed", "num_updates", "task", "normalized_score"], orient="row")
+    frame = frame.with_columns(run=pl.lit("r"), scenario=pl.lit("a"))
     curve = evaluation_curve("r", frame, ["a/x", "a/y"])
     assert curve is not None
     assert curve.updates.tolist() == [105.0, 200.0]

@@ -8,9 +8,11 @@ import polars as pl
 import pytest
 
 from gvz.core.errors import ConfigError
+from gvz.experiments.base import experiment_named
 from gvz.experiments.plan import Plan
 from gvz.reports.results import EACH, read_results, training_time_s
 from gvz.reports.run_section import run_sections
+from tests.reports.conftest import evaluation_row, write_rows
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +49,37 @@ def test_final_are_the_last_quarter_of_a_runs_checkpoints(small):
     final = episodes.filter(pl.col("final") & pl.col("run").is_not_null())
     assert set(final["num_updates"]) == {run.total_updates for run in read_results([small]).runs}  # 1 of 2
     assert episodes.filter(player="random")["final"].all()
+
+
+def test_a_record_file_may_hold_several_runs_each_with_its_last_checkpoint(tmp_path):
+    """As `gvz evaluate RUN RUN RUN --out FILE` writes it; the seeds have different numbers of gradient steps."""
+    trained = [("DQN", 1, 400), ("DQN", 1, 100), ("DQN", 2, 300), ("PPO", 1, 50)]
+    rows = [
+        evaluation_row(f"{run}/{seed}", task, 0, 50.0, run=run, run_seed=seed, num_updates=updates, params=str(updates))
+        for run, seed, updates in trained
+        for task in ("seek_and_kill/default", "dodge_projectiles/default")
+    ]
+    write_rows(tmp_path / "all.jsonl", rows)
+    final = read_results([tmp_path / "all.jsonl"]).episodes.filter("final")
+    assert set(final.select("run", "run_seed", "num_updates").rows()) == {
+        ("DQN", 1, 400),
+        ("DQN", 2, 300),
+        ("PPO", 1, 50),
+    }
+    assert len(final) == 6
+
+
+def test_an_agent_that_played_by_several_rules_is_several(tmp_path):
+    task = "defend_the_center/default"
+    rows = [evaluation_row(who, task, 0, 50.0, profile=rules) for who in ("a", "b") for rules in ("thesis", "levdoom")]
+    write_rows(tmp_path / "rows.jsonl", rows[:3])
+    assert set(read_results([tmp_path]).episodes["agent"]) == {"a (thesis)", "a (levdoom)", "b"}
+
+
+def test_agents_of_different_maps_that_played_the_same_are_not_one(tmp_path, experiments_writer):
+    plan = Plan(names=("procedural_gap",), scale=0.0001, scenarios=("defend_the_center",))
+    experiments_writer(tmp_path, plan, lambda _: 50.0)
+    assert len({*read_results([tmp_path]).agents.values()}) == len(experiment_named("procedural_gap").trainings)
 
 
 def test_damaged_runs_and_plans_are_named_and_the_rest_is_read(small, tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 
+from gvz.experiments.plan import Plan
 from gvz.reports.results import read_results
 from gvz.reports.scenario_section import scenario_sections
 from gvz.tasks import named_tasks
@@ -28,3 +29,14 @@ def test_own_kills_stand_below_the_scores_by_task_and_by_level(tmp_path):
         ["red", "1", "0.0 [0.0, 0.0]", "9.0 [9.0, 9.0]"],
         ["mean of 2 tasks", "1", "0.0 [0.0, 0.0]", "7.5 [7.5, 7.5]"],
     ]
+
+
+def test_the_gap_of_an_agent_is_shown_in_each_of_its_scenarios(tmp_path, experiments_writer):
+    """It has a run in each scenario, all of one name."""
+    scenarios = ("defend_the_center", "seek_and_kill")
+    plan = Plan(names=("general_on_policy",), scale=0.01, scenarios=scenarios)
+    experiments_writer(tmp_path, plan, lambda played: 70.0 if played.task in played.run.tasks else 50.0)
+    for section in scenario_sections(read_results([tmp_path]), tmp_path):
+        [gap] = [table for table in section.blocks[0].tables if table.id.endswith("_gap")]
+        [[agent, of_tasks, _]] = gap.rows
+        assert (agent.text, of_tasks.text.split()[0]) == ("ppo_segmented", "20.0")
