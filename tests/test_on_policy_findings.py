@@ -1,51 +1,82 @@
 """What the findings say of PPO on segmented frames is what its records give."""
 
+import json
+
 import numpy as np
+import pytest
 
 from gvz.evaluation.statistics import difference
 from gvz.reports.scores import agent_scores, estimate_groups
+from gvz.tasks import scenario_named
 from tests.score_tables import metrics_of, score_cells, task_sets, training_episodes
 from tests.test_results import ROOT, results_of
 
-CENTER = "defend_the_center"
+PAGE = (ROOT / "docs" / "FINDINGS.md").read_text()
+WORDS = " ".join(PAGE.split())
+FOLDER = ROOT / "results" / "general_on_policy"
+SCENARIOS = json.loads((FOLDER / "plan.json").read_text())["scenarios"]
 PERIODS_S = ((300, 600), (900, 1_500), (2_400, 3_000), (4_800, 5_400))
 RUNS = {
-    "Rainbow, seed 1111": f"general/runs/rainbow_segmented/{CENTER}/train8/seed_1111",
-    "Rainbow, seed 2222": f"general/runs/rainbow_segmented/{CENTER}/train8/seed_2222",
-    "PPO, seed 1111": f"general_on_policy/runs/ppo_segmented/{CENTER}/train8/seed_1111",
+    "Rainbow, seed 1111": "general/runs/rainbow_segmented/{}/train8/seed_1111",
+    "Rainbow, seed 2222": "general/runs/rainbow_segmented/{}/train8/seed_2222",
+    "PPO, seed 1111": "general_on_policy/runs/ppo_segmented/{}/train8/seed_1111",
 }
 
 
-def test_the_findings_say_what_ppo_has_beside_segmented_frames():
-    page = (ROOT / "docs" / "FINDINGS.md").read_text()
-    words = " ".join(page.split())
-    rainbow, ppo = (
-        agent_scores(results_of(folder).episodes.filter(scenario=CENTER), agent)
+def gains(scenario: str) -> list[str]:
+    """What PPO has less what Rainbow has, on each of `task_sets`."""
+    rainbow, ppo = scores_of(scenario)
+    return [estimate_groups([(s, tasks) for s in (ppo, rainbow)], difference).text for tasks in task_sets(scenario)]
+
+
+def scores_of(scenario: str):
+    return [
+        agent_scores(results_of(folder).episodes.filter(scenario=scenario), agent)
         for folder, agent in (("general", "rainbow_segmented"), ("general_on_policy", "ppo_segmented"))
-    )
-    assert f"| Rainbow, two seeds | {score_cells(rainbow, CENTER)} |" in page
-    assert f"| PPO, one seed | {score_cells(ppo, CENTER)} |" in page
-    gains = [
-        estimate_groups([(scores, tasks) for scores in (ppo, rainbow)], difference).text for tasks in task_sets(CENTER)
     ]
-    said = "the differences are {}, {} and {} points on training, gate and test tasks, on level 4 {}."
-    assert said.format(*gains) in words
-    summary = page.partition("## In short")[2].partition("\n## ")[0]
-    assert f"not Rainbow, beside segmented frames | {gains[1].split()[0]} | | | | no |" in summary
-    last = metrics_of(ROOT / "results" / RUNS["PPO, seed 1111"])[-1]
-    assert f"{last['num_updates']:,} gradient steps and {round(last['actors/env_steps'], -4):,} decisions" in words
 
 
-def test_the_findings_say_how_ppo_learned_beside_segmented_frames():
-    page = (ROOT / "docs" / "FINDINGS.md").read_text()
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_the_findings_say_what_ppo_has_beside_segmented_frames(scenario):
+    title = scenario_named(scenario).title
+    rainbow, ppo = scores_of(scenario)
+    assert f"| {title} | Rainbow, two seeds | {score_cells(rainbow, scenario)} |" in PAGE
+    assert f"| {title} | PPO, one seed | {score_cells(ppo, scenario)} |" in PAGE
+    assert f"| {title} | PPO less Rainbow | {' | '.join(gains(scenario))} |" in PAGE
+
+
+def test_the_summary_says_what_ppo_gives_on_the_gate_tasks():
+    summary = PAGE.partition("## In short")[2].partition("\n## ")[0]
+    columns = ("defend_the_center", "dodge_projectiles", "health_gathering", "seek_and_kill")
+    cells = [f" {gains(name)[1].split()[0]} " if name in SCENARIOS else " " for name in columns]
+    assert f"not Rainbow, beside segmented frames |{'|'.join(cells)}| no |" in summary
+
+
+def test_the_findings_say_how_many_gradient_steps_and_decisions_ppo_had():
+    last = [metrics_of(ROOT / "results" / RUNS["PPO, seed 1111"].format(name))[-1] for name in SCENARIOS]
+    updates, steps = ([row[key] for row in last] for key in ("num_updates", "actors/env_steps"))
+    low, high = (end(steps) / 1e6 for end in (min, max))
+    assert f"{min(updates):,} to {max(updates):,} gradient steps and {low:.1f} to {high:.1f} million decisions" in WORDS
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_the_findings_say_how_ppo_learned_beside_segmented_frames(scenario):
     for title, run in RUNS.items():
         cells = []
         for low_s, high_s in PERIODS_S:
-            found = training_episodes(ROOT / "results" / run, low_s, high_s)
+            found = training_episodes(ROOT / "results" / run.format(scenario), low_s, high_s)
             assert len({row["lane"] for row in found}) == 16
-            scores, kills = (
-                np.mean([row["normalized_score"] for row in found]),
-                np.mean([row["reward_components"]["kill"] for row in found]),
-            )
-            cells.append(f"{scores:.1f}, {kills:.1f}")
-        assert f"| {title} | {' | '.join(cells)} |" in page
+            score = f"{np.mean([row['normalized_score'] for row in found]):.1f}"
+            kills = [row["reward_components"]["kill"] for row in found if "kill" in row["reward_components"]]
+            cells.append(f"{score}, {np.mean(kills):.1f}" if kills else score)
+        assert f"| {scenario_named(scenario).title} | {title} | {' | '.join(cells)} |" in PAGE
+
+
+def test_the_findings_say_where_ppo_is_better_than_rainbow():
+    rainbow, ppo = scores_of("seek_and_kill")
+    for name in ("mixed_enemies+red", "blue+mixed_enemies+resized_enemies", "complete"):
+        had, has = (
+            np.mean([episodes[f"seek_and_kill/{name}"].mean() for episodes in scores.runs.values()])
+            for scores in (rainbow, ppo)
+        )
+        assert f"`{name}` {has:.0f} instead of {had:.0f}" in WORDS
