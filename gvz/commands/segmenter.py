@@ -59,7 +59,7 @@ class TrainSegmenter:
 
     def run(self) -> int:
         """Plays, trains, scores, writes."""
-        for name, least in (("frames", 1), ("gate_frames", 1), ("batch_size", 1), ("workers", 0)):
+        for name, least in (("frames", 1), ("gate_frames", 1), ("batch_size", 1), ("workers", 0), ("seed", 0)):
             if getattr(self, name) < least:
                 raise ConfigError(f"--{name.replace('_', '-')}: got {getattr(self, name)}, want at least {least}")
         if not 0 < self.processor_s < math.inf:
@@ -68,11 +68,18 @@ class TrainSegmenter:
             raise ConfigError(f"--out: got {self.out}, want a name that ends in .onnx")
         if not self.out.parent.is_dir():
             raise ConfigError(f"--out: {self.out.parent} is no directory")
+        if self.out.is_dir():
+            raise ConfigError(f"--out: {self.out} is a directory; want the name of a file")
         if find_spec("onnx") is None:
             raise ConfigError("gvz segmenter: the package onnx is missing; pip install 'gvizdoom[segmenter]'")
         from gvz.tasks import named_tasks
 
         gate_tasks = named_tasks(self.scenario, split="gate")
+        unfinished = self.out.with_suffix(".unfinished")
+        try:
+            unfinished.touch()
+        except OSError as error:
+            raise ConfigError(f"--out: {self.out} cannot be written: {error.strerror}") from error
         import jax
         import numpy as np
 
@@ -88,6 +95,7 @@ class TrainSegmenter:
         of_machine = machine.describe()  # with the commit of the code that is loaded now
         begun_s, steps, loss = machine.processor_s(), 0, 0.0
         with Bars(line_period_s=10.0) as bars, contextlib.ExitStack() as until_trained:
+            until_trained.callback(unfinished.unlink, missing_ok=True)
 
             def show(unit: str, done: int, total: int, text: str) -> None:
                 bars.show([Bar(name=unit, done=done, total=total, unit=unit, text=text)])
@@ -125,8 +133,14 @@ class TrainSegmenter:
             weights, key = segmentation.CLASS_WEIGHTS, jax.random.key(self.seed)
             params = train_segmentation(batches, weights, key, share_done)
             spent_s = machine.processor_s() - begun_s
+            if steps == 0:
+                raise ConfigError(
+                    f"--processor-s: got {self.processor_s:g}, but the games alone took {spent_s:.0f} s; give more, or "
+                    "fewer --frames"
+                )
+            write_onnx(params, unfinished, INPUT_HEIGHT, INPUT_WIDTH)
+            unfinished.replace(self.out)
             until_trained.close()
-            write_onnx(params, self.out, INPUT_HEIGHT, INPUT_WIDTH)
             segment, scores = Segmenter(str(self.out)), {}
             for task in gate_tasks:
                 show("tasks", len(scores), len(scores) + 1, f"scores on {task.id}")

@@ -14,8 +14,9 @@ has, choices are uniform unless said otherwise:
   SILHOUETTES.
 
 A strength in between takes this share of every pool, moves every number this share of its way from the default, and
-multiplies these probabilities. HELD_OUT keeps a fifth of what is in the pools for `procedural-test` and a tenth for
-`procedural-validation`; `procedural-train` has the rest, and `varied`, whose test is the named tasks, all.
+multiplies the probabilities of changed entities. Double textures and tinged light keep theirs. HELD_OUT keeps a fifth
+of what is in the pools for `procedural-test` and a tenth for `procedural-validation`; `procedural-train` has the rest,
+and `varied`, whose test is the named tasks, all.
 
 Nothing of the look of any named task, for training or testing, in either profile, is in a pool: no texture or near copy
 of one, no kind of decoration, no render style. The test list draws sizes from 0.3 to 3, for width and height apart and

@@ -59,6 +59,10 @@ class Channel:
             messages.append(message)
         return messages
 
+    def wait(self) -> None:
+        """Waits until something arrives, or the peer closes its end, however long that takes."""
+        self._poll.poll()
+
     def wait_for_message(self) -> Message:
         """The next message.
 

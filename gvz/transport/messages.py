@@ -19,7 +19,7 @@ import numpy as np
 
 from gvz.core.errors import TransportError
 
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 """Increased by one when the meaning or layout of anything in this file changes."""
 
 
@@ -264,15 +264,15 @@ class Render(_Message, frozen=True, tag="render"):
     """Asks for the last rendered screen of every game, environment -> worker."""
 
 
-class Screens(_Message, frozen=True, tag="screens"):
-    """The answer, worker -> environment: u8[render_height render_width 3] of each game."""
+class Screen(_Message, frozen=True, tag="screen"):
+    """An answer, worker -> environment, one for each game in their order: u8[render_height render_width 3], or nothing
+    if the game has rendered nothing yet.
+    """
 
-    screens: list[bytes]
+    screen: bytes
 
 
-Message = (
-    EpisodeStats | Ready | Fault | Stop | Assign | ActorSpec | VectorSpec | Decisions | Outcomes | Render | Screens
-)
+Message = EpisodeStats | Ready | Fault | Stop | Assign | ActorSpec | VectorSpec | Decisions | Outcomes | Render | Screen
 _DECODER = msgspec.msgpack.Decoder(Message)
 
 

@@ -22,7 +22,7 @@ from gvz.transport.messages import (
     Outcome,
     Outcomes,
     Render,
-    Screens,
+    Screen,
     Stop,
     VectorSpec,
 )
@@ -151,17 +151,18 @@ class Crew:
         for worker in self._workers:
             worker.process.channel.send(Render())
         for worker in self._workers:
-            try:
-                answer = worker.process.channel.wait_for_message()
-            except TransportError:
-                if not worker.process.channel.closed:
-                    raise
-                self._replace_dead(worker)
-                screens |= dict.fromkeys(worker.spec.games, b"")
-                continue
-            if not isinstance(answer, Screens):
-                raise _raised(worker, answer)
-            screens |= dict(zip(worker.spec.games, answer.screens, strict=True))
+            for game in worker.spec.games:
+                try:
+                    answer = worker.process.channel.wait_for_message()
+                except TransportError:
+                    if not worker.process.channel.closed:
+                        raise
+                    self._replace_dead(worker)
+                    screens |= dict.fromkeys(worker.spec.games, b"")
+                    break
+                if not isinstance(answer, Screen):
+                    raise _raised(worker, answer)
+                screens[game] = answer.screen
         return screens
 
     def close(self) -> None:
@@ -281,7 +282,7 @@ def _raised(worker: _Worker, message: Message) -> GvzError:
     """The error that a worker reported, or one about what it said instead of an answer."""
     who = f"vector environment: worker {worker.spec.worker}"
     if not isinstance(message, Fault):
-        return WorkerError(f"{who}: got {type(message).__name__}, want Outcomes or Screens")
+        return WorkerError(f"{who}: got {type(message).__name__}, want Outcomes or Screen")
     kind = getattr(errors, message.kind, None)
     if message.kind in ("EngineError", "ConfigError", "TaskError", "ResourceError") and kind is not None:
         return kind(f"{who}: {message.message}")

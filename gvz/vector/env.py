@@ -164,16 +164,19 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             raise ResetNeeded(
                 f"reset: games {np.flatnonzero(~(mask | self._begun)).tolist()} have not begun; reset all"
             )
+        half = 1 - int(self._halves[0])  # the one that the last call has not returned
         self._receive(self.num_playing)
+        if not self._copy:
+            self._halves[mask] = 1 - half  # answers that are dropped are written over
         for game in np.flatnonzero(mask).tolist():
             if seeds[game] is not None:
                 self._rngs[game], self._next_seeds[game] = seeding.np_random(seeds[game])[0], None
         self._send(np.flatnonzero(mask), [None] * int(mask.sum()), episode_seed)
         outcomes = {outcome.game: outcome for outcome in self._receive(int(mask.sum()))}
         if not self._copy:
-            for game in np.flatnonzero(~mask).tolist():  # all games in one half again
-                self._halves[game] = 1 - self._halves[game]
-                self._frames.repeat(game, int(self._halves[game]))
+            for game in np.flatnonzero(self._halves != half).tolist():  # all games in one half again
+                self._frames.repeat(game, half)
+                self._halves[game] = half
         games = np.arange(self.num_envs)
         return self._observe(games), self._infos([outcomes.get(game) for game in games.tolist()])
 

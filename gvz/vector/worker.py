@@ -10,7 +10,6 @@ removes their files.
 
 import contextlib
 import os
-import select
 import signal
 import sys
 import traceback
@@ -23,7 +22,7 @@ from gvz.core.env_config import EnvConfig
 from gvz.env import DoomEnv, make_env
 from gvz.transport import child
 from gvz.transport.channel import Channel
-from gvz.transport.messages import Decision, Decisions, Fault, Outcome, Outcomes, Render, Screens, Stop, VectorSpec
+from gvz.transport.messages import Decision, Decisions, Fault, Outcome, Outcomes, Render, Screen, Stop, VectorSpec
 from gvz.vector.frames import FrameLayout, Frames
 
 
@@ -52,7 +51,7 @@ class Worker:
                 elif isinstance(message, Render):
                     self._render()
             if not waiting:
-                select.select([self._channel], [], [])  # as long as the user thinks; the end of the parent ends it
+                self._channel.wait()  # as long as the user thinks; the end of the parent ends it
                 continue
             outcomes.append(self._play(waiting.popleft()))
             self._frames.progress[spec.worker] += 1
@@ -81,13 +80,11 @@ class Worker:
         return Outcome(game, reward, terminated, truncated, info, final_info)
 
     def _render(self) -> None:
-        screens = []
-        for game in self._spec.games:
+        for env in self._envs.values():
+            screen = None
             with contextlib.suppress(ResetNeeded):  # of a worker that was replaced
-                screens.append(self._envs[game].render())
-                continue
-            screens.append(None)
-        self._channel.send(Screens(screens=[b"" if screen is None else screen.tobytes() for screen in screens]))
+                screen = env.render()
+            self._channel.send(Screen(b"" if screen is None else screen.tobytes()))
 
 
 def main() -> int:

@@ -19,6 +19,8 @@ from gvz.env import DoomEnv
         ("--scenario seek_and_kill --out n.onnx --gate-frames 0", "--gate-frames: got 0, want at least 1"),
         ("--scenario seek_and_kill --out n.onnx --processor-s 0", "--processor-s: got 0, want more than 0"),
         ("--scenario seek_and_kill --out n.onnx --workers -1", "--workers: got -1, want at least 0"),
+        ("--scenario seek_and_kill --out n.onnx --seed -1", "--seed: got -1, want at least 0"),
+        ("--scenario seek_and_kill --out /proc/n.onnx", "--out: /proc/n.onnx cannot be written: "),
     ],
 )
 def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, tmp_path, monkeypatch):
@@ -35,6 +37,18 @@ def test_without_onnx_it_says_so_before_anything_is_played(capsys, tmp_path, mon
     monkeypatch.setattr(segmenter, "find_spec", lambda _: None)
     assert cli.main(["segmenter", "--scenario", "seek_and_kill", "--out", str(tmp_path / "n.onnx")]) == 2
     assert "pip install 'gvizdoom[segmenter]'" in capsys.readouterr().err
+
+
+@pytest.mark.engine
+def test_without_a_gradient_step_there_is_no_network_and_an_old_one_stays(capsys, tmp_path):
+    file = tmp_path / "mine.onnx"
+    file.write_text("old")
+    flags = (
+        f"--scenario health_gathering --training-set train4 --out {file} --frames 1 --gate-frames 1 --processor-s 0.01"
+    )
+    assert cli.main(["segmenter", *flags.split()]) == 2
+    assert "--processor-s: got 0.01, but the games alone took " in capsys.readouterr().err
+    assert [(path, path.read_text()) for path in tmp_path.iterdir()] == [(file, "old")]
 
 
 @pytest.mark.engine

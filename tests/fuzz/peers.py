@@ -29,7 +29,7 @@ from gvz.transport.messages import (
     ParamsHeader,
     Ready,
     Render,
-    Screens,
+    Screen,
     StepBlock,
     Stop,
     VectorSpec,
@@ -101,7 +101,7 @@ MESSAGES = [
     Decisions(decisions=[Decision(0, 1, None, 5), Decision(1, 0, 2, 6)]),
     Outcomes(outcomes=[Outcome(0, 0.5, False, True, {"score": 1.0}, {"score": 2.0})]),
     Render(),
-    Screens(screens=[b"\0\1"]),
+    Screen(b"\0\1"),
 ]
 
 

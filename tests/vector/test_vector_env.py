@@ -1,7 +1,11 @@
 """`gvz.make_vec` beside gymnasium's SyncVectorEnv over the same games, and its own way of `send` and `recv`."""
 
+import contextlib
+import os
+import resource
 from collections.abc import Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -245,3 +249,37 @@ def test_infos_of_some_games_have_masks():
             "_d": np.array([False, False, True]),
         },
     )
+
+
+@pytest.mark.engine
+def test_a_program_may_have_many_open_files():
+    """More than `select` could wait for."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard if hard < 4096 else 4096, hard))
+    with contextlib.ExitStack() as opened:
+        opened.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
+        for _ in range(1030):
+            opened.enter_context(Path(os.devnull).open())
+        envs = gvz.make_vec("defend_the_center/default", 1)
+        opened.callback(envs.close)
+        assert envs.reset(seed=1)[0].shape == (1, 84, 84, 3)
+
+
+@pytest.mark.engine
+def test_views_show_every_games_newest_frame_after_an_answer_of_one_was_dropped():
+    copies, views = (gvz.make_vec("defend_the_center/default", 2, num_workers=1, copy=copy) for copy in (True, False))
+    before_copy, before_view = copies.reset(seed=1)[0], views.reset(seed=1)[0]
+    for mask in ([True, True], [False, True], [True, False]):
+        for envs in (copies, views):
+            envs.send(np.array([1]), np.array([0]))
+        options = {"reset_mask": np.array(mask)}
+        for step in range(2):
+            copy, view = (
+                (envs.step(np.array([1, 2])) if step else envs.reset(seed=5, options=options))[0]
+                for envs in (copies, views)
+            )
+            np.testing.assert_array_equal(view, copy)
+            np.testing.assert_array_equal(before_view, before_copy)
+            before_copy, before_view = copy, view
+    copies.close()
+    views.close()
