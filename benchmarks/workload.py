@@ -152,7 +152,7 @@ def processor_s(pid: int | None = None) -> dict[str, float]:
             times = process.cpu_times()
             where = "learner's side" if process is root else "engines" if process.name() == "vizdoom" else "Python"
             seconds[where] += times.user + times.system
-            if process is not root:  # what has ended below it: engines that were started anew
+            if process is not root:  # an actor, which may have ended engines and started others
                 seconds["engines"] += times.children_user + times.children_system
     return seconds
 

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -16,7 +15,7 @@ import pytest
 from gymnasium.error import ResetNeeded
 
 import gvz
-from gvz.core.errors import ConfigError, ResourceError, TaskError
+from gvz.core.errors import ConfigError, TaskError
 from gvz.engine.engine import Engine
 from gvz.env import DoomEnv, is_solved, make_env
 from gvz.tasks import parse_task
@@ -378,29 +377,3 @@ def test_pictures_per_second_follow_the_frame_skip(shared: DoomEnv):
         env = gymnasium.make("GViZDoom/DefendTheCenter-Gore-v0", frame_skip=frame_skip, render_mode="rgb_array")
         assert env.metadata["render_fps"] == 35 / frame_skip
     assert shared.metadata["render_fps"] == 35 / 4
-
-
-def test_human_mode_shows_a_window_at_game_speed(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    env = DoomEnv("defend_the_center/default", render_mode="human", frame_skip=7)
-    env.reset(seed=1)
-    start = time.monotonic()  # at once: what a busy machine loses from here on, the game catches up
-    window = env._window
-    assert window is not None
-    shown = window._pygame.surfarray.array3d(window._pygame.display.get_surface()).swapaxes(0, 1)
-    assert env._engine is not None
-    scale = len(shown) // 144
-    np.testing.assert_array_equal(shown[::scale, ::scale], env._engine.screen)
-    for _ in range(5):
-        env.step(TURN)
-    assert 0.9 <= time.monotonic() - start < 30, "5 decisions of 7 tics are one second"
-    assert env.render() is None
-    env.close()
-
-
-def test_human_mode_without_a_display_says_so(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "no such driver")
-    env = DoomEnv("defend_the_center/default", render_mode="human")
-    with pytest.raises(ResourceError, match="render_mode human: no window can be opened"):
-        env.reset(seed=1)
-    env.close()

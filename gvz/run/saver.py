@@ -58,8 +58,8 @@ class Saver:
 
     @property
     def behind(self) -> bool:
-        """There are gradient steps that no checkpoint has."""
-        return self._counts.saved_updates != self._counts.updates or self._num_failed > 0
+        """There are gradient steps that no whole checkpoint has."""
+        return self.busy or self._counts.saved_updates != self._counts.updates or self._num_failed > 0
 
     def save_when_due(self, group: Group) -> None:
         """Begins a checkpoint at every multiple of the period, and again some time after one failed.

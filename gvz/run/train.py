@@ -100,8 +100,7 @@ class Trainer:
             with contextlib.suppress(CheckpointError, WaitTimeoutError):  # already reported; the first error is raised
                 self._saver.save_last(self._record_row)
             raise
-        saves = self._saver.behind or self._saver.busy
-        last = "writing the last checkpoint" if saves else "no new gradient steps to save"
+        last = "writing the last checkpoint" if self._saver.behind else "no new gradient steps to save"
         self._progress.say(f"{'stopping' if stop.requested else 'done'}: {last}")
         self._saver.save_last(self._record_row)
 

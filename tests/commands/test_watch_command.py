@@ -4,11 +4,9 @@ import os
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 from gvz import cli
-from gvz.viewer import Window
 
 
 @pytest.mark.parametrize(
@@ -48,36 +46,3 @@ def test_episodes_are_shown_one_after_the_other(capsys, monkeypatch, small_run):
     assert [line.partition(":")[0] for line in lines] == [
         *("defend_the_center/complete, episode 0", "defend_the_center/complete, episode 1")
     ]
-
-
-@pytest.mark.parametrize("event", ["QUIT", "KEYDOWN"])
-def test_a_window_notices_that_it_is_closed(monkeypatch, event):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    window = Window("title", 64, 48)
-    import pygame
-
-    frame = np.zeros((48, 64, 3), np.uint8)
-    window.show(frame)
-    assert not window.closed
-    pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_SPACE))
-    window.show(frame)
-    assert not window.closed
-    pygame.event.post(
-        pygame.event.Event(getattr(pygame, event), **({"key": pygame.K_ESCAPE} if "KEY" in event else {}))
-    )
-    window.show(frame)
-    assert window.closed
-    window.close()
-
-
-def test_a_window_stays_until_the_last_game_that_draws_in_it_is_closed(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    import pygame
-
-    frame = np.zeros((48, 64, 3), np.uint8)
-    first, second = Window("first", 64, 48), Window("second", 64, 48)
-    for _ in range(2):
-        first.close()
-        second.show(frame)
-    second.close()
-    assert not pygame.display.get_init()
