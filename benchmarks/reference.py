@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.record import ROOT
 from benchmarks.report import between
 from gvz.core import records
-from gvz.core.errors import ConfigError
+from gvz.core.errors import ConfigError, GvzError
 from gvz.evaluation.play import Row
 from gvz.evaluation.statistics import Estimate, bootstrap
 from gvz.experiments.base import experiment_named
@@ -197,4 +197,7 @@ def main(files: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    try:
+        main(sys.argv[1:])
+    except GvzError as error:
+        sys.exit(f"error: {error}")
