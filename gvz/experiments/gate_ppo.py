@@ -12,6 +12,7 @@ EXPERIMENT = Gate(
         "plain": {},
         "discount_99": {"agent.discount": 0.99},
         "entropy_03": {"agent.entropy_weight": 0.03},
+        "both": {"agent.discount": 0.99, "agent.entropy_weight": 0.03},
     },
     scenarios=("defend_the_center", "dodge_projectiles"),
     trainings=("train8",),
