@@ -58,7 +58,7 @@ class Panel:
             self.announce("died" if moment.terminated else "time is up")
         rewarded = moment.reward - self._reward
         if moment.decided or rewarded:
-            value = None if moment.values is None else float(moment.values.q_values.max())
+            value = None if moment.values is None else moment.values.value
             self._timeline.append((moment.frames, value, rewarded))
             self._reward = moment.reward
             self._draw_side(moment)
@@ -95,14 +95,13 @@ class Panel:
             self._text((left, HEIGHT - 8 - NOTE_HEIGHT * n), note, 13, FAINT, "ld")
 
     def _draw_actions(self, moment: Moment, box: Box) -> float:
-        """A line an action, the held one marked, with its value if there are any. Returns where it ends."""
+        """A line an action, the held one marked, with its value or probability if it has one. Returns where it ends."""
         left, y, right, _ = box
-        values = None if moment.values is None else moment.values.q_values
-        self._caption((left, y), "action" if values is None else "action, value (discounted reward to come)")
+        caption, values, (low, high) = self._estimates(moment.values)
+        self._caption((left, y), caption)
         y += 22
         row = min(24, 200 // len(self._actions))
         size = min(15, row - 3)
-        low, high = self._scale(values)
         name_width = min(220, max(_font(size).getlength(name) for name in self._actions))
         bar_left, bar_right = left + 14 + name_width + 10, right - 62
         for action, name in enumerate(self._actions):
@@ -120,17 +119,24 @@ class Panel:
             y += row
         return y
 
-    def _scale(self, values: np.ndarray | None) -> tuple[float, float]:
-        """The range of the bars: a little wider than all values so far, so that moments can be compared."""
-        if values is not None:
-            low, high = self._value_range
-            self._value_range = (min(low, float(values.min())), max(high, float(values.max())))
+    def _estimates(self, values: Values | None) -> tuple[str, np.ndarray | None, tuple[float, float]]:
+        """What the bars show: a caption, a number for each action, and the range of the bars.
+
+        That of action values is a little wider than all so far, so that moments can be compared.
+        """
+        if values is None:
+            return "action", None, (0.0, 1.0)
+        if values.policy is not None:
+            return "action, probability", values.policy, (0.0, 1.0)
+        assert values.q_values is not None
         low, high = self._value_range
+        self._value_range = low, high = min(low, float(values.q_values.min())), max(high, float(values.q_values.max()))
         room = max(0.1 * (high - low), 1e-3)
-        return low - room, high + room
+        return "action, value (discounted reward to come)", values.q_values, (low - room, high + room)
 
     def _draw_returns(self, values: Values, action: int, box: Box) -> float:
         """The distribution of the held action's return as bars. Returns where it ends."""
+        assert values.q_values is not None
         assert values.probabilities is not None
         assert values.atoms is not None
         left, y, right, _ = box
@@ -178,7 +184,7 @@ class Panel:
         self._draw_timeline(moment, (330, top + 12, SCREEN_WIDTH - MARGIN, HEIGHT - 12))
 
     def _draw_timeline(self, moment: Moment, box: Box) -> None:
-        """Over the episode's time: the value of the best action as a line, and below it rewards, up and down."""
+        """Over the episode's time: the value as a line, and below it rewards, up and down."""
         left, top, right, bottom = box
         scale = (right - left) / self._timeout
         now = left + moment.frames * scale

@@ -34,14 +34,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Values:
-    """A policy's estimates of its actions: discounted reward to come."""
+    """An agent's estimates: action values, which are discounted reward to come, or a policy and a value."""
 
-    q_values: np.ndarray
-    """f32[A]"""
+    q_values: np.ndarray | None
+    """f32[A], if the agent has them"""
     probabilities: np.ndarray | None
     """f32[A, N], the distribution of each action's return, if the agent has one"""
     atoms: np.ndarray | None
     """f32[N], the returns that `probabilities` are of"""
+    policy: np.ndarray | None
+    """f32[A], the probability of each action, if the agent learns a policy"""
+    value: float
+    """of what it sees; with action values, the largest of them"""
 
 
 def read_run_config(run_dir: Path, agent_file: Path | None = None) -> RunConfig:
@@ -171,11 +175,14 @@ class TrainedPlayer:
         """Its estimates when it chose the last action."""
         if self._evaluation is None:
             return None
-        _, q_values, probabilities, atoms = self._evaluation
+        _, q_values, probabilities, atoms, policy, value = self._evaluation
+        estimates = q_values if value is None else value
         return Values(
-            q_values=np.asarray(q_values)[0],
+            q_values=None if q_values is None else np.asarray(q_values)[0],
             probabilities=None if probabilities is None else np.asarray(probabilities)[0],
             atoms=None if atoms is None else np.asarray(atoms),
+            policy=None if policy is None else np.asarray(policy)[0],
+            value=float(np.asarray(estimates)[0].max()),
         )
 
     def begin(self, env: "DoomEnv", observation: "Observation", info: dict[str, Any], seed: int) -> None:

@@ -66,13 +66,17 @@ class Evaluation(NamedTuple):
     """What an agent thinks of a batch of observations with its noise off."""
 
     action: Int[Array, "B"]
-    """the greedy action: the largest of `q_values` among the allowed"""
-    q_values: Float[Array, "B A"]
-    """action values; the probabilities of the policy for an agent that has one and no action values"""
+    """the greedy action: the largest of `q_values` or `policy` among the allowed"""
+    q_values: Float[Array, "B A"] | None
+    """action values, if the agent has them"""
     probabilities: Float[Array, "B A N"] | None = None
     """return distributions, if the agent has them"""
     atoms: Float[Array, "N"] | None = None
     """the returns that `probabilities` stand for"""
+    policy: Float[Array, "B A"] | None = None
+    """the probability of each action, if the agent learns a policy"""
+    value: Float[Array, "B"] | None = None
+    """the value of the observation, with `policy`"""
 
 
 class AgentLoss(NamedTuple):

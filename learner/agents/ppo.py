@@ -47,9 +47,9 @@ class PPO(NetworkAgent):
         return action, jnp.stack([value, losses.take_action(log_p, action)], axis=1)
 
     def evaluate(self, params: Params, obs: Observation) -> Evaluation:
-        """The likeliest action, and the policy's probabilities instead of action values."""
-        logits, _ = self.policy(params, obs)
-        return Evaluation(jnp.argmax(logits, axis=-1), jax.nn.softmax(logits))
+        """The likeliest action, the policy and the value; PPO has no action values."""
+        logits, value = self.policy(params, obs)
+        return Evaluation(jnp.argmax(logits, axis=-1), None, policy=jax.nn.softmax(logits), value=value)
 
     def targets(self, steps: RolloutSteps) -> Targets:
         config = self.config

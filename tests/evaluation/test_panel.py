@@ -31,7 +31,12 @@ START = Moment(
 def values(q_values, peak_atom: int = 25) -> Values:
     masses = np.full((len(q_values), 51), 0.01)
     masses[:, peak_atom] = 0.5
-    return Values(q_values=np.array(q_values, np.float32), probabilities=masses, atoms=np.linspace(-5, 5, 51))
+    q, atoms = np.array(q_values, np.float32), np.linspace(-5, 5, 51)
+    return Values(q_values=q, probabilities=masses, atoms=atoms, policy=None, value=float(q.max()))
+
+
+def policy(probabilities, value: float = 0.0) -> Values:
+    return Values(q_values=None, probabilities=None, atoms=None, policy=np.array(probabilities), value=value)
 
 
 def draw(*moments: Moment, action_set="buttons") -> np.ndarray:
@@ -77,6 +82,33 @@ def test_bars_keep_their_scale_through_an_episode():
     second = dataclasses.replace(first, frames=1, values=values([0.0, 0.0, 0.0, 0.0, 0.0]))
     after, alone = count(draw(first, second), BAR, columns=SIDE), count(draw(second), BAR, columns=SIDE)
     assert after != alone
+
+
+def test_the_bar_of_an_action_is_as_long_as_it_is_likely():
+    """Of a policy without action values; two bars of a half are as long as one of a whole."""
+
+    def bars(*probabilities: float) -> int:
+        return count(draw(dataclasses.replace(START, action=None, values=policy(probabilities))), BAR, columns=SIDE)
+
+    none = bars(0.0, 0.0, 0.0, 0.0, 0.0)
+    whole, halves = bars(1.0, 0.0, 0.0, 0.0, 0.0) - none, bars(0.5, 0.5, 0.0, 0.0, 0.0) - none
+    assert whole == pytest.approx(halves, rel=0.05)
+    assert whole > 2000
+
+
+def test_the_timeline_has_the_value_of_a_policy_and_not_its_probabilities():
+    foot = slice(HEAD_HEIGHT + SCREEN_HEIGHT, HEIGHT)
+
+    def line(*values: float) -> np.ndarray:
+        moments = [
+            dataclasses.replace(START, frames=300 * n, values=policy([0.2] * 5, value))
+            for n, value in enumerate(values)
+        ]
+        return draw(*moments)[foot, :SCREEN_WIDTH]
+
+    falling, rising = line(2.0, 1.0), line(1.0, 2.0)
+    assert count(falling, ACCENT) > 100
+    assert (falling != rising).any()
 
 
 def test_the_tallest_bar_of_the_distribution_is_the_likeliest_return():

@@ -18,6 +18,8 @@ from gvz.evaluation.trained import TrainedPlayer, check_tasks, find_checkpoints,
 from gvz.run.assemble import run_agent
 from gvz.run.config_files import config_to_dict
 from gvz.tasks import named_tasks, parse_task
+from learner.agents.configs.ppo import PPOConfig
+from learner.config import OnPolicyConfig
 from learner.export import flatten_params
 from tests.evaluation.policies import CONFIG, write_policy
 
@@ -164,6 +166,20 @@ def test_a_policy_of_another_configuration_is_an_error(run):
     wider = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, hidden_units=9))
     with pytest.raises(CheckpointError, match="it belongs to another configuration"):
         trained_player(run, wider, 20)
+
+
+def test_an_agent_with_a_policy_has_probabilities_and_a_value_and_no_action_values(run):
+    agent = PPOConfig(conv_channels=(4,), conv_kernels=(8,), conv_strides=(8,), hidden_units=8)
+    config = dataclasses.replace(CONFIG, agent=agent, replay=None, learner=OnPolicyConfig())
+    (run / "config.json").write_text(json.dumps(config_to_dict(config)))
+    params, made = write_policy(run, config, 20), run_agent(config)
+    player = TrainedPlayer(run, 20)
+    action = player.act()
+    wanted = made.evaluate(params, made.spec.zeros())
+    assert player.values.q_values is None
+    assert action == int(wanted.action[0]) == int(player.values.policy.argmax())
+    np.testing.assert_allclose(player.values.policy, wanted.policy[0], atol=1e-5)
+    assert player.values.value == pytest.approx(float(wanted.value[0]), abs=1e-5)
 
 
 def test_an_agent_without_distributions_has_values_alone(run):

@@ -93,7 +93,8 @@ def test_every_agent_keeps_the_contract(name: str):
     assert extras.shape[1] >= 1
     np.testing.assert_allclose(extras[:, 0], 0.0, atol=2e-6, err_msg="the value of a fresh network is 0")
     evaluation = evaluate(params, obs)
-    np.testing.assert_array_equal(evaluation.action, np.asarray(evaluation.q_values).argmax(-1))
+    of_actions = evaluation.policy if evaluation.q_values is None else evaluation.q_values
+    np.testing.assert_array_equal(evaluation.action, np.asarray(of_actions).argmax(-1))
     batch = samples(agent, params, obs, act)
     result = losses(params, batch)
     for values in (result.loss, *result.metrics.values(), *batch.targets):
@@ -123,14 +124,15 @@ def test_ppo_samples_its_policy_and_records_value_and_probability():
     actions, extras = jax.jit(jax.vmap(lambda key: agent.act(params, key, obs, jnp.float32(0.0))))(
         jax.random.split(jax.random.key(0), K)
     )
-    probabilities = np.asarray(evaluate(params, obs).q_values)
+    evaluation = evaluate(params, obs)
+    assert evaluation.q_values is None
+    probabilities = np.asarray(evaluation.policy)
     np.testing.assert_allclose(probabilities.sum(1), 1.0, rtol=1e-5)
     shares = np.stack([(np.asarray(actions) == a).mean(0) for a in range(A)], axis=1)
     np.testing.assert_allclose(shares, probabilities, atol=5 * np.sqrt(0.25 / K))
     taken = probabilities[np.arange(B), np.asarray(actions)]
     np.testing.assert_allclose(np.exp(extras[:, :, 1]), taken, rtol=1e-4)
-    _, value = jax.jit(agent.policy)(params, obs)
-    np.testing.assert_allclose(extras[0, :, 0], value, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(extras[0, :, 0], evaluation.value, rtol=1e-5, atol=1e-6)
 
 
 def test_pqn_records_the_largest_value_among_the_allowed():
