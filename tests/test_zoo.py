@@ -136,4 +136,6 @@ def test_a_policy_is_the_best_of_its_track_on_the_gate_tasks(folders, suffix, na
         assert len(scores) > 2
         directory = run_directory(Path(f"zoo:{name}{suffix}"))
         config = read_run_config(directory)
-        assert (config.name, config.seed, *find_checkpoints(directory, ["newest"])) == max(scores, key=scores.__getitem__)
+        assert (config.name, config.seed, *find_checkpoints(directory, ["newest"])) == max(
+            scores, key=scores.__getitem__
+        )
