@@ -89,3 +89,47 @@ def test_the_findings_say_where_ppo_is_better_than_rainbow(task, said):
 
 def test_the_findings_say_what_ppo_gains_in_health_gathering():
     assert f"**In Health Gathering it has {gains('health_gathering')[1]} points more on the gate tasks.**" in WORDS
+
+
+def test_the_findings_say_what_a_longer_horizon_and_more_entropy_gave_ppo():
+    name, variants = "defend_the_center", ("plain", "discount_99", "entropy_03", "both")
+    trained, gate, *_ = task_sets(name)
+    episodes = results_of("gates").episodes.filter(scenario=name)
+    plain, *others = (agent_scores(episodes, f"ppo_segmented+{variant}") for variant in variants)
+    (_, of_entropy, of_both), (_, costs, gains_in_training) = (
+        [estimate_groups([(scores, tasks), (plain, tasks)], difference).text for scores in others]
+        for tasks in (gate, trained)
+    )
+    assert f"the training tasks gain {gains_in_training} points" in WORDS
+    assert f"gain with it**: {of_both} points with both." in WORDS
+    assert costs == "-2.5 [-4.2, -0.9]"
+    assert f"alone gives {of_entropy} there, and costs the training tasks 2.5 [0.9, 4.2]." in WORDS
+    for task, verb in (("fast_enemies+flying_enemies", " has"), ("gore+resized_enemies", "")):
+        has, had = (
+            np.mean([of_run[f"{name}/{task}"].mean() for of_run in scores.runs.values()])
+            for scores in (others[-1], plain)
+        )
+        assert f"`{task}`{verb} {has:.0f} instead of {had:.0f}" in WORDS
+    columns, decisions = [], []
+    for variant in variants:
+        (run,) = (ROOT / "results" / "gates" / "runs" / f"ppo_segmented+{variant}" / name / "train8").iterdir()
+        found = training_episodes(run, 600, 900)
+        decisions.append(metrics_of(run)[-1]["actors/env_steps"])
+        score = np.mean([row["normalized_score"] for row in found])
+        bullets = -10 * np.mean([row["reward_components"]["ammo_spent"] for row in found])
+        columns.append((f"{score:.1f}", f"{100 * np.mean([row['truncated'] for row in found]):.0f}", f"{bullets:.1f}"))
+    assert f"{round(min(decisions), -3):,} to {round(max(decisions), -3):,} decisions" in WORDS
+    titles = (
+        "training episodes, 600 to 900 s",
+        "percent of these that reach the time-out",
+        "bullets spent in one of them, of 26",
+    )
+    for title, cells in zip(titles, zip(*columns, strict=True), strict=True):
+        assert f"| {title} | {' | '.join(cells)} |" in PAGE
+    timed_out = [
+        100
+        * np.mean([row["truncated"] for row in training_episodes(ROOT / "results" / run.format(name), 4_800, 5_400)])
+        for run in (RUNS["PPO, seed 1111"], RUNS["Rainbow, seed 1111"])
+    ]
+    assert f"core, {timed_out[0]:.0f} percent of its training episodes reached the time-out." in WORDS
+    assert f"the same discount, had {timed_out[1]:.0f} percent" in WORDS
