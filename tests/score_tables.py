@@ -2,13 +2,15 @@
 
 import gzip
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars
 
-from gvz.reports.scores import Scores, estimate
+from gvz.evaluation.statistics import mean_over_scenarios
+from gvz.reports.scores import Scores, estimate, estimate_groups
 from gvz.tasks import TaskSet, named_tasks
 
 
@@ -26,6 +28,12 @@ def task_sets(scenario: str, training: TaskSet = "train8") -> list[list[str]]:
 def score_cells(scores: Scores, scenario: str, training: TaskSet = "train8") -> str:
     """Mean score and interval on each of `task_sets`, as cells of a Markdown table."""
     return " | ".join(estimate(scores, tasks).text for tasks in task_sets(scenario, training))
+
+
+def means(of_agents: Mapping[str, Scores]) -> list[str]:
+    """Means over scenarios on each of `task_sets`."""
+    groups = [[(scores, task_sets(name)[column]) for name, scores in of_agents.items()] for column in range(4)]
+    return [estimate_groups(group, mean_over_scenarios).text for group in groups]
 
 
 def of_first_seed(episodes: polars.DataFrame) -> polars.DataFrame:

@@ -7,18 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from gvz.evaluation.episode_log import read_rows
-from gvz.evaluation.statistics import difference, mean_over_scenarios
+from gvz.evaluation.statistics import difference
 from gvz.evaluation.zoo import run_directory
-from gvz.reports.scores import Scores, agent_scores, estimate, estimate_groups
+from gvz.reports.scores import agent_scores, estimate, estimate_groups
 from gvz.tasks import parse_task, scenario_named, scenarios
-from tests.score_tables import of_first_seed, score_cells, task_sets
+from tests.score_tables import means, of_first_seed, score_cells, task_sets
 from tests.test_results import ROOT, results_of
-
-
-def _means(of_agents: dict[str, Scores]) -> list[str]:
-    """Means over scenarios on each of `task_sets`."""
-    groups = [[(of_agents[name], task_sets(name)[column]) for name in scenarios()] for column in range(4)]
-    return [estimate_groups(group, mean_over_scenarios).text for group in groups]
 
 
 def test_the_findings_say_what_compositions_of_attributes_gave():
@@ -32,7 +26,7 @@ def test_the_findings_say_what_compositions_of_attributes_gave():
     for (name, called), of_agent in scores.items():
         assert f"| {scenario_named(name).title} | {called} | {score_cells(of_agent, name)} |" in page
     for called in folders:
-        *cells, on_level_4 = _means({name: scores[name, called] for name in scenarios()})
+        *cells, on_level_4 = means({name: scores[name, called] for name in scenarios()})
         assert f"| mean | {called} | {' | '.join(cells)} | {on_level_4} |" in page
     assert f"has {on_level_4} there after the same time" in page
 
@@ -70,7 +64,7 @@ def test_the_findings_say_what_compositions_gave_with_more_time():
         cells = score_cells(of_agent, name)
         assert f"| {scenario_named(name).title} | {called} | {seconds} | {cells} |" in page
     for row in rows:
-        *cells, on_level_4 = _means({name: of_seed[name, row] for name in scenarios()})
+        *cells, on_level_4 = means({name: of_seed[name, row] for name in scenarios()})
         assert f"| mean | {row[0]} | {row[1]} | {' | '.join(cells)} | {on_level_4} |" in page
         if row == longer:
             assert f"mean of the scenarios level 4 has {on_level_4}.**" in page
@@ -100,7 +94,7 @@ def test_the_findings_say_what_further_seeds_of_compositions_gave_with_more_time
     for name, seed in runs:
         of_agent = agent_scores(further.filter(scenario=name, run_seed=seed), "rainbow_segmented")
         assert f"| {scenario_named(name).title} | {seed} | {score_cells(of_agent, name)} |" in page
-    *_, on_test, on_level_4 = _means(
+    *_, on_test, on_level_4 = means(
         {name: agent_scores(episodes.filter(scenario=name), "rainbow_segmented") for name in scenarios()}
     )
     assert f"With all seeds the mean is {on_level_4} on level 4 and {on_test} on the test tasks." in page
