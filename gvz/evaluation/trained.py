@@ -44,8 +44,8 @@ class Values:
     """f32[N], the returns that `probabilities` are of"""
     policy: np.ndarray | None
     """f32[A], the probability of each action, if the agent learns a policy"""
-    value: float
-    """of what it sees; with action values, the largest of them"""
+    value: float | None
+    """of what it sees, if the agent has one; with action values, the largest of them"""
 
 
 def read_run_config(run_dir: Path, agent_file: Path | None = None) -> RunConfig:
@@ -176,13 +176,13 @@ class TrainedPlayer:
         if self._evaluation is None:
             return None
         _, q_values, probabilities, atoms, policy, value = self._evaluation
-        estimates = q_values if value is None else value
+        of_state = q_values if value is None else value
         return Values(
             q_values=None if q_values is None else np.asarray(q_values)[0],
             probabilities=None if probabilities is None else np.asarray(probabilities)[0],
             atoms=None if atoms is None else np.asarray(atoms),
             policy=None if policy is None else np.asarray(policy)[0],
-            value=float(np.asarray(estimates)[0].max()),
+            value=None if of_state is None else float(np.asarray(of_state)[0].max()),
         )
 
     def begin(self, env: "DoomEnv", observation: "Observation", info: dict[str, Any], seed: int) -> None:

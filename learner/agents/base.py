@@ -76,7 +76,7 @@ class Evaluation(NamedTuple):
     policy: Float[Array, "B A"] | None = None
     """the probability of each action, if the agent learns a policy"""
     value: Float[Array, "B"] | None = None
-    """the value of the observation, with `policy`"""
+    """the value of the observation, if the agent learns one beside its policy"""
 
 
 class AgentLoss(NamedTuple):

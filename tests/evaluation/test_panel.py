@@ -35,7 +35,7 @@ def values(q_values, peak_atom: int = 25) -> Values:
     return Values(q_values=q, probabilities=masses, atoms=atoms, policy=None, value=float(q.max()))
 
 
-def policy(probabilities, value: float = 0.0) -> Values:
+def policy(probabilities, value: float | None = None) -> Values:
     return Values(q_values=None, probabilities=None, atoms=None, policy=np.array(probabilities), value=value)
 
 
