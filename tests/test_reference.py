@@ -3,10 +3,13 @@
 import gzip
 import itertools
 import json
+import runpy
+import sys
 
 import numpy as np
 import pytest
 
+import benchmarks.reference
 from benchmarks.reference import (
     COMMAND,
     PAGE,
@@ -207,3 +210,9 @@ def test_what_is_no_reference_record_is_refused(tmp_path):
 def test_a_page_without_its_markers_is_an_error():
     with pytest.raises(ConfigError, match="are missing; what is measured goes between them"):
         between("# The benchmark", PAGE, "reference scores", "tables", COMMAND)
+
+
+def test_the_command_names_a_missing_file(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["reference", "missing.jsonl"])
+    with pytest.raises(SystemExit, match=r"^error: missing\.jsonl: no such record file"):
+        runpy.run_path(benchmarks.reference.__file__, run_name="__main__")

@@ -94,13 +94,17 @@ class Writer:
         )
 
 
-def lock(file: IO[Any]) -> bool:
+def lock(file: IO[Any], *, wait: bool = False) -> bool:
     """Locks an open file for this process and its children; False if another process holds the lock.
 
     The kernel takes the lock back when the last of them has closed the file or has ended.
+
+    Args:
+        file: an open file.
+        wait: until the other process has given it back, instead of returning False.
     """
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
     except BlockingIOError:
         return False
     return True

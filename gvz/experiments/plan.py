@@ -2,13 +2,13 @@
 
 import dataclasses
 import json
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+from gvz.core import records
 from gvz.core.errors import ConfigError
 from gvz.evaluation.simple import SimplePlayerName
 from gvz.experiments.base import Experiment, TrainingRun, experiment_named
@@ -152,24 +152,28 @@ def read_plan(results: Path) -> Plan | None:
 def write_plan(results: Path, plan: Plan) -> Plan:
     """Adds a plan to the one that the directory has.
 
+    Commands that start at once with one directory wait for each other here, so that none takes the other's away.
+
     Returns: both as one.
 
     Raises:
         ConfigError: the scales differ, or the directory cannot be written.
     """
-    before = read_plan(results)
-    both = plan if before is None else before.joined(plan)
-    saved = {
-        "schema": PLAN_SCHEMA,
-        "experiments": list(both.names),
-        "scale": both.scale,
-        "scenarios": None if both.scenarios is None else list(both.scenarios),
-    }
     try:
         results.mkdir(parents=True, exist_ok=True)
-        temporary = results / f"plan.json.{os.getpid()}"  # the shards of a cluster may come at once
-        temporary.write_text(json.dumps(saved, indent=2) + "\n")
-        temporary.replace(results / "plan.json")
+        with (results / ".plan.lock").open("ab") as lock:
+            records.lock(lock, wait=True)
+            before = read_plan(results)
+            both = plan if before is None else before.joined(plan)
+            saved = {
+                "schema": PLAN_SCHEMA,
+                "experiments": list(both.names),
+                "scale": both.scale,
+                "scenarios": None if both.scenarios is None else list(both.scenarios),
+            }
+            temporary = results / "plan.json.new"  # who reads meanwhile gets the old plan, whole
+            temporary.write_text(json.dumps(saved, indent=2) + "\n")
+            temporary.replace(results / "plan.json")
     except OSError as error:
         raise ConfigError(f"--results: {results} cannot be written: {error.strerror}") from error
     return both

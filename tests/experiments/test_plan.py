@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from hypothesis import given
@@ -10,6 +12,7 @@ from hypothesis import strategies as st
 from gvz.core.errors import ConfigError
 from gvz.experiments.base import experiments
 from gvz.experiments.plan import Evaluation, Plan, parse_shard, read_plan, shard, write_plan
+from gvz.tasks import scenarios
 
 THESIS = ("training_difficulty", "training_set_size", "algorithm_comparison", "rainbow_evaluation")
 
@@ -59,7 +62,20 @@ def test_plan_json_gathers_what_was_asked_for(tmp_path):
     assert both.scenarios == ("seek_and_kill", "health_gathering")
     assert read_plan(tmp_path) == both
     assert write_plan(tmp_path, dataclasses.replace(two, scenarios=None)).scenarios is None
-    assert [p.name for p in tmp_path.iterdir()] == ["plan.json"]
+    assert {p.name for p in tmp_path.iterdir()} == {"plan.json", ".plan.lock"}
+
+
+def test_commands_that_start_at_once_all_get_into_the_plan(tmp_path, monkeypatch):
+    def read_slowly(results):
+        found = read_plan(results)
+        time.sleep(0.05)  # long enough for all others to read the same plan
+        return found
+
+    monkeypatch.setattr("gvz.experiments.plan.read_plan", read_slowly)
+    plans = [Plan(names=("rainbow_evaluation",), scenarios=(name,)) for name in scenarios()]
+    with ThreadPoolExecutor(len(plans)) as pool:
+        list(pool.map(write_plan, [tmp_path] * len(plans), plans))
+    assert set(read_plan(tmp_path).scenarios) == set(scenarios())
 
 
 def test_scales_are_not_mixed(tmp_path):
