@@ -209,6 +209,7 @@ class ActorLoop:
         )
         game.episode += 1
         if game.next_task != game.task:
+            self._ring.beat(WriterState.RESETTING)  # a map may be compiled, which takes its time
             game.env.close()
             game.task, game.env = game.next_task, self._make_env(game.next_task)
         self._reset(game)

@@ -103,8 +103,12 @@ class LearnerParts(Protocol):
         """Samples of a gradient step."""
         ...
 
-    def memory_bytes(self) -> int:
-        """Bytes of the records that the learner keeps on its device."""
+    def device_bytes(self) -> int:
+        """Bytes of the records that the learner keeps on its devices, in all."""
+        ...
+
+    def host_bytes(self) -> int:
+        """Bytes of the records that it keeps in numpy, whatever its devices are."""
         ...
 
     def array_shapes(self) -> dict[str, Any]:

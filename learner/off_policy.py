@@ -45,8 +45,11 @@ class OffPolicyParts(Learning):
     def batch_size(self) -> int:
         return self.config.batch_size
 
-    def memory_bytes(self) -> int:
+    def device_bytes(self) -> int:
         return replay.memory_bytes(self.replay_spec)
+
+    def host_bytes(self) -> int:
+        return 0
 
     def make(
         self, key: jax.Array, tasks: Sequence[str], diagnostics_dir: Path, restored: Restored | None = None
@@ -135,14 +138,15 @@ class OffPolicyLearner:
         return self._flatten(self._placement.one_copy(self._state.params))
 
     def take_metrics(self) -> dict[str, float]:
-        """Means of the train step as `learner/...`, shares of the tasks in the replay as `replay/share/...`."""
+        """Means of the train step as `learner/...`, what the replay holds as `replay/...`."""
         state = self._placement.local(self._state)
         means, state = train_step.read_metrics(state, self._tasks, self._diagnostics_dir)
         self._state = self._placement.settled(state)
         stored = np.asarray(store.records_per_task(self._parts.replay_spec, self._replay.store))
         shares = zip(self._tasks, (stored / stored.sum()).tolist(), strict=True)
-        learner = {f"learner/{name}": value for name, value in means.items()}
-        return {**learner, **{f"replay/share/{name}": share for name, share in shares}}
+        metrics = {f"learner/{name}": value for name, value in means.items()}
+        metrics["replay/fill_share"] = float(stored.sum()) / self._parts.num_slots
+        return {**metrics, **{f"replay/share/{name}": share for name, share in shares}}
 
     def take_staleness(self) -> Staleness:
         return self._ingest.take_staleness()

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gvz.transport.messages import StepBlock
-from learner import rollout_step
+from learner import rollout_step, rollouts
 from learner.agents.base import OnPolicyAgent, Params
 from learner.checkpoint import Restored
 from learner.config import OnPolicyConfig
@@ -38,20 +38,24 @@ class OnPolicyParts:
         """Shapes and dtypes of `OnPolicyLearner.arrays()`."""
         return {
             "learner": jax.eval_shape(self.init, jax.random.key(0)),
-            "rollouts": jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), Rollouts(self.spec).arrays()),
+            "rollouts": rollouts.array_shapes(self.spec),
         }
 
     @property
     def num_slots(self) -> int:
-        return 2 * self.spec.num_slots
+        return self.spec.num_windows * self.spec.lane_capacity
 
     @property
     def batch_size(self) -> int:
         return rollout_step.batch_size(self.spec, self.config)
 
-    def memory_bytes(self) -> int:
-        """Of the windows on the host, and of the rollout that is learnt from."""
-        return Rollouts(self.spec).memory_bytes() * 3 // 2
+    def device_bytes(self) -> int:
+        """Of the rollout that is learnt from: half of the windows."""
+        return rollouts.memory_bytes(self.spec) // 2
+
+    def host_bytes(self) -> int:
+        """Of the windows."""
+        return rollouts.memory_bytes(self.spec)
 
     def init(self, key: jax.Array) -> rollout_step.OnPolicyState:
         """The state before the first update."""
@@ -130,11 +134,12 @@ class OnPolicyLearner:
         return self._flatten(self._state.params)
 
     def take_metrics(self) -> dict[str, float]:
-        """Means of the updates as `learner/...`, and how old the actions learnt from were as `rollout/...`."""
+        """Means of the updates as `learner/...`, ages of the actions learnt from as `rollout/...`, and the fill."""
         means, self._state = read_metrics(self._state, self._tasks, self._diagnostics_dir)
         ages = np.concatenate([np.zeros(0, np.int64), *self._ages])
         self._ages = []
         metrics = {f"learner/{name}": value for name, value in means.items()}
+        metrics["replay/fill_share"] = self._rollouts.fill_share()
         if ages.size:
             metrics |= {"rollout/age_mean_versions": float(ages.mean()), "rollout/age_max_versions": float(ages.max())}
         return metrics

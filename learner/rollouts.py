@@ -10,10 +10,12 @@ windows in a rollout, no lane waits for another, and a lane whose actor died hol
 Windows are gathered in numpy, in the records' own form, and go to the device as a `Store` whose lanes are windows.
 """
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
@@ -34,6 +36,11 @@ class RolloutSpec(StoreSpec):
         """T."""
         return self.lane_capacity - self.history
 
+    @property
+    def num_windows(self) -> int:
+        """Two for each lane: one that is being filled and one that is complete."""
+        return 2 * self.num_lanes
+
 
 class Rollout(NamedTuple):
     """Windows on their way to the device."""
@@ -45,15 +52,15 @@ class Rollout(NamedTuple):
 
 
 class Rollouts:
-    """Gathers the lanes' windows, at most two for each lane: one that is being filled and one that is complete."""
+    """Gathers the lanes' windows, at most `num_windows`."""
 
     def __init__(self, spec: RolloutSpec):
         L, W = spec.num_lanes, spec.lane_capacity
         self._spec, self._begin = spec, spec.history - 1
-        self._steps = np.zeros((2 * L, W), step_dtype(spec.num_variables, spec.num_extras))
-        self._frames = np.zeros((2 * L, W, *spec.frame_shape), np.uint8)
+        self._steps = np.zeros((spec.num_windows, W), step_dtype(spec.num_variables, spec.num_extras))
+        self._frames = np.zeros((spec.num_windows, W, *spec.frame_shape), np.uint8)
         self._open, self._fill = list(range(L)), [self._begin] * L
-        self._complete, self._free = deque[int](), list(range(L, 2 * L))
+        self._complete, self._free = deque[int](), list(range(L, spec.num_windows))
 
     def add(self, blocks: Sequence[StepBlock]) -> None:
         """Takes records that `Ingest.check` has passed, at most `num_records_allowed` of them.
@@ -129,9 +136,10 @@ class Rollouts:
         }
         return Store(**fields)
 
-    def memory_bytes(self) -> int:
-        """Bytes of all windows."""
-        return self._steps.nbytes + self._frames.nbytes
+    def fill_share(self) -> float:
+        """Share of the windows' slots that hold records."""
+        num_records = sum(self._fill) + len(self._complete) * self._spec.lane_capacity
+        return num_records / (self._spec.num_windows * self._spec.lane_capacity)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All records, for a checkpoint; views."""
@@ -153,6 +161,21 @@ class Rollouts:
             mine[...] = arrays[name]
         self._open, self._fill = list(state["open"]), list(state["fill"])
         self._complete, self._free = deque(state["complete"]), list(state["free"])
+
+
+def array_shapes(spec: RolloutSpec) -> dict[str, jax.ShapeDtypeStruct]:
+    """Shapes and dtypes of `Rollouts.arrays()`; allocates nothing."""
+    slots = (spec.num_windows, spec.lane_capacity)
+    record_bytes = step_dtype(spec.num_variables, spec.num_extras).itemsize
+    return {
+        "steps": jax.ShapeDtypeStruct((*slots, record_bytes), np.uint8),
+        "frames": jax.ShapeDtypeStruct((*slots, *spec.frame_shape), np.uint8),
+    }
+
+
+def memory_bytes(spec: RolloutSpec) -> int:
+    """Bytes of all windows; allocates nothing."""
+    return sum(math.prod(array.shape) for array in array_shapes(spec).values())
 
 
 def steps_of(spec: RolloutSpec, windows: Store) -> tuple[RolloutSteps, Int[Array, "T B"]]:

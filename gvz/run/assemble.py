@@ -132,7 +132,8 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
         learner=learner,
         pool_config=pool_config,
         footprint=Footprint(
-            replay_bytes=learner.memory_bytes(),
+            replay_bytes=learner.device_bytes(),
+            rollouts_bytes=learner.host_bytes(),
             replay_on_host=jax.default_backend() == "cpu",
             num_devices=config.learner.devices,
             params_bytes=4 * num_params,

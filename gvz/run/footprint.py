@@ -26,7 +26,11 @@ class Footprint:
     """Bytes and processes of a run."""
 
     replay_bytes: int
+    """of the records on the learner's devices: the replay, or the rollout that is learnt from"""
+    rollouts_bytes: int = 0
+    """of windows of rollouts, which lie in the host's memory"""
     replay_on_host: bool
+    """the devices' memory is the host's"""
     num_devices: int = 1
     """which learn, each with an equal part of the replay"""
     params_bytes: int
@@ -46,8 +50,13 @@ class Footprint:
 
     @property
     def snapshot_bytes(self) -> int:
-        """Host memory while a checkpoint is written: a second copy of replay and learner state."""
-        return self.replay_bytes + 4 * self.params_bytes
+        """Host memory while a checkpoint is written: a second copy of the records and of the learner's state."""
+        return (self.rollouts_bytes or self.replay_bytes) + 4 * self.params_bytes
+
+    @property
+    def device_bytes(self) -> int:
+        """What each device needs at least, if it has memory of its own: its part of the replay, the learner's state."""
+        return 0 if self.replay_on_host else self.replay_bytes // self.num_devices + 4 * self.params_bytes
 
     @property
     def memory_bytes(self) -> int:
@@ -55,6 +64,7 @@ class Footprint:
         return (
             LEARNER_MEMORY_BYTES
             + (self.replay_bytes + (self.num_devices - 1) * 4 * self.params_bytes if self.replay_on_host else 0)
+            + self.rollouts_bytes
             + self.snapshot_bytes
             + self.num_actors
             * (ASKING_ACTOR_MEMORY_BYTES if self.actors_ask else ACTOR_MEMORY_BYTES + 2 * self.params_bytes)
@@ -71,16 +81,33 @@ class Footprint:
             where = f"{self.num_devices} devices" + (" of the host" if self.replay_on_host else "")
             learner += f" on {self.num_devices} devices"
         shared = f"rings and {'requests' if self.actors_ask else 'parameter queue'}"
+        kept = f"replay {format_bytes(self.replay_bytes)} ({where})"
+        if self.rollouts_bytes:
+            kept = (
+                f"rollouts {format_bytes(self.rollouts_bytes)} (host) and {format_bytes(self.replay_bytes)} ({where})"
+            )
         return [
-            f"replay {format_bytes(self.replay_bytes)} ({where}), checkpoint copy {format_bytes(self.snapshot_bytes)}",
+            f"{kept}, checkpoint copy {format_bytes(self.snapshot_bytes)}",
             f"/dev/shm {format_bytes(self.shm_bytes)}, {shared} {format_bytes(self.transport_bytes)}, "
             f"host memory in all {format_bytes(self.memory_bytes)}",
             f"processes: {learner}, {self.num_actors} actors, {self.num_games} engines; {self.placement}",
         ]
 
 
-def check(footprint: Footprint, *, shm_free: int | None = None, memory_free: int | None = None) -> None:
-    """Refuses what does not fit. By default the free bytes of /dev/shm and of memory are read now.
+def check(
+    footprint: Footprint,
+    *,
+    shm_free: int | None = None,
+    memory_free: int | None = None,
+    device_free: int | None = None,
+) -> None:
+    """Refuses what does not fit.
+
+    Args:
+        footprint: of a run.
+        shm_free: bytes in /dev/shm; by default they are read now.
+        memory_free: bytes of memory; likewise.
+        device_free: bytes of a device; None if that is not known, or no matter.
 
     Raises:
         ResourceError: says what is too small, by how much, and how to get it.
@@ -97,9 +124,20 @@ def check(footprint: Footprint, *, shm_free: int | None = None, memory_free: int
     if footprint.memory_bytes > memory_free:
         raise ResourceError(
             f"memory: {format_bytes(memory_free)} available, this run needs {format_bytes(footprint.memory_bytes)} "
-            f"({'; '.join(footprint.lines())}). Lower --replay.capacity, --actors.num-actors or the frame size "
-            "(--env.frame-height, --env.frame-width, --env.grayscale)."
+            f"({'; '.join(footprint.lines())}). {_advice(footprint)}."
         )
+    if device_free is not None and footprint.device_bytes > device_free:
+        raise ResourceError(
+            f"device memory: {format_bytes(device_free)} free, this run needs at least "
+            f"{format_bytes(footprint.device_bytes)} on each device ({footprint.lines()[0]}). {_advice(footprint)}; or "
+            "let JAX take more of the device than three quarters: XLA_PYTHON_CLIENT_MEM_FRACTION=0.95."
+        )
+
+
+def _advice(footprint: Footprint) -> str:
+    records = "--learner.rollout-steps" if footprint.rollouts_bytes else "--replay.capacity"
+    frame = "--env.frame-height, --env.frame-width, --env.grayscale"
+    return f"Lower {records}, --actors.num-actors or the frame size ({frame})"
 
 
 def format_bytes(count: float) -> str:

@@ -76,6 +76,14 @@ def hardware() -> dict[str, Any]:
     }
 
 
+def free_device_memory() -> int | None:
+    """Bytes that JAX can still take of this process's first device; None if it does not say, as on a CPU."""
+    import jax
+
+    stats = jax.local_devices()[0].memory_stats() or {}
+    return stats["bytes_limit"] - stats["bytes_in_use"] if "bytes_limit" in stats else None
+
+
 def versions(packages: Sequence[str] = PACKAGES) -> dict[str, str]:
     """Of Python and of those of the packages that are installed."""
     found = {"python": platform.python_version()}

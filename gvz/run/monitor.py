@@ -49,11 +49,12 @@ class Monitor:
         self._num_slots, self._batch_size = parts.learner.num_slots, parts.learner.batch_size
         self._expected, self._warned = _expected(config, parts), set[str]()
         self._rates, self._last_look_s, self._loss = Rates(), 0.0, float("nan")
+        self._fill_share: float | None = None
 
     def log(self, statistics: PoolStatistics, staleness: Staleness, metrics: Mapping[str, float]) -> None:
         """A row of records, its alarms, and the panel, once a log period; `metrics` are the learner's."""
-        row = self._measure(statistics, staleness)
-        scalars = {**row, **metrics}
+        scalars = {**self._measure(statistics, staleness), **metrics}
+        self._fill_share = scalars["replay/fill_share"]
         self._telemetry.scalars(self._counts.updates, scalars)
         for condition, text in alarms(scalars, self._telemetry.task_statuses(), self._expected).items():
             if condition not in self._warned:  # each thing once
@@ -61,7 +62,7 @@ class Monitor:
                 self._progress.say(f"warning: {text}")
                 self._fault("warning", text)
         self._loss = metrics["learner/loss"]
-        self._progress.show(self._status(row))
+        self._progress.show(self._status(scalars))
 
     def look(self, statistics: PoolStatistics, take_staleness: Callable[[], Staleness]) -> None:
         """The panel alone, while there is nothing to log; does nothing if called again too soon."""
@@ -82,7 +83,9 @@ class Monitor:
 
     def _measure(self, statistics: PoolStatistics, staleness: Staleness) -> dict[str, float]:
         """Rates and waits since the last look, and sizes."""
-        counts = self._counts
+        counts, fill_share = self._counts, self._fill_share
+        if fill_share is None:  # the learner has not counted yet
+            fill_share = min(1.0, counts.records / self._num_slots)
         rates = self._rates(
             {
                 "learner/updates_per_s": counts.updates,
@@ -101,7 +104,7 @@ class Monitor:
             "actors/staleness_p95_versions": staleness.p95,
             "actors/staleness_max_versions": staleness.max,
             "run/processor_s": counts.processor_s,
-            "replay/fill_share": min(1.0, counts.records / self._num_slots),
+            "replay/fill_share": fill_share,
             **statistics.more,
         }
 

@@ -239,7 +239,7 @@ def train(config: RunConfig, run: RunDir, stop: StopRequest) -> int:
         group = join(config, progress.say)
         parts = assemble(with_own_segmenters(config, run), run.work)
         progress.say("\n".join(parts.footprint.lines()))
-        footprint.check(parts.footprint)
+        footprint.check(parts.footprint, device_free=machine.free_device_memory())
         acting = jax.ShapeDtypeStruct((parts.pool_config.num_params,), jnp.float32)
         restored = restore(run, {**parts.learner.array_shapes(), "acting": acting}, group, progress.say)
         run.write_config(config)

@@ -1,5 +1,6 @@
 """Rollouts against a slow oracle: windows, stacks, ends, cuts, returns; lanes of different speeds; checkpoints."""
 
+import dataclasses
 from dataclasses import dataclass, field
 
 import jax
@@ -10,7 +11,7 @@ from gvz.transport.messages import StepBlock, step_dtype
 from learner import store
 from learner.agents.base import AgentSpec, make_agent
 from learner.agents.configs.ppo import PPOConfig
-from learner.rollouts import Rollouts, RolloutSpec, steps_of
+from learner.rollouts import Rollouts, RolloutSpec, array_shapes, memory_bytes, steps_of
 
 LANES, T, STACK, PAST, GAMMA, LAMBDA = 3, 5, 3, 4, 0.9, 0.8
 SCALES = (1.0, 0.25)
@@ -201,3 +202,23 @@ def test_a_restored_rollout_goes_on_where_it_was():
             one.add([records])
     for mine, theirs in zip(jax.tree.leaves(rollouts.take(9)), jax.tree.leaves(other.take(9)), strict=True):
         np.testing.assert_array_equal(mine, theirs)
+
+
+def test_sizes_are_known_before_there_are_windows():
+    arrays = Rollouts(SPEC).arrays()
+    assert {name: (array.shape, array.dtype) for name, array in arrays.items()} == {
+        name: (array.shape, array.dtype) for name, array in array_shapes(SPEC).items()
+    }
+    assert memory_bytes(SPEC) == sum(array.nbytes for array in arrays.values())
+    huge = dataclasses.replace(SPEC, capacity=2**50)
+    assert memory_bytes(huge) > 2**50
+
+
+def test_the_fill_falls_when_a_rollout_is_taken():
+    streams, rollouts = [Stream(np.random.default_rng(0), lane) for lane in range(LANES)], Rollouts(SPEC)
+    windows, slots = SPEC.num_windows, SPEC.lane_capacity
+    assert rollouts.fill_share() == LANES * (HISTORY - 1) / (windows * slots)
+    in_step(rollouts, streams, T + 1)
+    assert rollouts.fill_share() == (LANES * slots + LANES * HISTORY) / (windows * slots)
+    rollouts.take(9)
+    assert rollouts.fill_share() == LANES * HISTORY / (windows * slots)

@@ -69,5 +69,30 @@ def test_too_little_memory_is_refused_with_the_bill():
         check(FOOTPRINT, shm_free=10**12, memory_free=10**9)
 
 
+def test_a_device_that_has_its_own_memory_must_hold_its_part_of_the_replay_and_the_learners_state():
+    on_devices = dataclasses.replace(FOOTPRINT, replay_on_host=False, num_devices=2)
+    assert on_devices.device_bytes == 1_000_000_000 + 4 * 20_000_000
+    check(on_devices, shm_free=10**12, memory_free=10**12, device_free=1_080_000_000)
+    with pytest.raises(
+        ResourceError,
+        match=r"^device memory: 1\.00 GB free, this run needs at least 1\.08 GB on each device \(replay 2\.00 GB "
+        r"\(2 devices\), .*\)\. Lower --replay\.capacity, --actors\.num-actors or .*=0\.95\.$",
+    ):
+        check(on_devices, shm_free=10**12, memory_free=10**12, device_free=10**9)
+    check(FOOTPRINT, shm_free=10**12, memory_free=10**12, device_free=0)  # its memory is the host's
+
+
+def test_windows_of_rollouts_lie_on_the_host_and_are_what_a_checkpoint_keeps():
+    on_policy = dataclasses.replace(FOOTPRINT, replay_bytes=1_000_000_000, rollouts_bytes=2_000_000_000)
+    assert on_policy.memory_bytes - FOOTPRINT.memory_bytes == 1_000_000_000
+    assert on_policy.snapshot_bytes == FOOTPRINT.snapshot_bytes
+    on_device = dataclasses.replace(on_policy, replay_on_host=False)
+    assert on_policy.memory_bytes - on_device.memory_bytes == 1_000_000_000
+    assert on_device.device_bytes == 1_000_000_000 + 4 * 20_000_000
+    assert on_device.lines()[0].startswith("rollouts 2.00 GB (host) and 1.00 GB (device), checkpoint copy 2.08 GB")
+    with pytest.raises(ResourceError, match=r"Lower --learner\.rollout-steps, --actors\.num-actors or the frame size"):
+        check(on_device, shm_free=10**12, memory_free=10**9)
+
+
 def test_bytes_are_readable():
     assert [format_bytes(n) for n in (0, 999, 1500, 2_000_000, 3.25e9)] == ["0 B", "999 B", "2 kB", "2 MB", "3.25 GB"]
