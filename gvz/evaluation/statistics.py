@@ -19,7 +19,7 @@ Statistic = Callable[..., np.ndarray]
 """f(scores [..., S, T], one such array for each group) -> [...]"""
 
 Cells = Sequence[Sequence[np.ndarray]]
-"""scores of single episodes: cells[s][t] is float64[E] of run s on task t; E may differ from cell to cell"""
+"""scores of single episodes: `cells[s][t]` is float64[E] of run s on task t; E may differ from cell to cell"""
 
 Redraw = Literal["episodes", "runs", "runs_by_task"]
 """what a bootstrap resamples, with replacement
@@ -173,15 +173,18 @@ def bootstrap_runs(
     statistic: Statistic = mean,
     *,
     redraw: Sequence[Redraw],
+    together: bool = False,
     num_resamples: int = 2000,
     seed: int = 0,
 ) -> Estimate:
     """A statistic of the runs' mean scores, with a percentile interval.
 
     Args:
-        groups: what the statistic takes, each resampled by itself: one scenario's runs each, or ours and theirs.
+        groups: what the statistic takes: one scenario's runs each, or ours and theirs.
         statistic: f(scores [..., S, T] of each group) -> [...].
         redraw: what is resampled in each group. Of a single run only episodes can be.
+        together: the groups are of the same runs in the same order, as of agents that play all scenarios; a resample
+            then has the same runs in each group. Otherwise each is resampled by itself.
         num_resamples: bootstrap samples.
         seed: of the resampling.
 
@@ -194,9 +197,13 @@ def bootstrap_runs(
             raise ValueError("bootstrap_runs: want runs with the same tasks, at least one episode in each")
     if not groups or len(groups) != len(redraw):
         raise ValueError(f"bootstrap_runs: got {len(groups)} groups of runs and {len(redraw)} ways, want one for each")
-    rng = np.random.default_rng(seed)
+    rngs = [np.random.default_rng(seed)] * len(groups)
+    if together:
+        if len({len(cells) for cells in groups}) > 1 or set(redraw) != {"runs"}:
+            raise ValueError("bootstrap_runs: together: want the same runs in each group, and to redraw runs")
+        rngs = [np.random.default_rng(seed) for _ in groups]  # each draws the same runs
     means = [_means(cells) for cells in groups]
-    drawn = [_redrawn(cells, how, num_resamples, rng) for cells, how in zip(groups, redraw, strict=True)]
+    drawn = [_redrawn(cells, how, num_resamples, rng) for cells, how, rng in zip(groups, redraw, rngs, strict=True)]
     low, high = np.quantile(statistic(*drawn), [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return Estimate(value=float(statistic(*means)), low=float(low), high=float(high))
 

@@ -85,7 +85,7 @@ class Document:
 
     title: str
     abstract: tuple[str, ...]
-    """what was run, with which budget, which agent beats which"""
+    """what was run, with which budget, who has more points"""
     warnings: tuple[str, ...]
     """what the numbers cannot show"""
     sections: tuple[Section, ...]

@@ -151,7 +151,7 @@ def interval_note(experiment: Experiment) -> str:
     what = "runs resampled within each task" if experiment.evaluate_on == "own" else "whole training seeds resampled"
     return (
         f"Mean [95% bootstrap interval, {what}]. With {len(experiment.seeds)} seeds it is about the range of their "
-        "means. A cell with missing seeds says so."
+        "means, and too short. A cell with missing seeds says so; with one seed, its interval is over episodes."
     )
 
 

@@ -6,7 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from gvz.core.errors import ConfigError
-from gvz.reports.abstract import caveats, what_beats_what, what_was_run
+from gvz.reports.abstract import caveats, what_was_run, who_has_more
 from gvz.reports.document import Block, Document, Section
 from gvz.reports.experiment_section import experiment_section
 from gvz.reports.joint_section import joint_sections
@@ -56,7 +56,7 @@ def make_report(paths: Sequence[Path], out: Path, title: str | None = None) -> t
     versions = ", ".join(f"{name} {version(name)}" for name in _PACKAGES)
     document = Document(
         title=title or "Report on " + ", ".join(path.resolve().name for path in paths),
-        abstract=(*what_was_run(results), *what_beats_what(results)),
+        abstract=(*what_was_run(results), *who_has_more(results)),
         warnings=tuple(caveats(results)),
         sections=tuple(sections),
         out=out,

@@ -3,8 +3,10 @@
 Reads records, never checkpoints.
 """
 
+import dataclasses
+import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -18,6 +20,7 @@ from gvz.evaluation.dataset import collect_evaluations, fits
 from gvz.experiments.base import Experiment
 from gvz.experiments.inventory import PROCESSOR_S
 from gvz.experiments.plan import read_plan
+from gvz.run.resume import may_change
 from gvz.tasks import TrainingSet, all_scenarios, named_tasks
 
 EACH = "each task alone"
@@ -43,7 +46,7 @@ class Run:
 
     path: Path
     id: str
-    """its path under runs/, else its directory's"""
+    """its path under runs/, else its directory's name; with more of its path where two would be the same"""
     config: dict[str, Any]
     """the configuration, as saved"""
     tasks: tuple[str, ...]
@@ -133,11 +136,13 @@ def read_results(paths: Sequence[Path]) -> Results:
         ConfigError: a path does not exist.
     """
     episodes, problems = collect_evaluations(paths)
+    episodes, of_other_seeds = _of_one_base_seed(episodes)
+    problems += of_other_seeds
     runs: dict[Path, Run] = {}
     asked = []
     for path in paths:
         for config in sorted(path.rglob("config.json")) if path.is_dir() else []:
-            of_group = (config.parents[1] / "config.json").exists()  # a further learner process of that run
+            of_group = (config.resolve().parents[1] / "config.json").exists()  # a further learner process of that run
             if config.parent.resolve() not in runs and "discarded" not in config.parts and not of_group:
                 run, found = _read_run(config, path)
                 problems += found
@@ -158,10 +163,11 @@ def read_results(paths: Sequence[Path]) -> Results:
         if str(run.path) not in evaluated:
             problems.append(f"{run.path}: no evaluation of this run yet; make one with `gvz evaluate {run.path}`")
     agents = _agents(list(runs.values()), evaluated)
+    problems += _pooled(list(runs.values()), agents, evaluated)
     return Results(
         paths=tuple(paths),
         episodes=_with_agents(episodes, agents),
-        runs=tuple(runs.values()),
+        runs=_with_unique_ids(list(runs.values())),
         agents=agents,
         asked=tuple(asked),
         problems=tuple(problems),
@@ -201,6 +207,31 @@ def _run_id(directory: Path, results: Path) -> str:
     return "/".join(inside[1:] if inside[:1] == ("runs",) else inside) or directory.resolve().name
 
 
+def _with_unique_ids(runs: Sequence[Run]) -> tuple[Run, ...]:
+    """Runs whose ids are the same get as much more of their paths as tells them apart."""
+    parts = {run.path: run.path.resolve().parts for run in runs}
+    unique = []
+    for run in runs:
+        others = [parts[other.path] for other in runs if other.id == run.id and other.path != run.path]
+        mine, length = parts[run.path], run.id.count("/") + 1
+        while others and any(other[-length:] == mine[-length:] for other in others):
+            length += 1
+        unique.append(dataclasses.replace(run, id="/".join(mine[-length:])) if others else run)
+    return tuple(unique)
+
+
+def _of_one_base_seed(episodes: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
+    """The episodes of the smallest base seed, by which agents are compared, and what is left out."""
+    kept = episodes.filter(pl.col("base_seed") == pl.col("base_seed").min())
+    if len(kept) == len(episodes):
+        return episodes, []
+    left_out = len(episodes) - len(kept)
+    return kept, [
+        f"{left_out} evaluation episodes of other base seeds than {kept['base_seed'][0]} are left out: they are other "
+        "episodes, and `gvz evaluate` prints their scores"
+    ]
+
+
 @cache
 def _task_ids(scenario: str, split: TrainingSet) -> set[str]:
     return {task.id for task in named_tasks(scenario, split=split)} if scenario in all_scenarios() else set()
@@ -230,9 +261,74 @@ def _agents(runs: Sequence[Run], evaluated: Mapping[object, set[str]]) -> dict[s
         return EACH if apart and len(played) > 2 else run.training  # more than default and one other
 
     trainings = {name: {training(run) for run in runs if run.name == name} for name in {run.name for run in runs}}
-    return {
-        str(run.path): run.name if len(trainings[run.name]) == 1 else f"{run.name} ({training(run)})" for run in runs
+    settings = _telling_settings(runs)
+    words = {
+        run.path: [training(run)] * (len(trainings[run.name]) > 1)
+        + settings.get(run.path, []) * (not _is_of_a_set(run))
+        for run in runs
     }
+    return {
+        str(run.path): f"{run.name} ({', '.join(words[run.path])})" if words[run.path] else run.name for run in runs
+    }
+
+
+def _telling_settings(runs: Sequence[Run]) -> dict[Path, list[str]]:
+    """ "agent.discount 0.5": settings in which runs of one name on the same tasks differ, of each of these runs.
+
+    Left out are settings that change nothing (`gvz.run.resume`), numbers of actors and games, and those that the other
+    run lacks: it is of an older version.
+    """
+    alike: dict[tuple[str, tuple[str, ...]], list[Run]] = {}
+    for run in runs:
+        alike.setdefault((run.name, run.tasks), []).append(run)
+    found: dict[Path, list[str]] = {}
+    for group in alike.values():
+        values = [dict(_settings(run.config, run.scenarios)) for run in group]
+        for name in values[0]:
+            own = [of_run.get(name) for of_run in values]
+            if None not in own and len(set(own)) > 1:
+                for run, value in zip(group, own, strict=True):
+                    found.setdefault(run.path, []).append(f"{name} {value}")
+    return found
+
+
+def _settings(config: Mapping[str, Any], scenarios: Sequence[str], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Dotted names and values, in JSON, of what may tell agents of these scenarios apart."""
+    for name, value in config.items():
+        if isinstance(value, dict):
+            yield from _settings(value, scenarios, f"{prefix}{name}.")
+        elif name == "reward_weights" and isinstance(value, list):
+            yield (
+                prefix + name,
+                json.dumps([pair for pair in value if any(f"{scenario}." in str(pair) for scenario in scenarios)]),
+            )
+        elif not (may_change(prefix + name) or prefix + name in _TELL_NOTHING):
+            yield prefix + name, json.dumps(value)
+
+
+_TELL_NOTHING = ("seed", "scenario", "training_set", "tasks", "actors.num_actors", "actors.games_per_actor")
+
+
+def _pooled(runs: Sequence[Run], agents: Mapping[str, str], evaluated: Mapping[object, set[str]]) -> list[str]:
+    """What a reader would not expect to be put together: an agent's runs of other settings, and of one seed."""
+    settings, problems = _telling_settings(runs), []
+    by_agent: dict[str, list[Run]] = {}
+    for run in runs:
+        by_agent.setdefault(agents[str(run.path)], []).append(run)
+    for agent, of_agent in by_agent.items():
+        problems += [
+            f"{run.path}: put together with other runs of {agent}, which have another {', '.join(settings[run.path])}"
+            for run in of_agent
+            if _is_of_a_set(run) and run.path in settings
+        ]
+        for one, other in itertools.combinations(of_agent, 2):
+            both = evaluated.get(str(one.path), set()) & evaluated.get(str(other.path), set())
+            if one.seed == other.seed and one.tasks == other.tasks and both:
+                problems.append(
+                    f"{other.path}: the same agent and training seed as {one.path}; their episodes are put together as "
+                    "if they were of one run; leave one out"
+                )
+    return problems
 
 
 def _is_of_a_set(run: Run) -> bool:

@@ -24,6 +24,9 @@ class Scores:
     """the required ones; those that are not in `runs` are missing"""
     agents_of_tasks: bool = False
     """every task has agents of its own: a seed stands for different agents on different tasks"""
+    policies: tuple[tuple[Seed, str, str], ...] = ()
+    """(seed, run directory, hash of the parameters) of what played, by which the runs of two scenarios are seen to be
+    the same; empty if that is not known"""
 
     def complete_seeds(self, tasks: Sequence[str]) -> tuple[Seed, ...]:
         """Seeds with an episode at least of each task."""
@@ -59,11 +62,13 @@ def agent_scores(episodes: pl.DataFrame, agent: str, *, column: str = "normalize
     """
     rows = episodes.filter(pl.col("final"), agent=agent)
     runs = pick(rows, column=column)
+    policies = rows.select("run_seed", "run_dir", "params").drop_nulls().unique().sort(pl.all())
     one_task_each = rows.group_by("run_dir").agg(pl.col("trained_on").list.len().max()).drop_nulls()
     return Scores(
         runs=runs,
         wanted_seeds=tuple(sorted(runs, key=lambda seed: -1 if seed is None else seed)),
         agents_of_tasks=len(one_task_each) > len(runs),
+        policies=tuple(policies.rows()),
     )
 
 
@@ -87,4 +92,6 @@ def estimate_groups(groups: Sequence[tuple[Scores, Sequence[str]]], statistic: S
     if not groups or not all(tasks and runs for (_, tasks), runs in zip(groups, cells, strict=True)):
         return missing(note)
     how: list[Redraw] = [redraw(scores, tasks) for scores, tasks in groups]
-    return ours(bootstrap_runs(cells, statistic, redraw=how), note, digits)
+    same_runs = len({(scores.policies, scores.complete_seeds(tasks)) for scores, tasks in groups}) == 1
+    together = same_runs and groups[0][0].policies != () and set(how) == {"runs"}
+    return ours(bootstrap_runs(cells, statistic, redraw=how, together=together), note, digits)

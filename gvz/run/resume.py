@@ -30,6 +30,11 @@ _MAY_CHANGE = (
 """Fields that leave a run what it was. Everything else changes its meaning."""
 
 
+def may_change(name: str) -> bool:
+    """Whether this field of a configuration, a dotted name, leaves a run what it was."""
+    return name in _MAY_CHANGE or f"{name.split('.')[0]}.*" in _MAY_CHANGE
+
+
 def differences(old: RunConfig, new: RunConfig) -> list[str]:
     """`field: old -> new` for every difference that would change the meaning of a run that goes on.
 
@@ -37,9 +42,6 @@ def differences(old: RunConfig, new: RunConfig) -> list[str]:
         old: as it was saved, with the range of its atoms (`config_from_dict`).
         new: as it was given: an open range is what it is derived to be now.
     """
-
-    def may_change(name: str) -> bool:
-        return name in _MAY_CHANGE or f"{name.split('.')[0]}.*" in _MAY_CHANGE
 
     before, after = _values(old), _values(new.with_support(new.support))
     names = [name for name in {**before, **after} if not may_change(name)]

@@ -1,5 +1,8 @@
 """Statistics against hand-worked numbers, scipy and rliable."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -172,3 +175,28 @@ def test_one_side_may_be_redrawn_by_runs_and_the_other_by_episodes():
     theirs = [[np.array([0.0, 2.0])]]
     gain = bootstrap_runs([[[np.array([10.0])], [np.array([30.0])]], theirs], difference, redraw=["runs", "episodes"])
     assert gain == Estimate(value=19.0, low=8.0, high=30.0)
+
+
+def test_the_guide_says_how_often_an_interval_over_few_seeds_holds_the_true_value():
+    """Of normal seeds: what is drawn has the mean 0, and so has the difference of two such agents."""
+    page = (Path(__file__).parents[2] / "docs" / "REPORTS.md").read_text()
+    rng = np.random.default_rng(0)
+    for num_seeds in (2, 3, 5, 10, 20):
+        (row,) = re.findall(rf"^\| {num_seeds} \| (\d+) \| (\d+) \|$", page, re.MULTILINE)
+        held = np.zeros(2)
+        for _ in range(500):
+            one, other = ([[np.array([score])] for score in rng.normal(size=num_seeds)] for _ in range(2))
+            estimates = (
+                bootstrap_runs([one], redraw=["runs"], num_resamples=500),
+                bootstrap_runs([one, other], difference, redraw=["runs", "runs"], num_resamples=500),
+            )
+            held += [found.low <= 0 <= found.high for found in estimates]
+        np.testing.assert_allclose(held / 5, list(map(int, row)), atol=10)  # 4.5 standard deviations of the count
+
+
+def test_groups_of_the_same_runs_are_redrawn_together():
+    runs = cells([[40.0], [50.0], [60.0]])
+    wide = bootstrap_runs([runs, runs], mean_over_scenarios, redraw=["runs"] * 2, together=True)
+    assert (wide.value, wide.low, wide.high) == (50.0, 40.0, 60.0)
+    with pytest.raises(ValueError, match="want the same runs in each group"):
+        bootstrap_runs([runs, runs[:2]], mean_over_scenarios, redraw=["runs"] * 2, together=True)

@@ -1,9 +1,10 @@
-"""The head of a report says who beats whom, and only where it can be told."""
+"""The head of a report says who has more points, and only where it can be told."""
 
 import json
+import re
 
 from gvz.experiments.plan import Plan
-from gvz.reports.abstract import caveats, what_beats_what, what_was_run
+from gvz.reports.abstract import caveats, what_was_run, who_has_more
 from gvz.reports.results import read_results
 from gvz.tasks import named_tasks
 
@@ -19,11 +20,13 @@ def test_trained_agents_first_then_the_best_beside_players(tmp_path, experiments
     rows = [json.loads(line) for line in scripted.read_text().splitlines()]
     scripted.write_text("".join(json.dumps({**row, "normalized_score": 90.0 + row["episode"]}) + "\n" for row in rows))
     results = read_results([tmp_path])
-    (sentence,) = what_beats_what(results)
-    assert sentence.startswith("Defend the Center, mean of the 7 test tasks: rainbow_quick beats dqn_quick by 40.0 [")
-    assert "; rainbow_quick beats random by 41.0 [" in sentence
-    assert "; rainbow_quick is behind scripted by -29.0 [" in sentence
-    assert caveats(results) == ["Scale 0.2: budgets and episodes are shrunk; not comparable with published numbers."]
+    (sentence,) = who_has_more(results)
+    assert sentence.startswith("Defend the Center, mean of the 7 test tasks: rainbow_quick has 40.0 [")
+    assert re.search(r"; rainbow_quick has 41\.0 \[.*\] points more than random[;.]", sentence)
+    assert re.search(r"; rainbow_quick has 29\.0 \[2\d\.\d, 3\d\.\d\] points fewer than scripted[;.]", sentence)
+    scale, few_seeds = caveats(results)
+    assert scale == "Scale 0.2: budgets and episodes are shrunk; not comparable with published numbers."
+    assert few_seeds.startswith("Fewer than 10 training seeds of dqn_quick, rainbow_quick: intervals over so few are ")
     assert "6 training runs of 2 agents (dqn_quick, rainbow_quick), 3 training seeds" in " ".join(what_was_run(results))
 
 
@@ -32,5 +35,5 @@ def test_what_cannot_be_told_apart_is_said(tmp_path):
     for player in ("random", "idle"):
         rows = [{"player": player, "task": task, "episode": n, "seed": n, "score": float(n)} for n in range(9)]
         (tmp_path / f"{player}.jsonl").write_text("".join(json.dumps({"schema": 1, **row}) + "\n" for row in rows))
-    (sentence,) = what_beats_what(read_results([tmp_path]))
+    (sentence,) = who_has_more(read_results([tmp_path]))
     assert sentence.startswith("Seek and Kill, default: no difference shown between idle and random (0.0 [")

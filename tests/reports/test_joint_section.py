@@ -1,5 +1,7 @@
 """The section over all scenarios."""
 
+import pytest
+
 from gvz.reports.joint_section import joint_sections
 from gvz.reports.results import read_results
 from gvz.tasks import named_tasks
@@ -47,3 +49,24 @@ def test_one_scenario_needs_no_such_section(tmp_path):
     tasks = named_tasks("health_gathering", split="test")
     write_rows(tmp_path / "rows.jsonl", [evaluation_row("random", task.id, 0, 40.0) for task in tasks])
     assert joint_sections(read_results([tmp_path]), tmp_path) == []
+
+
+@pytest.mark.parametrize("one_run_plays_all", [True, False])
+def test_a_run_that_plays_all_scenarios_is_redrawn_with_all_its_scores(tmp_path, one_run_plays_all):
+    """Then the mean over scenarios varies as much as each scenario; independent runs even out."""
+    rows = [
+        evaluation_row(
+            f"all/{seed}", task.id, 0, percent, run="all", run_seed=seed, num_updates=1,
+            params=str(seed) if one_run_plays_all else f"{seed} {scenario}",
+        )
+        for seed, percent in enumerate((40.0, 50.0, 60.0))
+        for scenario in PERCENT
+        for task in named_tasks(scenario, split="test")
+    ]  # fmt: skip
+    write_rows(tmp_path / "rows.jsonl", rows)
+    (section,) = joint_sections(read_results([tmp_path]), tmp_path)
+    *of_scenarios, of_all = [cell.estimate for cell in section.blocks[0].tables[0].rows[0][1:]]
+    assert of_all.value == 50.0
+    assert all((of_one.low, of_one.high) == (40.0, 60.0) for of_one in of_scenarios)
+    assert ((of_all.low, of_all.high) == (40.0, 60.0)) == one_run_plays_all
+    assert one_run_plays_all or 40.0 < of_all.low < of_all.high < 60.0

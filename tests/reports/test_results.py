@@ -3,6 +3,7 @@
 import gzip
 import json
 import shutil
+from pathlib import Path
 
 import polars as pl
 import pytest
@@ -80,6 +81,74 @@ def test_agents_of_different_maps_that_played_the_same_are_not_one(tmp_path, exp
     plan = Plan(names=("procedural_gap",), scale=0.0001, scenarios=("defend_the_center",))
     experiments_writer(tmp_path, plan, lambda _: 50.0)
     assert len({*read_results([tmp_path]).agents.values()}) == len(experiment_named("procedural_gap").trainings)
+
+
+@pytest.fixture
+def copied(small, tmp_path):
+    """Copies a run to `tmp_path / name`, with other settings."""
+
+    def copy(name: str, **settings: dict) -> None:
+        source = small / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111"
+        shutil.copytree(source, tmp_path / name)
+        saved = json.loads((tmp_path / name / "config.json").read_text())
+        for field, values in settings.items():
+            saved["config"][field] |= values
+        (tmp_path / name / "config.json").write_text(json.dumps(saved))
+
+    return copy
+
+
+def test_runs_of_one_configuration_with_other_settings_are_several_agents(copied, tmp_path):
+    copied("a/run", agent={"discount": 0.5})
+    copied("b/run", learner={"total_updates": 10**6})  # changes nothing of what the agent is
+    results = read_results([tmp_path / "a", tmp_path / "b"])
+    assert results.agents == {
+        str(tmp_path / "a" / "run"): "rainbow_4task (agent.discount 0.5)",
+        str(tmp_path / "b" / "run"): "rainbow_4task (agent.discount 0.99)",
+    }
+    assert not results.problems
+
+
+def test_runs_of_an_experiment_with_other_settings_are_put_together_and_named(small, tmp_path):
+    shutil.copytree(small, tmp_path / "r")
+    runs = sorted((tmp_path / "r" / "runs" / "rainbow_4task" / "defend_the_center" / "train4").iterdir())
+    other = runs[0].with_name("seed_2222")
+    shutil.copytree(runs[0], other)
+    saved = json.loads((other / "config.json").read_text())
+    saved["config"]["agent"]["discount"], saved["config"]["seed"] = 0.5, 2222
+    (other / "config.json").write_text(json.dumps(saved))
+    (problem, _) = read_results([tmp_path / "r"]).problems
+    assert problem.endswith(": put together with other runs of rainbow_4task (4 tasks), which have another agent."
+                            "discount 0.99")  # fmt: skip
+
+
+def test_a_seed_that_is_there_twice_is_named(copied, tmp_path):
+    copied("a/run")
+    copied("b/run")
+    results = read_results([tmp_path / "a", tmp_path / "b"])
+    (problem,) = results.problems
+    assert problem.startswith(f"{tmp_path / 'b' / 'run'}: the same agent and training seed as {tmp_path / 'a' / 'run'}")
+    assert [run.id for run in results.runs] == ["a/run", "b/run"]
+
+
+def test_a_report_can_be_made_inside_a_run_directory(copied, tmp_path, monkeypatch):
+    copied("run")
+    monkeypatch.chdir(tmp_path / "run")
+    (run,) = read_results([Path()]).runs
+    assert run.id == "run"
+
+
+def test_episodes_of_another_base_seed_are_left_out_and_counted(tmp_path):
+    rows = [
+        evaluation_row("random", "seek_and_kill/default", n, score, base_seed=base_seed, seed=10 * base_seed + n)
+        for base_seed, score in ((0, 5.0), (1, 10.0))
+        for n in range(3)
+    ]
+    write_rows(tmp_path / "rows.jsonl", rows)
+    results = read_results([tmp_path])
+    assert results.episodes["normalized_score"].to_list() == [5.0] * 3
+    (problem,) = results.problems
+    assert problem.startswith("3 evaluation episodes of other base seeds than 0 are left out")
 
 
 def test_damaged_runs_and_plans_are_named_and_the_rest_is_read(small, tmp_path):
