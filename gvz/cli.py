@@ -1,5 +1,6 @@
 """The `gvz` command: finds the commands in gvz/commands/ and runs one."""
 
+import errno
 import functools
 import operator
 import os
@@ -15,6 +16,8 @@ from gvz.core.registry import discover
 
 EXIT_BROKEN_PIPE = 141
 """exit code that a shell shows for a program that SIGPIPE ended"""
+_OF_THE_DISK = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EISDIR}
+"""what a user can do something about: no permission, no room, a directory in a file's place"""
 DESCRIPTION = (
     "GViZDoom: a benchmark of visual generalization in Doom. Help: `gvz COMMAND --help`. Version: `gvz --version`."
 )
@@ -35,6 +38,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output has closed it: gvz tasks | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at the end
         return EXIT_BROKEN_PIPE
+    except OSError as error:
+        if error.errno not in _OF_THE_DISK:
+            raise
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"error: {where}{error.strerror}; make room or give a place that you can write to", file=sys.stderr)
+        return 1
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -174,11 +174,12 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         if unknown := (options or {}).keys() - {"episode_seed"}:
             raise ValueError(f"reset: unknown options {sorted(unknown)}, want episode_seed")
         if options and "episode_seed" in options:
-            self._episode_seed = int(options["episode_seed"])
+            episode_seed = int(options["episode_seed"])
         else:
-            self._episode_seed = int(self.np_random.integers(EPISODE_SEEDS))
-        if not 0 <= self._episode_seed < EPISODE_SEEDS:
-            raise ValueError(f"reset: episode_seed {self._episode_seed}, want 0..{EPISODE_SEEDS - 1}")
+            episode_seed = int(self.np_random.integers(EPISODE_SEEDS))
+        if not 0 <= episode_seed < EPISODE_SEEDS:
+            raise ValueError(f"reset: episode_seed {episode_seed}, want 0..{EPISODE_SEEDS - 1}")
+        self._episode_seed = episode_seed
         if self._recycle_episodes and self._engine_episodes >= self._recycle_episodes:
             self._stop_engine()
         engine, crash = self._begin()

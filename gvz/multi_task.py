@@ -1,7 +1,7 @@
 """Several tasks as one Gymnasium environment: each episode is of one of them."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -10,6 +10,9 @@ from gvz.core.errors import ConfigError, TaskError
 from gvz.env import EPISODE_SEEDS, DoomEnv
 from gvz.observation import Observation
 from gvz.scenarios.base import Task
+
+if TYPE_CHECKING:
+    from gvz.engine.engine import Label
 
 Sampler = Callable[[np.random.Generator], str]
 """chooses an episode's task: a random number generator -> the id of one of the environment's tasks"""
@@ -110,6 +113,10 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
     def action_masks(self) -> np.ndarray:
         """bool[A]: the actions that the present episode's task allows."""
         return self._game.action_masks()
+
+    def labels(self) -> "Sequence[Label]":
+        """As DoomEnv's."""
+        return self._game.labels()
 
     def render(self) -> np.ndarray | None:
         """As DoomEnv's."""

@@ -172,7 +172,12 @@ def change_agent(config: AgentConfig, name: str) -> AgentConfig:
     kind = agent_config_class(name)
     wanted = {field.name for field in dataclasses.fields(kind)} - {"name"}
     shared: dict[str, Any] = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name in wanted}
-    return kind(name=name, **shared)
+    try:
+        return kind(name=name, **shared)
+    except ConfigError as error:
+        raise ConfigError(
+            f"{error}. The values are those of the config file, which agent.name keeps; give a config file that fits"
+        ) from error
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

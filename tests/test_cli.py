@@ -1,5 +1,6 @@
 """The gvz command: quick to start, resumable, one clear message for bad input."""
 
+import errno
 import json
 import os
 import subprocess
@@ -116,3 +117,35 @@ def test_ctrl_c_gives_one_line_and_the_exit_code_that_shells_expect(capsys, monk
     monkeypatch.setattr(cli, "run", interrupted)
     assert cli.main(["gallery"]) == 130
     assert capsys.readouterr() == ("", "interrupted\n")
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (PermissionError(errno.EACCES, "Permission denied", "out/a.svg"), "error: out/a.svg: Permission denied; make "),
+        (OSError(errno.ENOSPC, "No space left on device"), "error: No space left on device; make room or give "),
+    ],
+)
+def test_a_place_that_cannot_be_written_is_one_line(error, said, monkeypatch, capsys):
+    def fail(_):
+        raise error
+
+    monkeypatch.setattr(cli, "run", fail)
+    assert cli.main(["report"]) == 1
+    assert capsys.readouterr().err.startswith(said)
+
+
+def test_errors_that_are_no_matter_of_the_disk_keep_their_traceback(monkeypatch):
+    def fail(_):
+        raise TimeoutError(errno.ETIMEDOUT, "timed out")
+
+    monkeypatch.setattr(cli, "run", fail)
+    with pytest.raises(TimeoutError):
+        cli.main(["report"])
+
+
+def test_the_cache_of_policies_must_be_writable(tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path / "file" / "cache"))
+    assert cli.main(["zoo", "seek_and_kill"]) != 0
+    assert "make it writable, or set GVZ_CACHE_DIR to a directory that is" in capsys.readouterr().err

@@ -334,7 +334,10 @@ def test_wrong_calls_say_what_is_wanted(shared: DoomEnv):
     ):
         with pytest.raises(ValueError, match=message):
             shared.reset(options=options)
-    shared.reset(seed=1)
+    running = shared.reset(seed=1)[1]["episode_seed"]
+    with pytest.raises(ValueError, match=r"episode_seed -5, want 0\.\."):
+        shared.reset(options={"episode_seed": -5})
+    assert shared.step(0)[-1]["episode_seed"] == running, "a refused reset changes nothing"
     for action in (-1, 3):
         with pytest.raises(ValueError, match=f"action {action}, want 0..2"):
             shared.step(action)

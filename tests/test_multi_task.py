@@ -36,6 +36,13 @@ def test_an_episode_is_the_single_environments():
 
 
 @pytest.mark.engine
+def test_labels_are_those_of_the_game_that_plays():
+    with gvz.make(TASKS[:1], buffers=("labels",)) as env:
+        env.reset(seed=1)
+        assert "MarineChainsawVzd" in {label.object_name for label in env.labels()}
+
+
+@pytest.mark.engine
 def test_the_sampler_chooses_and_the_seed_repeats_the_sequence():
     with gvz.make(TASKS, action_set="unified_v1") as env:
         first = [env.reset(seed=3 if n == 0 else None)[1] for n in range(6)]

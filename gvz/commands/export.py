@@ -104,12 +104,15 @@ def write_table(table: "pl.DataFrame", file: Path) -> Path:
     import polars as pl
 
     temporary = file.with_name(file.name + ".tmp")
-    if file.suffix == ".csv":
-        lists = [name for name, kind in table.schema.items() if isinstance(kind, pl.List)]
-        table.with_columns(pl.col(lists).list.join("+")).write_csv(temporary)
-    else:
-        table.write_parquet(temporary)
-    return temporary.replace(file)
+    try:
+        if file.suffix == ".csv":
+            lists = [name for name, kind in table.schema.items() if isinstance(kind, pl.List)]
+            table.with_columns(pl.col(lists).list.join("+")).write_csv(temporary)
+        else:
+            table.write_parquet(temporary)
+        return temporary.replace(file)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def _flat(row: dict[str, Any]) -> dict[str, Any]:

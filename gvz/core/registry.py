@@ -5,8 +5,7 @@ import re
 import sys
 from functools import cache
 from importlib import import_module
-from importlib.machinery import SourceFileLoader
-from importlib.util import find_spec
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -79,6 +78,9 @@ def _sets(module: str, constant: str) -> bool:
 @cache
 def _module_in_file(file: Path) -> ModuleType:
     name = f"file_{file.stem}"
-    module = sys.modules[name] = ModuleType(name)
-    SourceFileLoader(name, str(file)).exec_module(module)
+    spec = spec_from_file_location(name, file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[name] = module_from_spec(spec)
+    spec.loader.exec_module(module)
     return module

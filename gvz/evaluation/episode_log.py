@@ -1,5 +1,6 @@
 """Evaluations on disk: episodes are played and appended to a record file. Those already there are not played again."""
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -84,6 +85,8 @@ class RecordFile(records.Writer):
             raise ConfigError(f"--out: got {path}, want a name without .gz: rows are appended as plain text")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            if path.exists() and not path.is_file() and str(path) != os.devnull:
+                raise ConfigError(f"--out: {path} is no regular file; want a file that rows can be read back from")
             locked = self.lock()
         except OSError as error:
             raise ConfigError(f"--out: {path} cannot be written: {error.strerror}") from error

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvz.core.cache import cache_directory
-from gvz.core.errors import ConfigError, nearest
+from gvz.core.errors import ConfigError, ResourceError, nearest
 
 if TYPE_CHECKING:
     import numpy as np
@@ -43,7 +43,7 @@ def run_directory(path: Path) -> Path:
     """The run directory that `path` names: itself, or that of a policy, which is unpacked into the cache.
 
     Raises:
-        ConfigError: there is no such policy.
+        ConfigError: there is no such policy. ResourceError: the cache cannot be written.
     """
     if not str(path).startswith(PREFIX):
         return path
@@ -53,14 +53,23 @@ def run_directory(path: Path) -> Path:
     file = ZOO_DIRECTORY / f"{name}.zip"
     digest = hashlib.blake2b(file.read_bytes(), digest_size=8).hexdigest()
     unpacked = cache_directory() / "zoo" / digest / name
-    if not unpacked.exists():
-        unpacked.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=unpacked.parent) as temporary, zipfile.ZipFile(file) as archive:
-            archive.extractall(Path(temporary) / name)  # zipfile keeps every name inside
-            # another process may have been first; then its directory stays
-            with contextlib.suppress(OSError):
-                (Path(temporary) / name).rename(unpacked)
+    try:
+        if not unpacked.exists():
+            _unpack(file, unpacked)
+    except OSError as error:
+        raise ResourceError(
+            f"cache {cache_directory()}: {error}; make it writable, or set GVZ_CACHE_DIR to a directory that is"
+        ) from error
     return unpacked
+
+
+def _unpack(file: Path, directory: Path) -> None:
+    directory.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=directory.parent) as temporary, zipfile.ZipFile(file) as archive:
+        archive.extractall(Path(temporary) / directory.name)  # zipfile keeps every name inside
+        # another process may have been first; then its directory stays
+        with contextlib.suppress(OSError):
+            (Path(temporary) / directory.name).rename(directory)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

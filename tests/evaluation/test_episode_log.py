@@ -1,7 +1,9 @@
 """Record files of evaluations: what is there is not played again, what is half there is."""
 
 import json
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -102,6 +104,13 @@ def test_a_row_without_task_or_episode_is_refused(tmp_path, fields):
     path.write_text(json.dumps({"schema": 1, **IDLE.identity, **fields}) + "\n")
     with pytest.raises(ConfigError, match=r"row 1: got task, episode and base seed \(.*\): no row of an evaluation"):
         RecordFile(path)
+
+
+def test_a_device_is_no_record_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (Path("/dev/zero"), tmp_path / "pipe"):  # the first would be read without an end
+        with pytest.raises(ConfigError, match=f"--out: {path} is no regular file"):
+            RecordFile(path)
 
 
 @pytest.mark.parametrize("line", ["nonsense", json.dumps({"schema": 99})])

@@ -14,7 +14,8 @@ from gvz.vector.env import DoomVectorEnv
 class Sb3VecEnv(VecEnv):
     """Games in worker processes; an episode begins in the same step in which the last one ends.
 
-    Infos have `score` in every step, and at the end of an episode `terminal_observation` and `TimeLimit.truncated`.
+    Infos have the episode's `score` so far in every step, and in its last one the final score (`VecMonitor` takes it by
+    `info_keywords=("score",)`), `terminal_observation` and `TimeLimit.truncated`.
 
     Args:
         envs: of `gvz.make_vec(..., autoreset_mode="SameStep")`; closed together with this object.
@@ -49,7 +50,11 @@ class Sb3VecEnv(VecEnv):
         over = terminated | truncated
         of_game: list[dict[str, Any]] = [{"score": score} for score in infos["score"].tolist()]
         for i in over.nonzero()[0]:
-            of_game[i] |= {"terminal_observation": infos["final_obs"][i], "TimeLimit.truncated": bool(truncated[i])}
+            of_game[i] = {
+                "score": float(infos["final_info"]["score"][i]),
+                "terminal_observation": infos["final_obs"][i],
+                "TimeLimit.truncated": bool(truncated[i]),
+            }
         return observations, rewards.astype(np.float32), over, of_game
 
     def close(self) -> None:

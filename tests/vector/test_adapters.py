@@ -1,0 +1,49 @@
+"""Adapters to other libraries, as far as they can be tried without these (`make test-interop` has them)."""
+
+import importlib
+import sys
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+import gvz
+
+
+class FakeVecEnv:
+    """What `Sb3VecEnv` needs of Stable-Baselines3's class."""
+
+    def __init__(self, num_envs: int, *_: object):
+        self.num_envs, self._seeds = num_envs, [None] * num_envs
+
+    def _reset_seeds(self) -> None:
+        self._seeds = [None] * self.num_envs
+
+
+@pytest.fixture
+def sb3_vec_env(monkeypatch):
+    name = "gvz.vector.adapters.stable_baselines3"
+    for package in ("stable_baselines3", "stable_baselines3.common", "stable_baselines3.common.vec_env"):
+        monkeypatch.setitem(sys.modules, package, ModuleType(package))
+    sys.modules["stable_baselines3.common.vec_env"].VecEnv = FakeVecEnv
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    yield importlib.import_module(name).Sb3VecEnv
+    sys.modules.pop(name)
+
+
+@pytest.mark.engine
+def test_an_episode_of_stable_baselines3_ends_with_its_own_score(sb3_vec_env):
+    """The next one has begun by then, and its score is 0."""
+    envs = sb3_vec_env(gvz.make_vec("defend_the_center/fast_enemies", 2, autoreset_mode="SameStep", frame_skip=35))
+    envs.reset()
+    before, ended = [0.0, 0.0], 0
+    while ended < 2:
+        envs.step_async(np.zeros(2, np.int64))
+        _, _, over, infos = envs.step_wait()
+        for game, info in enumerate(infos):
+            if over[game]:
+                assert info["score"] > before[game] > 0
+                assert info["terminal_observation"].shape == envs.envs.single_observation_space.shape
+                ended += 1
+            before[game] = 0.0 if over[game] else info["score"]
+    envs.close()
