@@ -190,7 +190,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             Observations, rewards, terminated, truncated and infos of all games.
 
         Raises:
-            As `send` and `recv`.
+            GvzError, ValueError: as `send` and `recv`.
         """
         self.send(actions)
         return self._batch(self._receive(self.num_envs))
