@@ -7,7 +7,8 @@ import numpy as np
 import polars as pl
 
 from gvz.evaluation.statistics import bootstrap_runs
-from gvz.reports.results import ONE_RUN, Run
+from gvz.reports.agents import ONE_RUN
+from gvz.reports.runs import Run
 from gvz.reports.scores import Scores, pick, redraw
 from gvz.tasks import LEVELS, parse_task
 

@@ -21,7 +21,8 @@ from gvz.experiments.inventory import run_directory
 from gvz.reports.curves import evaluation_curve, learning_curve, level_curves
 from gvz.reports.document import Block, Cell, Figure, Section, Table, count, missing, theirs, words
 from gvz.reports.draw import draw_curves
-from gvz.reports.results import TRAINING_SETS, PlannedExperiment, Results
+from gvz.reports.results import PlannedExperiment, Results
+from gvz.reports.runs import TRAINING_SETS
 from gvz.reports.scores import Scores, estimate, estimate_groups, pick
 from gvz.tasks import LEVELS, parse_task, scenario_named
 

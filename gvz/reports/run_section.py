@@ -13,7 +13,8 @@ from gvz.reports.curves import SHARE_EPISODES, share_curve
 from gvz.reports.document import Block, Figure, Link, Section, Table, count, missing, words
 from gvz.reports.draw import draw_curves
 from gvz.reports.experiment_section import what_id
-from gvz.reports.results import Results, Run, training_time_s
+from gvz.reports.results import Results
+from gvz.reports.runs import Run, training_time_s
 
 _VIDEOS = (".mp4", ".gif", ".webp", ".webm")
 

@@ -10,12 +10,14 @@ import polars as pl
 
 from gvz.evaluation.dataset import REWARD_PREFIX
 from gvz.evaluation.statistics import Statistic, generalization_gap, interquartile_mean, mean, median, solved
+from gvz.reports.agents import ONE_RUN
 from gvz.reports.attribute_tables import attribute_figure, attribute_tables
 from gvz.reports.curves import learning_curve, level_curves
 from gvz.reports.document import Block, Cell, Figure, Section, Table, count, missing, words
 from gvz.reports.draw import draw_curves, draw_heat_map, draw_histogram, draw_rewards
 from gvz.reports.experiment_section import what_id
-from gvz.reports.results import ONE_RUN, Results, Run
+from gvz.reports.results import Results
+from gvz.reports.runs import Run
 from gvz.reports.scores import Scores, agent_scores, estimate, pick
 from gvz.scenarios.base import Scenario, Task
 from gvz.tasks import LEVELS, all_scenarios, named_tasks, parse_task, scenario_named

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from gvz.reports.curves import evaluation_curve, learning_curve, running_mean, share_curve
-from gvz.reports.results import Run
+from gvz.reports.runs import Run
 
 
 def run_of(seed: int, episodes: list[tuple[int, str, float]]) -> Run:

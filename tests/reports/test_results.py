@@ -11,8 +11,10 @@ import pytest
 from gvz.core.errors import ConfigError
 from gvz.experiments.base import experiment_named
 from gvz.experiments.plan import Plan
-from gvz.reports.results import EACH, read_results, training_time_s
+from gvz.reports.agents import EACH
+from gvz.reports.results import read_results
 from gvz.reports.run_section import run_sections
+from gvz.reports.runs import training_time_s
 from tests.reports.conftest import evaluation_row, write_rows
 
 

@@ -1,0 +1,137 @@
+"""Which runs are one agent: those of one configuration, as far as their training and their settings are the same."""
+
+import itertools
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from gvz.reports.runs import Run
+from gvz.run.resume import may_change
+
+EACH = "each task alone"
+"""training of agents each of which was trained on one task"""
+
+ONE_RUN = ("run_dir", "run", "run_seed", "scenario")
+"""columns of episodes that tell trained agents apart: a record file, and so its directory, may have several"""
+
+_TELL_NOTHING = ("seed", "scenario", "training_set", "tasks", "actors.num_actors", "actors.games_per_actor")
+"""fields that agents of one name may have different: chance, what they train on, and how many games there are"""
+
+
+def agents_of_runs(runs: Sequence[Run], evaluated: Mapping[object, set[str]]) -> dict[str, str]:
+    """Run directory -> agent: the configuration's name, and what it was trained on where that tells agents apart.
+
+    Runs that were each trained on one task, and were evaluated on no common one, are one agent (EACH).
+
+    Args:
+        runs: of any configurations.
+        evaluated: run directory -> ids of the tasks that it was evaluated on.
+    """
+    alone: dict[tuple[str, tuple[str, ...]], dict[str, set[str]]] = {}
+    for run in runs:
+        if len(run.tasks) == 1:
+            played = alone.setdefault((run.name, run.scenarios), {}).setdefault(run.training, set())
+            if not _is_of_a_set(run):
+                played |= evaluated.get(str(run.path), set())
+
+    def training(run: Run) -> str:
+        if len(run.tasks) > 1 or _is_of_a_set(run):
+            return run.training
+        played = alone[run.name, run.scenarios].values()
+        apart = sum(map(len, played)) == len(set().union(*played))
+        return EACH if apart and len(played) > 2 else run.training  # more than default and one other
+
+    trainings = {name: {training(run) for run in runs if run.name == name} for name in {run.name for run in runs}}
+    settings = _telling_settings(runs)
+    words = {
+        run.path: [training(run)] * (len(trainings[run.name]) > 1)
+        + settings.get(run.path, []) * (not _is_of_a_set(run))
+        for run in runs
+    }
+    return {
+        str(run.path): f"{run.name} ({', '.join(words[run.path])})" if words[run.path] else run.name for run in runs
+    }
+
+
+def _telling_settings(runs: Sequence[Run]) -> dict[Path, list[str]]:
+    """ "agent.discount 0.5": settings in which runs of one name on the same tasks differ, of each of these runs.
+
+    Left out are settings that change nothing (`gvz.run.resume`), numbers of actors and games, and those that the other
+    run lacks: it is of an older version.
+    """
+    alike: dict[tuple[str, tuple[str, ...]], list[Run]] = {}
+    for run in runs:
+        alike.setdefault((run.name, run.tasks), []).append(run)
+    found: dict[Path, list[str]] = {}
+    for group in alike.values():
+        values = [dict(_settings(run.config, run.scenarios)) for run in group]
+        for name in values[0]:
+            own = [of_run.get(name) for of_run in values]
+            if None not in own and len(set(own)) > 1:
+                for run, value in zip(group, own, strict=True):
+                    found.setdefault(run.path, []).append(f"{name} {value}")
+    return found
+
+
+def _settings(config: Mapping[str, Any], scenarios: Sequence[str], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Dotted names and values, in JSON, of what may tell agents of these scenarios apart."""
+    for name, value in config.items():
+        if isinstance(value, dict):
+            yield from _settings(value, scenarios, f"{prefix}{name}.")
+        elif name == "reward_weights" and isinstance(value, list):
+            yield (
+                prefix + name,
+                json.dumps([pair for pair in value if any(f"{scenario}." in str(pair) for scenario in scenarios)]),
+            )
+        elif not (may_change(prefix + name) or prefix + name in _TELL_NOTHING):
+            yield prefix + name, json.dumps(value)
+
+
+def pooled_runs(runs: Sequence[Run], agents: Mapping[str, str], evaluated: Mapping[object, set[str]]) -> list[str]:
+    """What a reader would not expect to be put together: an agent's runs of other settings, and of one seed."""
+    settings, problems = _telling_settings(runs), []
+    by_agent: dict[str, list[Run]] = {}
+    for run in runs:
+        by_agent.setdefault(agents[str(run.path)], []).append(run)
+    for agent, of_agent in by_agent.items():
+        problems += [
+            f"{run.path}: put together with other runs of {agent}, which have another {', '.join(settings[run.path])}"
+            for run in of_agent
+            if _is_of_a_set(run) and run.path in settings
+        ]
+        for one, other in itertools.combinations(of_agent, 2):
+            both = evaluated.get(str(one.path), set()) & evaluated.get(str(other.path), set())
+            if one.seed == other.seed and one.tasks == other.tasks and both:
+                problems.append(
+                    f"{other.path}: the same agent and training seed as {one.path}; their episodes are put together as "
+                    "if they were of one run; leave one out"
+                )
+    return problems
+
+
+def _is_of_a_set(run: Run) -> bool:
+    """An experiment has trained it on a training set, if only of one task."""
+    return "/train" in run.id
+
+
+def with_agents(episodes: pl.DataFrame, agents: dict[str, str]) -> pl.DataFrame:
+    """Adds the columns `agent` and `final`."""
+    named = pl.col("run_dir").replace_strict(agents, default=pl.col("run"), return_dtype=pl.String)
+    age = pl.col("num_updates").rank("dense", descending=True)  # 1: the newest checkpoint
+    num_checkpoints = pl.col("num_updates").n_unique()
+    final = (age <= (num_checkpoints / 4).ceil()).over(ONE_RUN).fill_null(value=True)
+    agent = pl.coalesce(named, "player")
+    return episodes.with_columns(agent=agent, final=final).with_columns(agent=pl.concat_str("agent", *_other_rules()))
+
+
+def _other_rules() -> list[pl.Expr]:
+    """ " (levdoom)" for rows of an agent that played by several rules, for each kind of rule; else nothing."""
+    return [
+        pl.when(pl.col(rule).drop_nulls().n_unique().over("agent") > 1)
+        .then(pl.format(" ({})", pl.col(rule).fill_null("unknown " + rule)))
+        .otherwise(pl.lit(""))
+        for rule in ("profile", "action_set")
+    ]
