@@ -14,10 +14,14 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
-import zstandard
 
-from gvz.core.errors import TransportError
+from gvz.core.errors import ConfigError, TransportError
 from gvz.transport.messages import Count, Message, StepBlock, decode, encode
+
+try:
+    import zstandard
+except ModuleNotFoundError as error:
+    raise ConfigError("cluster: zstandard is not installed; pip install 'gvizdoom[cluster]'") from error
 
 WIRE_VERSION = 1
 """increased by one when the meaning or layout of anything in this file changes"""

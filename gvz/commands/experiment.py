@@ -1,8 +1,10 @@
 """`gvz experiment list | plan | run | status`: the experiments of gvz/experiments."""
 
 import dataclasses
+import heapq
 import json
 import os
+import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -122,8 +124,9 @@ class PlanCommand:
         if whole.training_hours is None or whole.evaluation_hours is None:
             print(f"\n{jobs}: hours are not known yet; begin with gvz experiment run, and ask again after a while")
         else:
-            hours = (whole.training_hours + whole.evaluation_hours) / len(slots)
-            print(f"\n{jobs}: {hours:.2f} hours at most")
+            hours = [(costs[run.id].training_hours or 0) + (costs[run.id].evaluation_hours or 0) for run in mine]
+            how = "about" if any(run.max_processor_s is not None for run in mine) else "at most"
+            print(f"\n{jobs}: {how} {_side_by_side(hours, len(slots)):.2f} hours")
         for agent, found in rates.items():
             trained, played = (_text(rate) for rate in (found.updates_per_s, found.evaluation_steps_per_s))
             print(f"{agent}: {trained} updates/s, {played} evaluation decisions/s, one job on {cores} cores")
@@ -163,14 +166,18 @@ class RunCommand:
                 )
             slots = self.ask.slots()
             write_plan(self.ask.results, plan)
-            return run_jobs(_jobs(plan, self.ask.results, index, count), Machine(slots))
+            jobs = _jobs(plan, self.ask.results, index, count)
+            _warn_of_other_settings(jobs)
+            return run_jobs(jobs, Machine(slots))
         from gvz.cluster.ray_jobs import open_places
 
         results = self.ask.results.resolve()  # every node has working directories of its own
         share = (2 if self.job_cores is None else self.job_cores, self.job_gpus, self.ask.jobs)
         with open_places(self.cluster, results, *share, public=self.cluster_public) as places:
             write_plan(results, plan)
-            return run_jobs(_jobs(plan, results, index, count), places)
+            jobs = _jobs(plan, results, index, count)
+            _warn_of_other_settings(jobs)
+            return run_jobs(jobs, places)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,6 +234,27 @@ class Experiment:
 
 
 COMMAND = Experiment
+
+
+def _warn_of_other_settings(jobs: "Sequence[Job]") -> None:
+    """Names runs that are trained and were made with other settings; one that is not is refused when it goes on."""
+    from gvz.experiments.jobs import RunJob
+
+    for job in jobs:
+        if isinstance(job, RunJob) and (changed := job.other_settings()):
+            print(
+                f"warning: {job.id} was trained with other settings and stays as it is ({'; '.join(changed)}); "
+                "move its directory aside to train it anew",
+                file=sys.stderr,
+            )
+
+
+def _side_by_side(hours: Sequence[float], num_slots: int) -> float:
+    """Hours until all jobs are done: the next one begins where a slot is free first."""
+    ends = [0.0] * num_slots
+    for of_job in hours:
+        heapq.heapreplace(ends, ends[0] + of_job)
+    return max(ends)
 
 
 def _jobs(plan: "Plan", results: Path, index: int, count: int) -> "tuple[Job, ...]":

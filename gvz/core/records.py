@@ -120,7 +120,11 @@ def is_locked(path: Path) -> bool:
     if not path.exists():
         return False
     with path.open("rb") as file:
-        return not lock(file)
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # NFS gives a reader no other lock
+        except BlockingIOError:
+            return True
+    return False
 
 
 def stored(path: Path) -> Path | None:

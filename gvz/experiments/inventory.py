@@ -60,6 +60,8 @@ def run_progress(results: Path, run: TrainingRun, evaluation: Evaluation) -> Run
     held = _held_episodes(directory / "evaluation.jsonl")
     saved = sorted({*policies(directory), *held})  # the policies of a finished run may have been removed
     num_updates, processor_s = last_update(directory), last_processor_s(directory)
+    if run.max_processor_s is not None and num_updates:  # a later one is of what was discarded: its checkpoint failed
+        saved = [checkpoint for checkpoint in saved if checkpoint <= num_updates]
     checkpoints = standing_checkpoints(run, saved)
     trained = run.total_updates in checkpoints
     if run.max_processor_s is not None:

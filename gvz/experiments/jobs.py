@@ -12,6 +12,7 @@ from gvz.experiments import inventory
 from gvz.experiments.base import TrainingRun
 from gvz.experiments.plan import Evaluation
 from gvz.experiments.scale import scaled_settings
+from gvz.run.config_files import with_settings
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -71,9 +72,40 @@ class RunJob:
             following = Command(step="train", arguments=arguments, total=goal, unit=unit)
         elif now.missing:
             which = (directory, "--checkpoints", *map(str, now.missing))
-            arguments = ("-m", "gvz.cli", "evaluate", *which, *_episodes(self.evaluation))
+            agent_file = self.run.run_config.agent_file
+            agent = () if agent_file is None else ("--agent", str(agent_file))
+            arguments = ("-m", "gvz.cli", "evaluate", *which, *agent, *_episodes(self.evaluation))
             following = Command(step="evaluate", arguments=arguments, total=total, unit="episodes")
         return Outlook(next=following, begun=now.num_updates > 0, text=text)
+
+    def other_settings(self) -> list[str]:
+        """`field: as it is -> as the plan has it`, of a run that is trained: nobody else would see it.
+
+        Raises:
+            ConfigError: its config.json is damaged.
+        """
+        from gvz.evaluation.trained import read_run_config
+        from gvz.run.resume import differences
+
+        directory = inventory.run_directory(self.results, self.run)
+        if not (directory / "config.json").exists() or not self._trained():
+            return []
+        saved = read_run_config(directory, self.run.run_config.agent_file)
+        wanted = with_settings(
+            self.run.run_config,
+            {
+                "tasks": self.run.tasks,
+                "seed": self.run.seed,
+                "learner.total_updates": self.run.total_updates,
+                "actors.num_actors": saved.num_actors,
+                "actors.games_per_actor": saved.games_per_actor,
+                **scaled_settings(self.run.run_config, self.run.total_updates, self.scale),
+            },
+        )
+        return differences(saved, wanted)
+
+    def _trained(self) -> bool:
+        return inventory.run_progress(self.results, self.run, self.evaluation).trained
 
     def done_count(self, step: str) -> int:
         """How much of `Command.total` is done: gradient steps, processor seconds or episodes of a job at work."""

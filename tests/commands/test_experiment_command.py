@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from gvz.cli import main
+from gvz.commands.experiment import _side_by_side
 from gvz.experiments import inventory
 from gvz.experiments.base import experiments
 from gvz.experiments.costs import Rates, read_rates
@@ -76,6 +77,14 @@ def test_plan_prints_runs_steps_episodes_and_hours_and_counts_shared_runs_once(r
     assert row["experiments"] == ["rainbow_evaluation", "training_set_size"]
     assert (row["updates"], row["episodes"]) == (200_000, 36_000)
     assert (row["training_hours"], row["evaluation_hours"]) == pytest.approx((200_625 / 36_000, 2.75))
+
+
+def test_jobs_side_by_side_take_as_long_as_the_slot_that_ends_last(results, capsys):
+    arguments = ["experiment", "plan", "rainbow_evaluation", "--scenario", "defend_the_center", "--jobs", "1"]
+    assert main([*arguments, "--results", str(results)]) == 0
+    assert "1 jobs at once on this machine: at most 24.97 hours" in capsys.readouterr().out
+    for hours, slots, want in (([3.0], 2, 3.0), ([3.0, 3.0, 3.0], 2, 6.0), ([4.0, 1.0, 2.0, 1.0], 2, 4.0)):
+        assert _side_by_side(hours, slots) == want
 
 
 def test_a_gate_s_hours_follow_from_its_processor_time_and_its_variants_have_rates_of_their_own(results, capsys):

@@ -85,6 +85,7 @@ def test_a_run_with_a_limit_of_processor_time_is_trained_when_its_last_row_has_i
         num_updates=180, processor_s=60.1, trained=True, missing={180: 2}
     ), "only the newest policy is evaluated"
     save_policies(tmp_path, 300)
+    assert found(180, 60.1).missing == {180: 2}, "the policy of 300 was saved without a checkpoint, and then discarded"
     assert found(300, 20.0).trained, "it had all its gradient steps before"
 
 

@@ -1,6 +1,9 @@
 """What a job does next, as the trainer and the evaluation command take it."""
 
 import dataclasses
+import json
+import re
+from pathlib import Path
 
 import pytest
 
@@ -12,6 +15,7 @@ from gvz.experiments.scale import scaled
 from gvz.launch import parse
 from gvz.run.config_files import config_to_dict, load_config, with_settings
 
+ROOT = Path(__file__).parents[2]
 EVALUATION = Evaluation(tasks=("defend_the_center/default",), episodes=2)
 
 
@@ -28,6 +32,41 @@ def test_the_trainer_understands_every_experiment_at_every_scale(name, scale):
     assert config.name == run.agent
     assert config.env.grayscale == (scale < 0.01 or run.run_config.env.grayscale)
     assert config_to_dict(config)["resolved"]["tasks"] == list(run.tasks)
+
+
+@pytest.mark.parametrize("scale", [1, 0.001])
+@pytest.mark.parametrize("name", sorted(experiments()))
+def test_a_trained_run_with_other_settings_is_known(name, scale, tmp_path, monkeypatch):
+    monkeypatch.setattr(RunJob, "_trained", lambda _: True)
+    run = scaled(experiments()[name], scale).runs()[-1]
+    job = RunJob(results=tmp_path, run=run, evaluation=EVALUATION, scale=scale)
+    assert job.other_settings() == [], "there is no run"
+    file = progress.run_directory(tmp_path, run) / "config.json"
+    file.parent.mkdir(parents=True)
+    file.write_text(json.dumps(config_to_dict(parse(training_flags(run, scale)).run)))
+    assert job.other_settings() == []
+    saved = json.loads(file.read_text())
+    saved["config"]["learner"]["learning_rate"] = 0.123
+    file.write_text(json.dumps(saved))
+    (changed,) = job.other_settings()
+    assert changed.startswith("learner.learning_rate: 0.123 -> ")
+
+
+def test_an_agent_in_a_file_is_given_to_the_evaluation(tmp_path):
+    agent = tmp_path / "mine.py"
+    (text,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "AGENTS.md").read_text(), flags=re.DOTALL)
+    agent.write_text(text)
+    quick = dataclasses.replace(
+        experiments()["quick_comparison"], configs=("dqn_quick",), variants={"mine": {"agent.name": str(agent)}}
+    )
+    run = quick.runs()[0]
+    directory = progress.run_directory(tmp_path, run)
+    for step in run.checkpoints:
+        (directory / "policies" / str(step)).mkdir(parents=True)
+    (directory / "metrics.jsonl").write_text(json.dumps({"num_updates": run.total_updates}) + "\n")
+    following = RunJob(results=tmp_path, run=run, evaluation=EVALUATION, scale=1).outlook().next
+    assert following is not None
+    assert f" --agent {agent} --tasks " in " ".join(following.arguments)
 
 
 def test_a_run_is_trained_then_evaluated_where_episodes_are_missing_then_done(tmp_path):
