@@ -1,6 +1,7 @@
 """A task as a Gymnasium environment: observation, actions, reward, time-out, seeds, crashes of the engine."""
 
 import dataclasses
+import operator
 import time
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -174,11 +175,12 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         if unknown := (options or {}).keys() - {"episode_seed"}:
             raise ValueError(f"reset: unknown options {sorted(unknown)}, want episode_seed")
         if options and "episode_seed" in options:
-            episode_seed = int(options["episode_seed"])
+            episode_seed = _integer(options["episode_seed"])
         else:
             episode_seed = int(self.np_random.integers(EPISODE_SEEDS))
         if not 0 <= episode_seed < EPISODE_SEEDS:
-            raise ValueError(f"reset: episode_seed {episode_seed}, want 0..{EPISODE_SEEDS - 1}")
+            got = (options or {}).get("episode_seed")
+            raise ValueError(f"reset: episode_seed {got!r}, want an integer, 0..{EPISODE_SEEDS - 1}")
         self._episode_seed = episode_seed
         if self._recycle_episodes and self._engine_episodes >= self._recycle_episodes:
             self._stop_engine()
@@ -213,11 +215,11 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             held = np.asarray(action)
             if not self.action_space.contains(held):
                 raise ValueError(f"DoomEnv.step: action {action!r}, want integers of {self.action_space}")
-            action = int(np.ravel_multi_index(tuple(held), tuple(self.action_space.nvec)))
-        elif not 0 <= action < len(self._actions):
+            chosen = int(np.ravel_multi_index(tuple(held), tuple(self.action_space.nvec)))
+        elif not 0 <= (chosen := _integer(action)) < len(self._actions):
             raise ValueError(f"DoomEnv.step: action {action!r}, want 0..{len(self._actions) - 1}")
         if self._repeat_rng.random() >= self.config.repeat_action_probability or self._held is None:
-            self._held = self._actions[action]
+            self._held = self._actions[chosen]
         tics = min(self.config.frame_skip, self._timeout_frames - self._frames)
         try:
             terminated = not engine.advance(self._held, tics)
@@ -382,6 +384,14 @@ def make_env(task_id: str, env_config: Mapping[str, Any], **options: Any) -> Doo
 def is_solved(solved_episodes: Sequence[bool]) -> bool:
     """Whether a survival scenario is solved: the last ten episodes all reached the time-out (thesis 3.1)."""
     return len(solved_episodes) >= _SOLVED_EPISODES and all(solved_episodes[-_SOLVED_EPISODES:])
+
+
+def _integer(value: object) -> int:
+    """The value as an integer; -1 if it is none: a number with a part behind the point, an array of several numbers."""
+    try:
+        return operator.index(value)  # pyright: ignore[reportArgumentType]
+    except TypeError:
+        return -1
 
 
 def _with_fields(config: EnvConfig, fields: Mapping[str, Any]) -> EnvConfig:

@@ -100,8 +100,9 @@ def segmenter_names() -> list[str]:
 
 
 def segmenter_file(scenario: str, config: EnvConfig) -> Path:
-    """The file of a scenario's network: the configured one, or else that of the scenario's name. So it is, too, where a
-    set or a directory is configured that has no file for the scenario.
+    """The file of a scenario's network: the configured one, or else that of the scenario's name.
+
+    A set or a directory that lacks the scenario is an error: another network has been trained on other tasks.
 
     Raises:
         ConfigError: there is none.
@@ -109,11 +110,15 @@ def segmenter_file(scenario: str, config: EnvConfig) -> Path:
     name, known = config.segmenter or scenario, segmenter_names()
     directory = SEGMENTERS / name if name in known else Path(name)
     if directory.is_dir():
-        kept = directory / f"{scenario}.onnx"
-        file = kept if kept.is_file() else SEGMENTERS / kept.name
+        file = directory / f"{scenario}.onnx"
     else:
         file = Path(name) if name.endswith(".onnx") else SEGMENTERS / f"{name}.onnx"
     if not file.is_file():
+        if directory.is_dir() or not config.segmenter:
+            raise ConfigError(
+                f"env.segmenter: {config.segmenter or 'GViZDoom'} has no network for {scenario}; "
+                f"`gvz segmenter --scenario {scenario}` trains one, and a directory takes it as {scenario}.onnx"
+            )
         raise ConfigError(
             f"env.segmenter: got {name!r}{nearest(name, known)}, want one of {', '.join(known) or 'none'}, the path of "
             "an .onnx file, or a directory of them"

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -330,16 +331,17 @@ def test_wrong_arguments_fail_at_construction(options: dict, error: type[Excepti
 def test_wrong_calls_say_what_is_wanted(shared: DoomEnv):
     for options, message in (
         ({"sed": 1}, r"unknown options \['sed'\]"),
-        ({"episode_seed": 2**31}, r"want 0\.\.2147483647"),
+        ({"episode_seed": 2**31}, r"episode_seed 2147483648, want an integer, 0\.\.2147483647"),
+        ({"episode_seed": 1.9}, r"episode_seed 1\.9, want an integer"),
     ):
         with pytest.raises(ValueError, match=message):
             shared.reset(options=options)
     running = shared.reset(seed=1)[1]["episode_seed"]
-    with pytest.raises(ValueError, match=r"episode_seed -5, want 0\.\."):
+    with pytest.raises(ValueError, match=r"episode_seed -5, want an integer"):
         shared.reset(options={"episode_seed": -5})
     assert shared.step(0)[-1]["episode_seed"] == running, "a refused reset changes nothing"
-    for action in (-1, 3):
-        with pytest.raises(ValueError, match=f"action {action}, want 0..2"):
+    for action in (-1, 3, 1.0, None, np.array([1])):
+        with pytest.raises(ValueError, match=f"action {re.escape(repr(action))}, want 0..2"):
             shared.step(action)
 
 

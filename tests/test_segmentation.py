@@ -149,7 +149,8 @@ def test_kept_networks_stay_what_they_were(tmp_path: Path, network: str):
     kept = with_kept_segmenters(EnvConfig(frames="segmented"), directory)
     assert segmenter_file("seek_and_kill", kept).read_bytes() == Path(network).read_bytes()
     assert segmenter_file("dodge_projectiles", kept).read_bytes() == installed("dodge_projectiles").read_bytes()
-    assert segmenter_file("health_gathering", kept) == installed("health_gathering"), "of a scenario that it lacks"
+    with pytest.raises(ConfigError, match=r"segmenters has no network for health_gathering; `gvz segmenter --scenario"):
+        segmenter_file("health_gathering", kept)  # the installed one may have been trained on other tasks
     keep_segmenters(["seek_and_kill"], EnvConfig(), tmp_path / "none")
     assert not (tmp_path / "none").exists(), "frames of the screen need no network"
 

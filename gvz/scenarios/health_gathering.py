@@ -14,7 +14,7 @@ Attributes: thesis B.2, below. `complete` takes water for its textures. Tasks: t
 
 import random
 
-from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
+from gvz.scenarios.base import Attribute, Content, Period, Scenario, Textures, Uniform, Variety, words
 from gvz.scenarios.layout import Layout, draw_rooms, furnished, vary
 from gvz.scenarios.parts import RESIZED, retextured, starts_at, things_at
 from gvz.scenarios.rewards import Pace, Reward, Rose, death, living
@@ -277,8 +277,10 @@ SCENARIO = Scenario(
         Attribute(
             name="poison",
             groups=("poison",),
-            content=Content(parameters={"num_poisons": 2, "poison_delay": 30, "first_poison_delay": 30}),
-            levdoom=Content(parameters={"poison_delay": 60, "first_poison_delay": 0}),
+            content=Content(
+                parameters={"num_poisons": 2, "poison_delay": Period(30), "first_poison_delay": Period(30)}
+            ),
+            levdoom=Content(parameters={"poison_delay": Period(60), "first_poison_delay": 0}),
         ),
     ),
     complete=words("obstacles water supreme stimpacks resized_kits shaded_kits short_agent poison"),

@@ -1,7 +1,8 @@
 """Graded attributes: the content of an attribute at a severity between 0 (as without it) and 1 (whole).
 
-Numbers go this part of the way. Textures are blended, the new one this opaque. Of the added things this share stands,
-evenly spread. A way of drawing (`RenderStyle`) is given to this share of the enemies or kits, drawn for each.
+Numbers go this part of the way. What comes again and again comes so much more rarely (`Period`). Textures are blended,
+the new one this opaque. Of the added things this share stands, evenly spread. A way of drawing (`RenderStyle`) is given
+to this share of the enemies or kits, drawn for each.
 
 An attribute that brings another map or other classes of things has nothing in between. It is whole, but in force only
 in this share of the episodes; an episode's seed says whether.
@@ -12,7 +13,7 @@ import hashlib
 import random
 from collections.abc import Mapping
 
-from gvz.scenarios.base import Blend, Chance, Content, Textures, Thing, Toward, Uniform, Value
+from gvz.scenarios.base import Blend, Chance, Content, Period, Textures, Thing, Toward, Uniform, Value
 
 
 def is_whole(change: Content) -> bool:
@@ -72,6 +73,8 @@ def _between(before: Value | None, value: Value, share: float) -> Value:
     assert isinstance(value, int | float | Uniform), "change is not whole"
     if not isinstance(before, int | float | Uniform):
         return Toward(value, share)
+    if isinstance(value, Period) and before == 0:
+        return Period(round(value / share))
     if isinstance(before, int) and isinstance(value, int):
         return round(before + share * (value - before))
     (low, high), (new_low, new_high) = _ends(before), _ends(value)

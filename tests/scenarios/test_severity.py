@@ -99,6 +99,16 @@ def test_things_are_spread_and_numbers_go_part_of_the_way():
     assert (default["num_poisons"], half["num_poisons"], whole["num_poisons"]) == (0, 1, 2)
 
 
+@pytest.mark.parametrize(("profile", "whole", "first"), [("thesis", 30, 1), ("levdoom", 60, 0)])
+def test_a_weaker_poison_comes_more_rarely(profile, whole, first):
+    for task in ("poison", "complete"):
+        for severity in (0.05, 0.1, 0.5, 0.99):
+            parameters = task_content(parse_task(f"health_gathering/{task}={severity}"), profile).parameters
+            assert parameters["poison_delay"] == round(whole / severity)
+            assert parameters["first_poison_delay"] == first * parameters["poison_delay"]
+    assert task_content(parse_task("health_gathering/poison"), profile).parameters["poison_delay"] == whole
+
+
 def test_a_whole_attribute_is_in_force_in_its_share_of_the_episodes():
     """Of 4,000 evaluation seeds; the standard error is 0.7 points. What is in force at 0.3 is so at 0.6."""
     seeds = [episode_seed("seek_and_kill/default", n) for n in range(4000)]

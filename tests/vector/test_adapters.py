@@ -46,4 +46,16 @@ def test_an_episode_of_stable_baselines3_ends_with_its_own_score(sb3_vec_env):
                 assert info["terminal_observation"].shape == envs.envs.single_observation_space.shape
                 ended += 1
             before[game] = 0.0 if over[game] else info["score"]
+    assert envs.get_images() == [None, None]
+    envs.close()
+
+
+@pytest.mark.engine
+def test_stable_baselines3_can_render(sb3_vec_env):
+    envs = sb3_vec_env(gvz.make_vec("defend_the_center/gore", 2, autoreset_mode="SameStep", render_mode="rgb_array"))
+    envs.reset()
+    images = envs.get_images()
+    assert len(images) == 2
+    assert images[0].shape[2] == 3
+    assert images[0].dtype == np.uint8
     envs.close()

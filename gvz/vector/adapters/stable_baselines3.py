@@ -57,6 +57,10 @@ class Sb3VecEnv(VecEnv):
             }
         return observations, rewards.astype(np.float32), over, of_game
 
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """The screens of all games, u8[H, W, 3] each; None without a render mode. `render()` tiles them."""
+        return self.envs.render() or [None] * self.num_envs
+
     def close(self) -> None:
         """Ends the games and their processes."""
         self.envs.close()
