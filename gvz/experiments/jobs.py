@@ -3,6 +3,7 @@
 The next command follows from the files on the disk, so an interrupted job goes on.
 """
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,8 @@ from gvz.experiments import inventory
 from gvz.experiments.base import TrainingRun
 from gvz.experiments.plan import Evaluation
 from gvz.experiments.scale import scaled_settings
-from gvz.run.config_files import with_settings
+from gvz.run.config_files import config_from_dict, with_settings
+from gvz.run.resume import differences
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -79,18 +81,14 @@ class RunJob:
         return Outlook(next=following, begun=now.num_updates > 0, text=text)
 
     def other_settings(self) -> list[str]:
-        """`field: as it is -> as the plan has it`, of a run that is trained: nobody else would see it.
-
-        Raises:
-            ConfigError: its config.json is damaged.
-        """
-        from gvz.evaluation.trained import read_run_config
-        from gvz.run.resume import differences
-
-        directory = inventory.run_directory(self.results, self.run)
-        if not (directory / "config.json").exists() or not self._trained():
+        """`field: as it is -> as the plan has it`, of a run that is trained: nobody else would see it."""
+        file = inventory.run_directory(self.results, self.run) / "config.json"
+        if not file.exists() or not self._trained():
             return []
-        saved = read_run_config(directory, self.run.run_config.agent_file)
+        try:
+            saved = config_from_dict(json.loads(file.read_text()), self.run.run_config.agent_file)
+        except (ValueError, OSError, RecursionError) as error:
+            return [f"{file} cannot be read: {error}"]
         wanted = with_settings(
             self.run.run_config,
             {

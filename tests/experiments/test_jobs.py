@@ -42,7 +42,7 @@ def test_a_trained_run_with_other_settings_is_known(name, scale, tmp_path, monke
     job = RunJob(results=tmp_path, run=run, evaluation=EVALUATION, scale=scale)
     assert job.other_settings() == [], "there is no run"
     file = progress.run_directory(tmp_path, run) / "config.json"
-    file.parent.mkdir(parents=True)
+    (file.parent / "segmenters").mkdir(parents=True)  # as a run on segmented frames has it
     file.write_text(json.dumps(config_to_dict(parse(training_flags(run, scale)).run)))
     assert job.other_settings() == []
     saved = json.loads(file.read_text())
@@ -50,6 +50,8 @@ def test_a_trained_run_with_other_settings_is_known(name, scale, tmp_path, monke
     file.write_text(json.dumps(saved))
     (changed,) = job.other_settings()
     assert changed.startswith("learner.learning_rate: 0.123 -> ")
+    file.write_text("{")
+    assert "config.json cannot be read: " in job.other_settings()[0]
 
 
 def test_an_agent_in_a_file_is_given_to_the_evaluation(tmp_path):
