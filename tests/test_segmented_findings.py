@@ -212,11 +212,19 @@ def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
         ]
         of_both += [estimate_groups([(scores, tasks) for scores in both], difference).text for tasks in task_sets(name)]
     assert f"beside segmented frames | {of_both[1]} | {of_both[9]} | {of_both[13]} | {of_both[5]} | as you like" in page
+    together = {
+        name: {2: "both", 3: "all three"}[all_long.filter(scenario=name)["run_seed"].n_unique()] for name in compared
+    }
     assert (
-        "both together have {} points more than 900 seconds on the training tasks, {} on the gate tasks and {} on the "
+        "{} together have {} points more than 900 seconds on the training tasks, {} on the gate tasks and {} on the "
         "test tasks; on level 4 {}."
-    ).format(*of_both[:4]) in page
-    assert "both together have {}, {} and {} points more, and on level 4 {}.".format(*of_both[4:8]) in page
+    ).format(together["defend_the_center"], *of_both[:4]) in page
+    assert (
+        "{} together have {}, {} and {} points more, and on level 4 {}.".format(
+            together["seek_and_kill"], *of_both[4:8]
+        )
+        in page
+    )
     assert f"Projectiles the gate tasks lose**: both seeds together have {of_both[9]} points." in page
     before = of_short["dodge_projectiles", "train8"]
     assert f"The training tasks had {before:.1f} before, and gain {of_both[8]} points; the test" in page
