@@ -179,8 +179,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         else:
             episode_seed = int(self.np_random.integers(EPISODE_SEEDS))
         if not 0 <= episode_seed < EPISODE_SEEDS:
-            got = (options or {}).get("episode_seed")
-            raise ValueError(f"reset: episode_seed {got!r}, want an integer, 0..{EPISODE_SEEDS - 1}")
+            raise ValueError(f"reset: {options}, want an integer as episode_seed, 0..{EPISODE_SEEDS - 1}")
         self._episode_seed = episode_seed
         if self._recycle_episodes and self._engine_episodes >= self._recycle_episodes:
             self._stop_engine()
@@ -387,7 +386,7 @@ def is_solved(solved_episodes: Sequence[bool]) -> bool:
 
 
 def _integer(value: object) -> int:
-    """The value as an integer; -1 if it is none: a number with a part behind the point, an array of several numbers."""
+    """The value as an integer; -1 for anything else, such as 1.5 or an array."""
     try:
         return operator.index(value)  # pyright: ignore[reportArgumentType]
     except TypeError:

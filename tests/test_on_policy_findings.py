@@ -99,7 +99,8 @@ def test_the_findings_say_where_ppo_is_better_or_worse_than_rainbow(task, said):
     assert said.format(name, has, had) in WORDS
 
 
-def test_the_findings_say_what_ppo_gains_in_health_gathering():
+def test_the_findings_say_what_ppo_gains_in_health_gathering_and_on_level_4_of_defend_the_center():
+    assert f"On level 4 it has {gains('defend_the_center')[3]} points more." in WORDS
     assert f"**In Health Gathering it has {gains('health_gathering')[1]} points more on the gate tasks.**" in WORDS
 
 

@@ -243,8 +243,8 @@ def _warn_of_other_settings(jobs: "Sequence[Job]") -> None:
     for job in jobs:
         if isinstance(job, RunJob) and (changed := job.other_settings()):
             print(
-                f"warning: {job.id} was trained with other settings and stays as it is ({'; '.join(changed)}); "
-                "move its directory aside to train it anew",
+                f"warning: {job.id} was trained with other settings and stays as it is ({'; '.join(changed)}). "
+                "To train it again, move its directory aside",
                 file=sys.stderr,
             )
 

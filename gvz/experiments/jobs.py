@@ -89,18 +89,8 @@ class RunJob:
             saved = config_from_dict(json.loads(file.read_text()), self.run.run_config.agent_file)
         except (ValueError, OSError, RecursionError) as error:
             return [f"{file} cannot be read: {error}"]
-        wanted = with_settings(
-            self.run.run_config,
-            {
-                "tasks": self.run.tasks,
-                "seed": self.run.seed,
-                "learner.total_updates": self.run.total_updates,
-                "actors.num_actors": saved.num_actors,
-                "actors.games_per_actor": saved.games_per_actor,
-                **scaled_settings(self.run.run_config, self.run.total_updates, self.scale),
-            },
-        )
-        return differences(saved, wanted)
+        games = {"actors.num_actors": saved.num_actors, "actors.games_per_actor": saved.games_per_actor}
+        return differences(saved, with_settings(self.run.run_config, {**_settings(self.run, self.scale), **games}))
 
     def _trained(self) -> bool:
         return inventory.run_progress(self.results, self.run, self.evaluation).trained
@@ -150,13 +140,7 @@ Job = RunJob | PlayerJob
 
 def training_flags(run: TrainingRun, scale: float) -> tuple[str, ...]:
     """The flags of gvz.launch for this run, without --run-dir."""
-    settings: dict[str, Any] = {
-        "tasks": run.tasks,
-        "seed": run.seed,
-        "learner.total_updates": run.total_updates,
-        **run.settings,
-        **scaled_settings(run.run_config, run.total_updates, scale),
-    }
+    settings = _settings(run, scale)
     if run.variant is not None:
         settings["name"] = run.agent
     if run.max_processor_s is None:
@@ -164,6 +148,17 @@ def training_flags(run: TrainingRun, scale: float) -> tuple[str, ...]:
     else:
         settings["max_processor_s"] = run.max_processor_s
     return ("--config", run.config, *(text for name, value in settings.items() for text in _flag(name, value)))
+
+
+def _settings(run: TrainingRun, scale: float) -> dict[str, Any]:
+    """What the plan sets of the run's config file."""
+    return {
+        "tasks": run.tasks,
+        "seed": run.seed,
+        "learner.total_updates": run.total_updates,
+        **run.settings,
+        **scaled_settings(run.run_config, run.total_updates, scale),
+    }
 
 
 def _flag(name: str, value: Any) -> tuple[str, ...]:

@@ -340,17 +340,6 @@ def test_derived_numbers_are_saved_explicitly():
     assert dataclasses.replace(saved, actors=config.actors, agent=config.agent) == config
 
 
-def test_the_games_of_an_on_policy_config_do_not_depend_on_the_cores(monkeypatch):
-    """They are settings of its learner: a rollout has a window for each."""
-    games = []
-    for cores in (1, 2, 32):
-        monkeypatch.setattr(os, "sched_getaffinity", lambda _, cores=cores: set(range(cores)))
-        configs = [load_config(file.stem) for file in configs_directory().glob("*_*.py") if file.stem != "__init__"]
-        games.append({config.name: config.num_lanes for config in configs if config.agent.on_policy})
-    assert games[0] == games[1] == games[2]
-    assert games[0]["ppo_segmented"] == 16
-
-
 def test_an_agent_that_learns_on_policy_brings_its_kind_of_learner():
     run = parse("--agent.name ppo --learner.rollout-steps 64 --agent.clip 0.1 --learner.total-updates 7".split()).run
     assert (run.learner, run.replay) == (OnPolicyConfig(rollout_steps=64, total_updates=7), None)

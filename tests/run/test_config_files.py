@@ -1,12 +1,13 @@
 """Config files: found by name or path, and what is wrong with one is said with its path."""
 
+import os
 import re
 
 import pytest
 
 from gvz.core.errors import ConfigError
 from gvz.launch import parse
-from gvz.run.config_files import find_config_file, load_config
+from gvz.run.config_files import configs_directory, find_config_file, load_config
 from gvz.tasks import scenarios
 from learner.config import ValueConfig
 
@@ -123,3 +124,14 @@ def test_the_segmented_config_shifts_frames_in_one_scenario_and_looks_further_ah
         "health_gathering": ((), 0.98),
         "seek_and_kill": ((), 0.95),
     }
+
+
+def test_the_games_of_an_on_policy_config_do_not_depend_on_the_cores(monkeypatch):
+    """They are settings of its learner: a rollout has a window for each."""
+    games = []
+    for cores in (1, 2, 32):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _, cores=cores: set(range(cores)))
+        configs = [load_config(file.stem) for file in configs_directory().glob("*_*.py") if file.stem != "__init__"]
+        games.append({config.name: config.num_lanes for config in configs if config.agent.on_policy})
+    assert games[0] == games[1] == games[2]
+    assert games[0]["ppo_segmented"] == 16
