@@ -40,7 +40,7 @@ class DevicePolicy:
 
         def act(
             params: Params, obs: dict[str, Array], key: Array, num_calls: Array, epsilon: Array
-        ) -> tuple[Int[Array, "B"], Float[Array, "B E"]]:
+        ) -> tuple[Int[Array, " B"], Float[Array, "B E"]]:
             return agent.act(params, jax.random.fold_in(key, num_calls), Observation(**obs), epsilon)
 
         self._act = jax.jit(act)

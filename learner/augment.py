@@ -186,7 +186,7 @@ def _shifted(frames: Frames, strength: Strength, share: Float[Array, "B 2"]) -> 
     return jax.vmap(crop)(padded, SHIFT_PIXELS + offset.astype(jnp.int32))
 
 
-def _per_sample(x: Shaped[Array, "B"]) -> Shaped[Array, "B 1 1 1 1"]:
+def _per_sample(x: Shaped[Array, " B"]) -> Shaped[Array, "B 1 1 1 1"]:
     return x[:, None, None, None, None]
 
 

@@ -20,12 +20,12 @@ from learner.agents.base import Agent, Params, folding
 from learner.observation import Observation
 
 
-def flatten_params(params: Params) -> Float[Array, "P"]:
+def flatten_params(params: Params) -> Float[Array, " P"]:
     """All leaves in tree order, which is the order that `export_policy` takes them in, as one float32 vector."""
     return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(params)])
 
 
-def unflatten_params(template: Params, vector: Float[Array, "P"]) -> Params:
+def unflatten_params(template: Params, vector: Float[Array, " P"]) -> Params:
     """The inverse of `flatten_params`: parameters of the template's shapes (arrays or their ShapeDtypeStructs)."""
     leaves, treedef = jax.tree.flatten(template)
     ends = list(itertools.accumulate(leaf.size for leaf in leaves))
@@ -60,7 +60,7 @@ def export_policy(agent: Agent, template: Params, batch_size: int) -> bytes:
 
     def policy(
         leaves: list[Array], obs: dict[str, Array], key_data: Array, epsilon: Array
-    ) -> tuple[Int[Array, "B"], Float[Array, "B E"]]:
+    ) -> tuple[Int[Array, " B"], Float[Array, "B E"]]:
         params = jax.tree.unflatten(treedef, leaves)
         return agent.act(params, _key(key_data), Observation(**obs), epsilon)
 

@@ -14,12 +14,12 @@ from jaxtyping import Array, Float, Int, UInt8
 
 def q_learning_td(
     q_tm1: Float[Array, "B A"],
-    a_tm1: Int[Array, "B"],
-    r_t: Float[Array, "B"],
-    discount_t: Float[Array, "B"],
+    a_tm1: Int[Array, " B"],
+    r_t: Float[Array, " B"],
+    discount_t: Float[Array, " B"],
     q_t_value: Float[Array, "B A"],
     q_t_selector: Float[Array, "B A"] | None = None,
-) -> Float[Array, "B"]:
+) -> Float[Array, " B"]:
     """TD error of (double, n-step) Q-learning: r + discount * Q'(s', argmax_a S(s', a)) - Q(s, a).
 
     Args:
@@ -53,7 +53,7 @@ def huber(td: Float[Array, "*batch"], delta: float = 1.0) -> Float[Array, "*batc
     return inside * (td - 0.5 * inside)
 
 
-def sight(logits: Float[Array, "B C"], seen: UInt8[Array, "B C"], num_classes: int) -> Float[Array, "B"]:
+def sight(logits: Float[Array, "B C"], seen: UInt8[Array, "B C"], num_classes: int) -> Float[Array, " B"]:
     """Cross-entropy of what is in sight, in nats: the sum over classes of the mean over columns.
 
     Args:
@@ -68,18 +68,18 @@ def sight(logits: Float[Array, "B C"], seen: UInt8[Array, "B C"], num_classes: i
     return num_classes * optax.sigmoid_binary_cross_entropy(logits, seen).mean(axis=1)
 
 
-def take_action(values: Float[Array, "B A *rest"], actions: Int[Array, "B"]) -> Float[Array, "B *rest"]:
+def take_action(values: Float[Array, "B A *rest"], actions: Int[Array, " B"]) -> Float[Array, " B *rest"]:
     """values[i, actions[i]] for every i of the batch."""
     return jax.vmap(lambda value, action: value[action])(values, actions)
 
 
-def support(v_min: float, v_max: float, num_atoms: int) -> Float[Array, "N"]:
+def support(v_min: float, v_max: float, num_atoms: int) -> Float[Array, " N"]:
     """The atoms z_i = v_min + (i - 1) (v_max - v_min) / (N - 1). Source: thesis 4.2.6."""
     return jnp.linspace(v_min, v_max, num_atoms, dtype=jnp.float32)
 
 
 def project(
-    shifted_atoms: Float[Array, "B N"], probabilities: Float[Array, "B N"], atoms: Float[Array, "N"]
+    shifted_atoms: Float[Array, "B N"], probabilities: Float[Array, "B N"], atoms: Float[Array, " N"]
 ) -> Float[Array, "B N"]:
     """Projects a distribution on moved atoms onto the evenly spaced support, sharing mass between neighbours.
 
@@ -105,13 +105,13 @@ def project(
 
 def categorical_q_learning(
     logits_tm1: Float[Array, "B A N"],
-    a_tm1: Int[Array, "B"],
-    r_t: Float[Array, "B"],
-    discount_t: Float[Array, "B"],
+    a_tm1: Int[Array, " B"],
+    r_t: Float[Array, " B"],
+    discount_t: Float[Array, " B"],
     logits_t_value: Float[Array, "B A N"],
-    atoms: Float[Array, "N"],
+    atoms: Float[Array, " N"],
     q_t_selector: Float[Array, "B A"] | None = None,
-) -> tuple[Float[Array, "B"], Float[Array, "B"]]:
+) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
     """Cross-entropy between the projected target distribution and the online one, and their KL divergence.
 
     Args:
@@ -144,7 +144,7 @@ def categorical_q_learning(
     return cross_entropy, jnp.maximum(cross_entropy - entropy, 0.0)
 
 
-def expectation(probabilities: Float[Array, "*batch N"], atoms: Float[Array, "N"]) -> Float[Array, "*batch"]:
+def expectation(probabilities: Float[Array, "*batch N"], atoms: Float[Array, " N"]) -> Float[Array, "*batch"]:
     """Mean of a distribution on the atoms: Q(s, a) = E[Z(s, a)]. Source: thesis 4.2.6."""
     return jnp.einsum("...n,n->...", probabilities, atoms, precision=jax.lax.Precision.HIGHEST)
 
@@ -155,8 +155,8 @@ def quantile_midpoints(num_quantiles: int) -> Float[Array, "1 N"]:
 
 
 def quantile_target(
-    r_t: Float[Array, "B"],
-    discount_t: Float[Array, "B"],
+    r_t: Float[Array, " B"],
+    discount_t: Float[Array, " B"],
     z_t_value: Float[Array, "B A M"],
     q_t_selector: Float[Array, "B A"] | None = None,
 ) -> Float[Array, "B M"]:
@@ -180,9 +180,9 @@ def quantile_target(
 
 def munchausen_target(
     q_tm1: Float[Array, "B A"],
-    a_tm1: Int[Array, "B"],
-    r_t: Float[Array, "B"],
-    discount_t: Float[Array, "B"],
+    a_tm1: Int[Array, " B"],
+    r_t: Float[Array, " B"],
+    discount_t: Float[Array, " B"],
     z_t: Float[Array, "B A M"],
     q_t: Float[Array, "B A"],
     alpha: float = 0.9,
@@ -225,7 +225,7 @@ def munchausen_target(
 
 def quantile_huber(
     z_tm1: Float[Array, "B N"], fractions: Float[Array, "#B N"], targets: Float[Array, "B M"], kappa: float = 1.0
-) -> Float[Array, "B"]:
+) -> Float[Array, " B"]:
     """Quantile regression: sum over i of the mean over j of |f_i - 1(u_ij < 0)| huber(u_ij, kappa) / kappa.
 
     u_ij = target_j - z_i. QR-DQN and IQN share it: the fractions f are fixed there and sampled here.

@@ -22,7 +22,7 @@ class Observation:
     """the game variables that the agent may see, as the game counts them"""
     actions: Int[Array, "B K"]
     """the last K actions, oldest first; -1 before the episode's first"""
-    task: Int[Array, "B"]
+    task: Int[Array, " B"]
     """index into the run's table of tasks"""
     mask: Bool[Array, "B A"] | None = None
     """the actions that the task allows; None where it is all of them"""

@@ -70,7 +70,7 @@ class ReplayState:
     """a leaf a slot"""
     max_priority: Float[Array, ""]
     """largest leaf ever set; what new transitions enter with"""
-    newest: Int[Array, "num_newest"]
+    newest: Int[Array, " num_newest"]
     """anchors of the newest transitions, a circle; num_slots where there is none yet"""
     newest_head: Int[Array, ""]
 
@@ -88,15 +88,15 @@ class Transitions:
     """
 
     obs_tm1: Observation
-    a_tm1: Int[Array, "B"]
-    r_t: Float[Array, "B"]
-    discount_t: Float[Array, "B"]
+    a_tm1: Int[Array, " B"]
+    r_t: Float[Array, " B"]
+    discount_t: Float[Array, " B"]
     obs_t: Observation
     sight_tm1: UInt8[Array, "B C"] | None = None
     """what was in sight when the action was chosen: flags by class and column; None if it is not recorded"""
 
     @property
-    def task(self) -> Int[Array, "B"]:
+    def task(self) -> Int[Array, " B"]:
         """Index of each transition's task."""
         return self.obs_tm1.task
 
@@ -110,9 +110,9 @@ class SampleInfo:
     `weights` correct for not having drawn uniformly, divided by the largest in the batch (thesis eq. 4.13).
     """
 
-    slots: Int[Array, "B"]
-    weights: Float[Array, "B"]
-    probabilities: Float[Array, "B"]
+    slots: Int[Array, " B"]
+    weights: Float[Array, " B"]
+    probabilities: Float[Array, " B"]
 
 
 def init(spec: ReplaySpec) -> ReplayState:
@@ -213,15 +213,15 @@ def sample(
 
 
 def _weights(
-    probabilities: Float[Array, "B"], smallest: Float[Array, ""], is_exponent: Float[Array, ""] | float
-) -> Float[Array, "B"]:
+    probabilities: Float[Array, " B"], smallest: Float[Array, ""], is_exponent: Float[Array, ""] | float
+) -> Float[Array, " B"]:
     """(1 / N P(i))^beta over its maximum: N drops out."""
     return (smallest / probabilities) ** is_exponent
 
 
 def _of_all_devices(
-    probabilities: Float[Array, "B"], is_exponent: Float[Array, ""] | float, across: Across
-) -> tuple[Float[Array, "B"], Float[Array, "B"]]:
+    probabilities: Float[Array, " B"], is_exponent: Float[Array, ""] | float, across: Across
+) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
     """P(i) and weights of a draw to which each device that has a transition gives the same part.
 
     A device without one drew leaves of no tree: P(i) is infinite there, the weight 0. If none has one, it is NaN.
@@ -236,8 +236,8 @@ def _of_all_devices(
 def update_priorities(
     spec: ReplaySpec,
     state: ReplayState,
-    slots: Int[Array, "B"],
-    td_errors: Float[Array, "B"],
+    slots: Int[Array, " B"],
+    td_errors: Float[Array, " B"],
     across: Across = ALONE,
 ) -> ReplayState:
     """Sets the priorities of drawn transitions to (|TD error| + min_priority)^omega; nothing if not prioritized.
@@ -276,7 +276,7 @@ def check_can_sample(spec: ReplaySpec, state: ReplayState) -> None:
         )
 
 
-def _completed(spec: ReplaySpec, last: Bool[Array, "K"], written: Written) -> Int[Array, "N n"]:
+def _completed(spec: ReplaySpec, last: Bool[Array, " K"], written: Written) -> Int[Array, "N n"]:
     """The anchors whose windows each new record completes, oldest first; num_slots in place of none.
 
     A record completes the window of the anchor n records back, and if it is the last of its episode also those of
@@ -291,7 +291,7 @@ def _completed(spec: ReplaySpec, last: Bool[Array, "K"], written: Written) -> In
     return jnp.where(same_episode & completes, anchors, spec.num_slots)[:, ::-1]
 
 
-def _reading(spec: ReplaySpec, first: Bool[Array, "K"], slot: Int[Array, "N"]) -> Int[Array, "N history"]:
+def _reading(spec: ReplaySpec, first: Bool[Array, " K"], slot: Int[Array, " N"]) -> Int[Array, "N history"]:
     """The anchors whose observations read each written slot, itself included; num_slots in place of none."""
     ahead = moved(spec, slot[:, None], jnp.arange(1, spec.history)[None, :])
     reaches_back = jnp.cumprod(~store.at(first, ahead), axis=1, dtype=jnp.int32) > 0
@@ -299,7 +299,7 @@ def _reading(spec: ReplaySpec, first: Bool[Array, "K"], slot: Int[Array, "N"]) -
 
 
 def _keep_newest(
-    spec: ReplaySpec, state: ReplayState, stale: Int[Array, "R"], completed: Int[Array, "M"]
+    spec: ReplaySpec, state: ReplayState, stale: Int[Array, " R"], completed: Int[Array, " M"]
 ) -> tuple[Array, Array]:
     """Takes stale anchors out of the circle of the newest, and puts completed ones in."""
     if spec.num_newest == 0:
@@ -313,7 +313,7 @@ def _keep_newest(
     return newest.at[place].set(completed, mode="drop"), (state.newest_head + count) % spec.num_newest
 
 
-def _transitions(spec: ReplaySpec, state: ReplayState, anchors: Int[Array, "B"]) -> Transitions:
+def _transitions(spec: ReplaySpec, state: ReplayState, anchors: Int[Array, " B"]) -> Transitions:
     n, records = spec.n_steps, state.store
     powers = jnp.asarray(spec.discount ** np.arange(n + 1), jnp.float32)
     window = moved(spec, anchors[:, None], jnp.arange(1, n + 1)[None, :])  # [B, n]

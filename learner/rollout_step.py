@@ -27,8 +27,8 @@ class MetricSums:
     grad_norm_max: Float[Array, ""]
     agent: dict[str, Float[Array, ""]]
     """of `SampleLosses.metrics`: means of minibatches, and largest numbers"""
-    task_samples: Float[Array, "Z"]
-    task_loss: Float[Array, "Z"]
+    task_samples: Float[Array, " Z"]
+    task_loss: Float[Array, " Z"]
 
 
 @jax.tree_util.register_dataclass
@@ -142,7 +142,7 @@ def optimizer(config: OnPolicyConfig) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adam)
 
 
-def _mean(values: Float[Array, "B"], weight: Float[Array, "B"]) -> Float[Array, ""]:
+def _mean(values: Float[Array, " B"], weight: Float[Array, " B"]) -> Float[Array, ""]:
     return (weight * values).sum() / jnp.maximum(weight.sum(), 1.0)
 
 

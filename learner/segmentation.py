@@ -60,7 +60,7 @@ def normalized(screens: UInt8[Array, "B H W 3"]) -> Float[Array, "B H W 3"]:
 
 
 def segmentation_loss(
-    logits: Float[Array, "B h w C"], labels: UInt8[Array, "B H W"], class_weights: Float[Array, "C"]
+    logits: Float[Array, "B h w C"], labels: UInt8[Array, "B H W"], class_weights: Float[Array, " C"]
 ) -> Float[Array, ""]:
     """Cross-entropy of every pixel's class under its cell's distribution, a weighted mean over pixels.
 

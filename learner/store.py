@@ -76,13 +76,13 @@ class StepArrays:
     """
 
     frames: UInt8[Array | np.ndarray, "N H W C"]
-    action: Int[Array | np.ndarray, "N"]
-    reward: Float[Array | np.ndarray, "N"]
-    lane: Int[Array | np.ndarray, "N"]
-    task: Int[Array | np.ndarray, "N"]
-    first: Bool[Array | np.ndarray, "N"]
-    terminated: Bool[Array | np.ndarray, "N"]
-    truncated: Bool[Array | np.ndarray, "N"]
+    action: Int[Array | np.ndarray, " N"]
+    reward: Float[Array | np.ndarray, " N"]
+    lane: Int[Array | np.ndarray, " N"]
+    task: Int[Array | np.ndarray, " N"]
+    first: Bool[Array | np.ndarray, " N"]
+    terminated: Bool[Array | np.ndarray, " N"]
+    truncated: Bool[Array | np.ndarray, " N"]
     num_valid: Int[Array | np.ndarray, ""]
     vector: Float[Array | np.ndarray, "N V"] | None = None
     extras: Float[Array | np.ndarray, "N E"] | None = None
@@ -96,30 +96,30 @@ class Store:
     """All records, K = num_slots."""
 
     frames: UInt8[Array, "K HWC"]
-    action: Int[Array, "K"]
-    reward: Float[Array, "K"]
-    task: Int[Array, "K"]
+    action: Int[Array, " K"]
+    reward: Float[Array, " K"]
+    task: Int[Array, " K"]
     """num_tasks in an empty slot"""
-    first: Bool[Array, "K"]
-    last: Bool[Array, "K"]
+    first: Bool[Array, " K"]
+    last: Bool[Array, " K"]
     """the episode ended or was cut here, or the slot is empty"""
-    terminated: Bool[Array, "K"]
+    terminated: Bool[Array, " K"]
     """the episode ended by the rules here: nothing to bootstrap from"""
     vector: Float[Array, "K V"]
     extras: Float[Array, "K E"]
     sight: UInt8[Array, "K C"] | None = None
     """None if it is not recorded"""
-    heads: Int[Array, "lanes"]
+    heads: Int[Array, " lanes"]
     """where in its circle each lane writes next, 0..lane_capacity-1 (a running count would overflow)"""
 
 
 class Written(NamedTuple):
     """Where a block of N records went."""
 
-    slot: Int[Array, "N"]
+    slot: Int[Array, " N"]
     """num_slots or more for padding"""
-    is_last: Bool[Array, "N"]
-    cut: Bool[Array, "N"]
+    is_last: Bool[Array, " N"]
+    cut: Bool[Array, " N"]
     """the stream broke off before this record: the record before it became the last of its episode, truncated"""
 
 
@@ -176,7 +176,7 @@ def write(spec: StoreSpec, store: Store, block: StepArrays) -> tuple[Store, Writ
     return written, Written(slot, is_last, cut)
 
 
-def observations(spec: StoreSpec, store: Store, slots: Int[Array, "B"]) -> Observation:
+def observations(spec: StoreSpec, store: Store, slots: Int[Array, " B"]) -> Observation:
     """What the agent observed at `slots`."""
     task = store.task[slots]
     return Observation(
@@ -194,7 +194,7 @@ def rewards(spec: StoreSpec, store: Store, slots: Int[Array, "..."]) -> Float[Ar
     return raw if spec.reward_scales is None else raw * jnp.asarray(spec.reward_scales, jnp.float32)[store.task[slots]]
 
 
-def records_per_task(spec: StoreSpec, store: Store) -> Int[Array, "num_tasks"]:
+def records_per_task(spec: StoreSpec, store: Store) -> Int[Array, " num_tasks"]:
     """Counts the stored records of each task. Reads all task numbers: for the log, not for every step."""
     return jnp.zeros(spec.num_tasks, jnp.int32).at[store.task].add(1, mode="drop")
 
@@ -205,12 +205,12 @@ def moved(spec: StoreSpec, slot: Array, steps: Array | int) -> Array:
     return lane_start + (slot + steps) % spec.lane_capacity
 
 
-def at(flags: Bool[Array, "K"], slots: Int[Array, "..."]) -> Bool[Array, "..."]:
+def at(flags: Bool[Array, " K"], slots: Int[Array, "..."]) -> Bool[Array, "..."]:
     """flags[slots]; True beyond the last slot, where padding lies: it is the last and the first of everything."""
     return flags.at[slots].get(mode="fill", fill_value=True)
 
 
-def _stacks(spec: StoreSpec, store: Store, slots: Int[Array, "B"]) -> UInt8[Array, "B H W SC"]:
+def _stacks(spec: StoreSpec, store: Store, slots: Int[Array, " B"]) -> UInt8[Array, "B H W SC"]:
     """Frames of one episode, oldest first, its first one repeated.
 
     Measured at 100K frames of 84x84x3, batch 32: a whole `replay.sample`, two stacks a transition, takes 1.4 ms
@@ -227,7 +227,7 @@ def _stacks(spec: StoreSpec, store: Store, slots: Int[Array, "B"]) -> UInt8[Arra
     return store.frames[history].reshape(S, B, H, W, C).transpose(1, 2, 3, 0, 4).reshape(B, H, W, S * C)
 
 
-def _past_actions(spec: StoreSpec, store: Store, slots: Int[Array, "B"]) -> Int[Array, "B K"]:
+def _past_actions(spec: StoreSpec, store: Store, slots: Int[Array, " B"]) -> Int[Array, "B K"]:
     """The actions before `slots` in the same episode, oldest first; -1 before the first."""
     if spec.num_past_actions == 0:
         return jnp.zeros((slots.shape[0], 0), jnp.int32)

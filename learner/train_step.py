@@ -42,10 +42,10 @@ class MetricSums:
     grad_norm: Float[Array, ""]
     grad_norm_max: Float[Array, ""]
     importance_weight: Float[Array, ""]
-    task_samples: Float[Array, "Z"]
-    task_loss: Float[Array, "Z"]
-    task_priority: Float[Array, "Z"]
-    task_td_error: Float[Array, "Z"]
+    task_samples: Float[Array, " Z"]
+    task_loss: Float[Array, " Z"]
+    task_priority: Float[Array, " Z"]
+    task_td_error: Float[Array, " Z"]
 
 
 @jax.tree_util.register_dataclass
@@ -59,8 +59,8 @@ class NonFinite:
     """number of the first such update"""
     batch: Any
     """a pytree of arrays"""
-    loss: Float[Array, "B"]
-    weights: Float[Array, "B"]
+    loss: Float[Array, " B"]
+    weights: Float[Array, " B"]
 
 
 class TrainedState(Protocol):
@@ -84,7 +84,7 @@ class Losses(Protocol):
     """What an agent says of a batch: one number per sample, and more for the records."""
 
     @property
-    def loss(self) -> Float[Array, "B"]: ...
+    def loss(self) -> Float[Array, " B"]: ...
 
 
 @jax.tree_util.register_dataclass
@@ -106,7 +106,7 @@ class LearnerState:
 T = TypeVar("T")
 StateT = TypeVar("StateT", bound=TrainedState)
 LossesT = TypeVar("LossesT", bound=Losses)
-TrainStep = Callable[[LearnerState, ReplayState, Float[Array, "Z"]], tuple[LearnerState, ReplayState]]
+TrainStep = Callable[[LearnerState, ReplayState, Float[Array, " Z"]], tuple[LearnerState, ReplayState]]
 
 
 def init(
@@ -169,7 +169,7 @@ def of_one_device(
     """What `make_train_step` jits, and what each of several devices does: sizes and batch are those of one device."""
 
     def update(
-        state: LearnerState, replay_state: ReplayState, task_weights: Float[Array, "Z"]
+        state: LearnerState, replay_state: ReplayState, task_weights: Float[Array, " Z"]
     ) -> tuple[LearnerState, ReplayState]:
         """One gradient step (thesis Algorithm 1 with prioritized replay)."""
         key, *keys = jax.random.split(state.key, 3)
@@ -205,7 +205,7 @@ def of_one_device(
         return state, replay_state
 
     def train_step(
-        state: LearnerState, replay_state: ReplayState, task_weights: Float[Array, "Z"]
+        state: LearnerState, replay_state: ReplayState, task_weights: Float[Array, " Z"]
     ) -> tuple[LearnerState, ReplayState]:
         def one(carry: tuple[LearnerState, ReplayState], _: None):
             return update(*carry, task_weights), None
@@ -280,7 +280,7 @@ def gradient_step(
     optimizer: optax.GradientTransformation,
     mean_loss: Callable[[Params], tuple[Float[Array, ""], LossesT]],
     batch: Any,
-    weights: Float[Array, "B"],
+    weights: Float[Array, " B"],
     *,
     hold_gradient: bool,
     across: Across = ALONE,
@@ -352,15 +352,15 @@ def _add_metrics(
     losses: AgentLoss,
     grad_norm: Float[Array, ""],
     info: SampleInfo,
-    task: Int[Array, "B"],
+    task: Int[Array, " B"],
     across: Across,
 ) -> MetricSums:
     magnitude = jnp.abs(losses.td_error)
 
-    def mean(values: Float[Array, "B"]) -> Float[Array, ""]:
+    def mean(values: Float[Array, " B"]) -> Float[Array, ""]:
         return across.mean(values.mean())
 
-    def per_task(sums: Float[Array, "Z"], values: Float[Array, "B"] | float) -> Float[Array, "Z"]:
+    def per_task(sums: Float[Array, " Z"], values: Float[Array, " B"] | float) -> Float[Array, " Z"]:
         if across.alone:
             return sums.at[task].add(values)
         return sums + across.sum(jnp.zeros_like(sums).at[task].add(values))

@@ -73,7 +73,7 @@ class PlanFlags:
         """Raises ConfigError for anything that cannot be run."""
         from gvz.experiments.plan import Plan
 
-        return Plan(names=self.names, scale=self.scale, scenarios=self.scenario or None)
+        return Plan.of(*self.names, scale=self.scale, scenarios=self.scenario or None)
 
     def slots(self) -> "tuple[Slot, ...]":
         """The machine's shares."""
@@ -212,7 +212,7 @@ class Status:
             if state == "failed":
                 print("\n".join([f"{'':8}     {log}", *(f"{'':8}     {line}" for line in inventory.last_words(log))]))
         if not self.json:
-            print(f"{', '.join(plan.names)}, scale {plan.scale:g}: {', '.join(f'{n} {s}' for s, n in states.items())}")
+            print(f"{', '.join(plan.asked)}, scale {plan.scale:g}: {', '.join(f'{n} {s}' for s, n in states.items())}")
         return 1 if states["failed"] else 0
 
 

@@ -1,9 +1,10 @@
 """The plan of a results directory: experiments, scale and scenarios, and the runs that follow; plan.json keeps it."""
 
 import dataclasses
+import itertools
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -15,7 +16,7 @@ from gvz.experiments.base import Experiment, TrainingRun, experiment_named
 from gvz.experiments.scale import scaled
 from gvz.tasks import scenario_named
 
-PLAN_SCHEMA = 1
+PLAN_SCHEMA = 2
 
 Item = TypeVar("Item")
 
@@ -36,17 +37,20 @@ class Evaluation:
 class Plan:
     """The experiments of one results directory."""
 
-    names: tuple[str, ...]
-    """of the experiments"""
+    asked: Mapping[str, tuple[str, ...] | None]
+    """experiment -> only these of its scenarios; None: all (at the smallest scales: the first)"""
     scale: float = 1.0
-    scenarios: tuple[str, ...] | None = None
-    """only these of each experiment's; None: all (at the smallest scales: the first)"""
 
     def __post_init__(self) -> None:
-        for scenario in self.scenarios or ():
+        for scenario in itertools.chain.from_iterable(filter(None, self.asked.values())):
             scenario_named(scenario)
         self.experiments()
         self.runs()
+
+    @classmethod
+    def of(cls, *names: str, scale: float = 1.0, scenarios: tuple[str, ...] | None = None) -> "Plan":
+        """Experiments by name, all with the same choice of scenarios."""
+        return cls(asked=dict.fromkeys(names, scenarios), scale=scale)
 
     def experiments(self) -> tuple[Experiment, ...]:
         """The experiments, at the plan's scale and with its scenarios alone.
@@ -54,17 +58,17 @@ class Plan:
         Raises:
             ConfigError: an unknown experiment, none, a bad scale, or an experiment without any of the scenarios.
         """
-        if not self.names:
+        if not self.asked:
             raise ConfigError("experiments: got none, want at least one name; `gvz experiment list` shows them")
         found = []
-        for name in dict.fromkeys(self.names):
+        for name, scenarios in self.asked.items():
             full = experiment_named(name)
             experiment = scaled(full, self.scale)
-            if self.scenarios is not None:
-                chosen = tuple(s for s in full.scenarios if s in self.scenarios)
+            if scenarios is not None:
+                chosen = tuple(s for s in full.scenarios if s in scenarios)
                 if not chosen:
                     raise ConfigError(
-                        f"--scenario: got {', '.join(self.scenarios)}, but {name} has {', '.join(full.scenarios)}"
+                        f"--scenario: got {', '.join(scenarios)}, but {name} has {', '.join(full.scenarios)}"
                     )
                 experiment = dataclasses.replace(experiment, scenarios=chosen)
             found.append(experiment)
@@ -118,10 +122,13 @@ class Plan:
                 f"--scale: got {other.scale:g}, but the results there have {self.scale:g}, and scales cannot be mixed; "
                 "give the same, or another --results"
             )
-        both = None
-        if self.scenarios is not None and other.scenarios is not None:
-            both = tuple(dict.fromkeys((*self.scenarios, *other.scenarios)))
-        return Plan(names=tuple(dict.fromkeys((*self.names, *other.names))), scale=self.scale, scenarios=both)
+        both = dict(self.asked)
+        for name, scenarios in other.asked.items():
+            before = both.get(name, ())
+            both[name] = None
+            if before is not None and scenarios is not None:
+                both[name] = tuple(dict.fromkeys((*before, *scenarios)))
+        return Plan(asked=both, scale=self.scale)
 
 
 def read_plan(results: Path) -> Plan | None:
@@ -135,13 +142,15 @@ def read_plan(results: Path) -> Plan | None:
         return None
     try:
         saved = json.loads(file.read_text())
-        if saved["schema"] != PLAN_SCHEMA:
-            raise ConfigError(f"{file}: schema {saved['schema']}, want {PLAN_SCHEMA}")
-        scenarios = saved["scenarios"]
+        if saved["schema"] == 1:  # one choice of scenarios for all experiments
+            asked = dict.fromkeys(saved["experiments"], saved["scenarios"])
+        elif saved["schema"] == PLAN_SCHEMA:
+            asked = dict(saved["experiments"])
+        else:
+            raise ConfigError(f"{file}: schema {saved['schema']}, want 1 or {PLAN_SCHEMA}")
         return Plan(
-            names=tuple(saved["experiments"]),
+            asked={name: None if scenarios is None else tuple(scenarios) for name, scenarios in asked.items()},
             scale=saved["scale"],
-            scenarios=None if scenarios is None else tuple(scenarios),
         )
     except (ValueError, KeyError, TypeError, OSError, RecursionError) as error:
         if isinstance(error, ConfigError):
@@ -165,12 +174,7 @@ def write_plan(results: Path, plan: Plan) -> Plan:
             records.lock(lock, wait=True)
             before = read_plan(results)
             both = plan if before is None else before.joined(plan)
-            saved = {
-                "schema": PLAN_SCHEMA,
-                "experiments": list(both.names),
-                "scale": both.scale,
-                "scenarios": None if both.scenarios is None else list(both.scenarios),
-            }
+            saved = {"schema": PLAN_SCHEMA, "scale": both.scale, "experiments": both.asked}
             temporary = results / "plan.json.new"  # who reads meanwhile gets the old plan, whole
             temporary.write_text(json.dumps(saved, indent=2) + "\n")
             temporary.replace(results / "plan.json")

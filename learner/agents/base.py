@@ -65,30 +65,30 @@ class AgentSpec:
 class Evaluation(NamedTuple):
     """What an agent thinks of a batch of observations with its noise off."""
 
-    action: Int[Array, "B"]
+    action: Int[Array, " B"]
     """the greedy action: the largest of `q_values` or `policy` among the allowed"""
     q_values: Float[Array, "B A"] | None
     """action values, if the agent has them"""
     probabilities: Float[Array, "B A N"] | None = None
     """return distributions, if the agent has them"""
-    atoms: Float[Array, "N"] | None = None
+    atoms: Float[Array, " N"] | None = None
     """the returns that `probabilities` stand for"""
     policy: Float[Array, "B A"] | None = None
     """the probability of each action, if the agent learns a policy"""
-    value: Float[Array, "B"] | None = None
+    value: Float[Array, " B"] | None = None
     """the value of the observation, if the agent learns one beside its policy"""
 
 
 class AgentLoss(NamedTuple):
     """One number per sample of a batch."""
 
-    loss: Float[Array, "B"]
+    loss: Float[Array, " B"]
     """what the gradient step makes smaller, before any weights"""
-    priority: Float[Array, "B"]
+    priority: Float[Array, " B"]
     """how surprising the sample was, >= 0: |TD error|, or the KL divergence if distributional"""
-    q_tm1: Float[Array, "B"]
+    q_tm1: Float[Array, " B"]
     """online Q(s, a) of the action taken"""
-    td_error: Float[Array, "B"]
+    td_error: Float[Array, " B"]
     """r + discount * Q'(s', a') - Q(s, a), for the records"""
 
 
@@ -110,7 +110,7 @@ class Agent(Protocol):
 
     def act(
         self, params: Params, key: PRNGKeyArray, obs: Observation, epsilon: Float[Array, ""]
-    ) -> tuple[Int[Array, "B"], Float[Array, "B E"]]:
+    ) -> tuple[Int[Array, " B"], Float[Array, "B E"]]:
         """Exploring actions: with fresh noise, or uniformly random with probability epsilon, or both.
 
         Returns: (actions, what the learner wants to be recorded with each of them; E = 0 for nothing).
@@ -183,20 +183,20 @@ class Samples(NamedTuple):
 
     obs: Observation
     """where the step began"""
-    a_tm1: Int[Array, "B"]
+    a_tm1: Int[Array, " B"]
     extras: Float[Array, "B E"]
     """what the agent recorded with the action"""
     targets: Targets
-    weight: Float[Array, "B"]
+    weight: Float[Array, " B"]
     """1, or 0 for a step that nobody took"""
 
 
 class SampleLosses(NamedTuple):
     """One number per sample of a minibatch."""
 
-    loss: Float[Array, "B"]
+    loss: Float[Array, " B"]
     """what the gradient step makes smaller, before the weights"""
-    metrics: dict[str, Float[Array, "B"]]
+    metrics: dict[str, Float[Array, " B"]]
     """for the records, by name: means are logged, and of a name that ends in _max the largest"""
 
 
@@ -237,7 +237,7 @@ def epsilon_greedy(
     q_values: Float[Array, "B A"],
     epsilon: Float[Array, ""],
     mask: Bool[Array, "B A"] | None = None,
-) -> Int[Array, "B"]:
+) -> Int[Array, " B"]:
     """The greedy action of each row, or with probability epsilon a uniformly random one (thesis, Algorithm 1).
 
     Both among the actions that the mask allows.

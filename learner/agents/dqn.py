@@ -31,7 +31,7 @@ class DQN(QAgent):
 
     def act(
         self, params: Params, key: PRNGKeyArray, obs: Observation, epsilon: Float[Array, ""]
-    ) -> tuple[Int[Array, "B"], Float[Array, "B E"]]:
+    ) -> tuple[Int[Array, " B"], Float[Array, "B E"]]:
         action = epsilon_greedy(key, self.q_values(params, obs), epsilon, obs.mask)
         return action, jnp.zeros((action.shape[0], 0))
 

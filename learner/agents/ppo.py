@@ -29,7 +29,7 @@ class PPO(NetworkAgent):
         """The last of its outputs is the value; all begin at 0, so the first policy is uniform."""
         return QNetwork(self.config, self.spec.num_actions + 1, self.spec.num_tasks, first_outputs=(0.0,))
 
-    def policy(self, params: Params, obs: Observation) -> tuple[Float[Array, "B A"], Float[Array, "B"]]:
+    def policy(self, params: Params, obs: Observation) -> tuple[Float[Array, "B A"], Float[Array, " B"]]:
         """(logits, value)."""
         outputs = self.outputs(params, obs)[:, :, 0]
         logits, value = outputs[:, :-1], outputs[:, -1]
@@ -37,7 +37,7 @@ class PPO(NetworkAgent):
 
     def act(
         self, params: Params, key: PRNGKeyArray, obs: Observation, epsilon: Float[Array, ""]
-    ) -> tuple[Int[Array, "B"], Float[Array, "B E"]]:
+    ) -> tuple[Int[Array, " B"], Float[Array, "B E"]]:
         """Samples the policy; with probability epsilon uniformly instead, which is part of the recorded probability."""
         logits, value = self.policy(params, obs)
         allowed = jnp.ones(logits.shape, bool) if obs.mask is None else obs.mask
@@ -73,7 +73,7 @@ class PPO(NetworkAgent):
         entropy = returns.entropy(logits)
         log_ratio = log_p - log_p_old
         ratio = jnp.exp(log_ratio)
-        clipped: Bool[Array, "B"] = jnp.abs(ratio - 1) > config.clip
+        clipped: Bool[Array, " B"] = jnp.abs(ratio - 1) > config.clip
         return SampleLosses(
             policy_loss + config.value_weight * value_loss - config.entropy_weight * entropy,
             {
@@ -88,7 +88,7 @@ class PPO(NetworkAgent):
         )
 
 
-def _normalized(x: Float[Array, "B"], weight: Float[Array, "B"]) -> Float[Array, "B"]:
+def _normalized(x: Float[Array, " B"], weight: Float[Array, " B"]) -> Float[Array, " B"]:
     """Mean 0 and deviation 1 over the steps of weight 1."""
     total = jnp.maximum(weight.sum(), 1.0)
     centred = x - (weight * x).sum() / total

@@ -41,7 +41,7 @@ class PQN(QAgent):
 
     def act(
         self, params: Params, key: PRNGKeyArray, obs: Observation, epsilon: Float[Array, ""]
-    ) -> tuple[Int[Array, "B"], Float[Array, "B E"]]:
+    ) -> tuple[Int[Array, " B"], Float[Array, "B E"]]:
         q = self.q_values(params, obs)
         action = epsilon_greedy(key, q, epsilon, obs.mask)
         return action, allowed_values(q, obs.mask).max(axis=1, keepdims=True)

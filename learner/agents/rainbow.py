@@ -42,7 +42,7 @@ class Rainbow(NetworkAgent):
             )
 
     @property
-    def atoms(self) -> Float[Array, "N"]:
+    def atoms(self) -> Float[Array, " N"]:
         """The returns that a distribution's masses stand for."""
         return losses.support(*self._value_range(), self.config.num_atoms)
 
@@ -68,7 +68,7 @@ class Rainbow(NetworkAgent):
 
     def act(
         self, params: Params, key: PRNGKeyArray, obs: Observation, epsilon: Float[Array, ""]
-    ) -> tuple[Int[Array, "B"], Float[Array, "B E"]]:
+    ) -> tuple[Int[Array, " B"], Float[Array, "B E"]]:
         """Greedy in a freshly drawn noisy network, each game with noise of its own if factorized.
 
         With parameters that `fold` made, greedy in their network.

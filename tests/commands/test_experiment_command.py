@@ -104,7 +104,7 @@ def test_a_gate_s_hours_follow_from_its_processor_time_and_its_variants_have_rat
 
 
 def test_status_tells_done_failed_and_waiting_apart(tmp_path, capsys):
-    plan = write_plan(tmp_path, Plan(names=("algorithm_comparison",), scale=0.001))
+    plan = write_plan(tmp_path, Plan.of("algorithm_comparison", scale=0.001))
     (dqn, rainbow), evaluations = plan.runs(), plan.evaluations()
     directory = inventory.run_directory(tmp_path, dqn)
     for step in dqn.checkpoints:

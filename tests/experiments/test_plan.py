@@ -18,7 +18,7 @@ THESIS = ("training_difficulty", "training_set_size", "algorithm_comparison", "r
 
 
 def test_a_run_that_experiments_share_is_there_once_and_evaluated_for_all():
-    plan = Plan(names=THESIS)
+    plan = Plan.of(*THESIS)
     ids = [run.id for run in plan.runs()]
     assert len(ids) == len(set(ids)) == 228 + 36 + 12  # the comparison adds DQN alone, the evaluation nothing
     evaluations = plan.evaluations()
@@ -30,12 +30,12 @@ def test_a_run_that_experiments_share_is_there_once_and_evaluated_for_all():
 
 
 def test_players_meet_every_task_that_any_run_is_evaluated_on():
-    assert len(Plan(names=THESIS).players()["random"].tasks) == 76
-    assert set(Plan(names=("quick_comparison",)).players()) == {"random", "idle", "scripted"}
+    assert len(Plan.of(*THESIS).players()["random"].tasks) == 76
+    assert set(Plan.of("quick_comparison").players()) == {"random", "idle", "scripted"}
 
 
 def test_scenarios_narrow_every_experiment_and_bring_back_those_a_small_scale_leaves_out():
-    plan = Plan(names=("training_set_size",), scale=0.001, scenarios=("seek_and_kill",))
+    plan = Plan.of("training_set_size", scale=0.001, scenarios=("seek_and_kill",))
     assert {run.scenario for run in plan.runs()} == {"seek_and_kill"}
 
 
@@ -54,15 +54,32 @@ def test_an_evaluation_joined_with_another_has_the_tasks_of_both_and_the_more_ep
 
 def test_plan_json_gathers_what_was_asked_for(tmp_path):
     assert read_plan(tmp_path) is None
-    one = Plan(names=("training_set_size",), scale=0.5, scenarios=("seek_and_kill",))
-    two = Plan(names=("rainbow_evaluation",), scale=0.5, scenarios=("health_gathering",))
-    write_plan(tmp_path, one)
-    both = write_plan(tmp_path, two)
-    assert both.names == ("training_set_size", "rainbow_evaluation")
-    assert both.scenarios == ("seek_and_kill", "health_gathering")
+    write_plan(tmp_path, Plan.of("training_set_size", scale=0.5, scenarios=("seek_and_kill",)))
+    both = write_plan(tmp_path, Plan.of("rainbow_evaluation", scale=0.5, scenarios=("health_gathering",)))
+    assert {(e.name, e.scenarios) for e in both.experiments()} == {
+        ("training_set_size", ("seek_and_kill",)),
+        ("rainbow_evaluation", ("health_gathering",)),
+    }
     assert read_plan(tmp_path) == both
-    assert write_plan(tmp_path, dataclasses.replace(two, scenarios=None)).scenarios is None
+    more = write_plan(tmp_path, Plan.of("training_set_size", scale=0.5, scenarios=("dodge_projectiles",)))
+    assert more.asked["training_set_size"] == ("seek_and_kill", "dodge_projectiles")
+    assert write_plan(tmp_path, Plan.of("training_set_size", scale=0.5)).asked["training_set_size"] is None
+    assert write_plan(tmp_path, Plan.of("training_set_size", scale=0.5, scenarios=("seek_and_kill",))).asked == {
+        "training_set_size": None,
+        "rainbow_evaluation": ("health_gathering",),
+    }
     assert {p.name for p in tmp_path.iterdir()} == {"plan.json", ".plan.lock"}
+
+
+@pytest.mark.parametrize("chosen", [None, ["seek_and_kill", "health_gathering"]])
+def test_the_first_schema_had_one_choice_of_scenarios_for_all_experiments(tmp_path, chosen):
+    names = ["training_set_size", "rainbow_evaluation"]
+    saved = {"schema": 1, "experiments": names, "scale": 0.5, "scenarios": chosen}
+    (tmp_path / "plan.json").write_text(json.dumps(saved))
+    wanted = Plan.of(*names, scale=0.5, scenarios=None if chosen is None else tuple(chosen))
+    assert read_plan(tmp_path) == wanted
+    assert write_plan(tmp_path, wanted) == wanted
+    assert json.loads((tmp_path / "plan.json").read_text())["experiments"] == dict.fromkeys(names, chosen)
 
 
 def test_commands_that_start_at_once_all_get_into_the_plan(tmp_path, monkeypatch):
@@ -72,18 +89,18 @@ def test_commands_that_start_at_once_all_get_into_the_plan(tmp_path, monkeypatch
         return found
 
     monkeypatch.setattr("gvz.experiments.plan.read_plan", read_slowly)
-    plans = [Plan(names=("rainbow_evaluation",), scenarios=(name,)) for name in scenarios()]
+    plans = [Plan.of("rainbow_evaluation", scenarios=(name,)) for name in scenarios()]
     with ThreadPoolExecutor(len(plans)) as pool:
         list(pool.map(write_plan, [tmp_path] * len(plans), plans))
-    assert set(read_plan(tmp_path).scenarios) == set(scenarios())
+    assert set(read_plan(tmp_path).asked["rainbow_evaluation"]) == set(scenarios())
 
 
 def test_scales_are_not_mixed(tmp_path):
-    write_plan(tmp_path, Plan(names=("rainbow_evaluation",)))
+    write_plan(tmp_path, Plan.of("rainbow_evaluation"))
     with pytest.raises(
         ConfigError, match=r"--scale: got 0.5, but the results there have 1, and scales cannot be mixed"
     ):
-        write_plan(tmp_path, Plan(names=("rainbow_evaluation",), scale=0.5))
+        write_plan(tmp_path, Plan.of("rainbow_evaluation", scale=0.5))
 
 
 @pytest.mark.parametrize("text", ["", "{}", '{"schema": 1}', "[]"])
@@ -95,14 +112,14 @@ def test_a_damaged_plan_is_named(tmp_path, text):
 
 def test_a_plan_of_another_schema_is_refused(tmp_path):
     (tmp_path / "plan.json").write_text(json.dumps({"schema": 9}))
-    with pytest.raises(ConfigError, match=r"plan\.json: schema 9, want 1"):
+    with pytest.raises(ConfigError, match=r"plan\.json: schema 9, want 1 or 2"):
         read_plan(tmp_path)
 
 
 def test_a_results_directory_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"--results: .*file/results cannot be written: Not a directory"):
-        write_plan(tmp_path / "file" / "results", Plan(names=("rainbow_evaluation",)))
+        write_plan(tmp_path / "file" / "results", Plan.of("rainbow_evaluation"))
 
 
 @pytest.mark.parametrize("text", ["", "3", "0/2", "3/2", "1/0", "a/b", "-1/2"])
@@ -116,20 +133,21 @@ def test_a_shard_is_two_numbers():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("names", "chosen", "message"),
     [
-        ({"names": ()}, "experiments: got none, want at least one name"),
-        ({"names": ("nope",)}, "unknown experiment 'nope'"),
-        ({"names": ("quick_comparison",), "scenarios": ("nope",)}, "unknown scenario 'nope'"),
+        ((), None, "experiments: got none, want at least one name"),
+        (("nope",), None, "unknown experiment 'nope'"),
+        (("quick_comparison",), ("nope",), "unknown scenario 'nope'"),
         (
-            {"names": ("quick_comparison",), "scenarios": ("seek_and_kill",)},
+            ("quick_comparison",),
+            ("seek_and_kill",),
             "--scenario: got seek_and_kill, but quick_comparison has defend_the_center",
         ),
     ],
 )
-def test_a_plan_that_cannot_be_run_is_refused(arguments, message):
+def test_a_plan_that_cannot_be_run_is_refused(names, chosen, message):
     with pytest.raises(ValueError, match=message):
-        Plan(**arguments)
+        Plan.of(*names, scenarios=chosen)
 
 
 def test_two_experiments_that_want_one_run_differently_are_refused():
@@ -139,6 +157,6 @@ def test_two_experiments_that_want_one_run_differently_are_refused():
         with pytest.raises(
             ConfigError, match=r"run rainbow_4task/.* is to have 400000 gradient steps .* gives it 200000"
         ):
-            Plan(names=("rainbow_evaluation", "rainbow_evaluation_twice"))
+            Plan.of("rainbow_evaluation", "rainbow_evaluation_twice")
     finally:
         del experiments()["rainbow_evaluation_twice"]

@@ -53,7 +53,11 @@ def _examples(name: str, num_lines: int = 3) -> bytes:
 
 
 CONFIG_JSON = (QUICK / "config.json").read_bytes()
-PLAN_JSON = (RESULTS / "quick_comparison" / "plan.json").read_bytes()
+PLAN_JSON = b"""{
+  "schema": 2,
+  "scale": 0.5,
+  "experiments": {"quick_comparison": null, "general_long": ["defend_the_center", "seek_and_kill"]}
+}"""
 
 
 def saved_config(directory: Path) -> Target:

@@ -143,7 +143,7 @@ def report_of_all(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     results, out = tmp_path_factory.mktemp("all"), tmp_path_factory.mktemp("report")
     names = ("training_difficulty", "training_set_size", "algorithm_comparison", "rainbow_evaluation")
-    plan = Plan(names=names, scale=0.0001)
+    plan = Plan.of(*names, scale=0.0001)
     write_experiments(results, plan, lambda played: 10.0 * played.episode + len(played.run.tasks), without=(MISSING,))
     videos = results / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111" / "videos"
     videos.mkdir()

@@ -15,7 +15,7 @@ def test_trained_agents_first_then_the_best_beside_players(tmp_path, experiments
     def score(played) -> float:
         return (60.0 if played.run.config == "rainbow_quick" else 20.0) + OFFSETS[played.run.seed] + played.episode
 
-    experiments_writer(tmp_path, Plan(names=("quick_comparison",), scale=0.2), score)  # 5 episodes; players: 22
+    experiments_writer(tmp_path, Plan.of("quick_comparison", scale=0.2), score)  # 5 episodes; players: 22
     scripted = tmp_path / "players" / "scripted.jsonl"
     rows = [json.loads(line) for line in scripted.read_text().splitlines()]
     scripted.write_text("".join(json.dumps({**row, "normalized_score": 90.0 + row["episode"]}) + "\n" for row in rows))

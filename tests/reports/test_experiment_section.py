@@ -24,7 +24,7 @@ def by_config(played) -> float:
 def compared(tmp_path_factory, experiments_writer):
     results = tmp_path_factory.mktemp("compared")
     missing = ("rainbow_quick/defend_the_center/train4/seed_3333",)
-    experiments_writer(results, Plan(names=("quick_comparison",), scale=0.2), by_config, without=missing)
+    experiments_writer(results, Plan.of("quick_comparison", scale=0.2), by_config, without=missing)
     return read_results([results])
 
 
@@ -54,7 +54,7 @@ def test_aggregates_have_mean_iqm_and_median(compared):
 
 
 def test_published_numbers_stand_below_ours_and_in_no_mean_of_ours(tmp_path, experiments_writer):
-    plan = Plan(names=("training_set_size",), scale=0.01, scenarios=("health_gathering", "seek_and_kill"))
+    plan = Plan.of("training_set_size", scale=0.01, scenarios=("health_gathering", "seek_and_kill"))
     experiments_writer(tmp_path, plan, lambda played: float(len(played.run.tasks)))
     results = read_results([tmp_path])
     rows = result_table(results, results.asked[0]).rows
@@ -77,7 +77,7 @@ def test_a_gate_has_a_table_over_its_gate_tasks_and_one_over_the_tasks_of_traini
         decisions = float(played.run.agent.rpartition("_")[2])
         return decisions + (50.0 if played.task in played.run.tasks else 0.0) + SEEDS[played.run.seed]
 
-    experiments_writer(tmp_path, Plan(names=("gate_reuse",), scale=0.2), score)
+    experiments_writer(tmp_path, Plan.of("gate_reuse", scale=0.2), score)
     results = read_results([tmp_path])
     (asked,) = results.asked
     gate, training = result_table(results, asked), result_table(results, asked, trained=True)
@@ -102,7 +102,7 @@ def test_a_level_is_the_mean_of_its_tasks_each_trained_alone(tmp_path, experimen
     def score(played) -> float:
         return 80.0 - 10 * parse_task(played.task).level + (4.0 if "gore" in played.task else 0.0)
 
-    plan = Plan(names=("training_difficulty",), scale=0.01, scenarios=("defend_the_center",))
+    plan = Plan.of("training_difficulty", scale=0.01, scenarios=("defend_the_center",))
     alone = "rainbow_4task/defend_the_center/complete/seed_1111"
     experiments_writer(tmp_path, plan, score, without=(alone,))
     results = read_results([tmp_path])

@@ -34,7 +34,7 @@ def test_own_kills_stand_below_the_scores_by_task_and_by_level(tmp_path):
 def test_the_gap_of_an_agent_is_shown_in_each_of_its_scenarios(tmp_path, experiments_writer):
     """It has a run in each scenario, all of one name."""
     scenarios = ("defend_the_center", "seek_and_kill")
-    plan = Plan(names=("general_on_policy",), scale=0.01, scenarios=scenarios)
+    plan = Plan.of("general_on_policy", scale=0.01, scenarios=scenarios)
     experiments_writer(tmp_path, plan, lambda played: 70.0 if played.task in played.run.tasks else 50.0)
     for section in scenario_sections(read_results([tmp_path]), tmp_path):
         [gap] = [table for table in section.blocks[0].tables if table.id.endswith("_gap")]
