@@ -55,6 +55,12 @@ def parse(arguments: Sequence[str]) -> Launch:
         ConfigError, TaskError: an invalid value. SystemExit(2): flags that do not parse.
     """
     name = argument(arguments, "--config") or DEFAULT_CONFIG
+    if argument(arguments, "--tasks") is not None:
+        for flag in ("--scenario", "--training-set"):
+            if (value := argument(arguments, flag)) is not None:
+                raise ConfigError(
+                    f"{flag}: got {value} and also --tasks, which leave it without effect; want one of them"
+                )
     agent = argument(arguments, "--agent.name")
 
     def parsed(config: RunConfig) -> Launch:
@@ -71,7 +77,7 @@ def parse(arguments: Sequence[str]) -> Launch:
 
 def resumed_config(run: RunDir, config: RunConfig) -> RunConfig:
     """`config` with the run's first number of actors and games, if the command does not set them."""
-    saved = run.saved_config(config.agent_file)
+    saved = run.saved_config(config.own_files)
     if saved is None or config.mode == "sync":
         return config
     unset = [name for name in ("num_actors", "games_per_actor") if getattr(config.actors, name) is None]
@@ -91,9 +97,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 raise ConfigError("--fresh: got it for a group of learner processes; give all another --run-dir")
             if launch.fresh and (moved := move_aside(directory)) is not None:
                 print(f"moved the old run to {moved}", file=sys.stderr)
-            with RunDir(Path(directory)) as run:
+            with RunDir(Path(directory), in_another=launch.run.group.own_id > 0) as run:
                 config = resumed_config(run, launch.run)
-                run.check_resumable(config)
+                for note in run.check_resumable(config):
+                    print(note, file=sys.stderr)
                 stop.importing = True
                 from gvz.run.train import train  # imports jax, so only after the input is checked
 

@@ -258,7 +258,8 @@ class LearnerConfig:
 class OnPolicyConfig:
     """The learner of agents without a replay: rollouts of all games, each learnt from and dropped.
 
-    Defaults: PPO's for Atari, Schulman et al. 2017, Table 5 (its 3 epochs, and batches of a quarter of a rollout).
+    Defaults: PPO's for Atari, Schulman et al. 2017, Table 5 (its 3 epochs, and batches of a quarter of a rollout), but
+    for the learning rate, which falls there to 0. Adam's epsilon and the clipping are those of OpenAI's published code.
     """
 
     total_updates: Annotated[int, Range(1, MOST_UPDATES)] = 200_000

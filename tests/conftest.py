@@ -19,7 +19,7 @@ from tests.learner import seeds
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "xla"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
-os.environ["XDG_RUNTIME_DIR"] = tempfile.mkdtemp(prefix="gvz-tests-")
+os.environ["GVZ_RUNTIME_DIR"] = tempfile.mkdtemp(prefix="gvz-tests-")
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job; programs under test would inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -35,7 +35,7 @@ def _clean_up() -> None:
     from gvz.core import janitor
 
     janitor.clean_dead_instances()
-    shutil.rmtree(os.environ["XDG_RUNTIME_DIR"], ignore_errors=True)
+    shutil.rmtree(os.environ["GVZ_RUNTIME_DIR"], ignore_errors=True)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

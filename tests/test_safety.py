@@ -170,7 +170,7 @@ def test_private_directories_and_the_records_of_them_are_private_whatever_the_um
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     tmp_path.chmod(0o700)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("GVZ_RUNTIME_DIR", str(tmp_path))
     with janitor.temporary_directory() as directory:
         assert stat.S_IMODE(directory.stat().st_mode) == 0o700
         assert set(modes(tmp_path).values()) == {0o700, 0o600}

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from gvz.core.errors import ConfigError
+
 if TYPE_CHECKING:
     from gvz.cluster.plan import Capacity, Cluster, Costs
     from gvz.run.config import RunConfig
@@ -35,7 +37,7 @@ class PlanCluster:
     publish_period_s: float = 1.0
     """seconds between publications of parameters"""
     compress: bool = True
-    """frames travel compressed"""
+    """frames travel compressed; --no-compress: as they are"""
     measure: bool = False
     """measure this machine first (half a minute, best when it is idle), instead of taking constants of records"""
     json: bool = False
@@ -47,6 +49,11 @@ class PlanCluster:
         from gvz.run.config_files import load_config
 
         config = load_config(self.config)
+        if config.agent.on_policy:
+            raise ConfigError(
+                f"--config: got {self.config}, whose agent {config.agent.name} learns on-policy; actor hosts are for "
+                "agents that learn from a replay"
+            )
         ask = self._cluster(config)
         if self.measure:
             from gvz.cluster.measure import measure

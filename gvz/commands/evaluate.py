@@ -12,6 +12,7 @@ import tyro
 
 from gvz.core.env_config import EnvConfig, Profile
 from gvz.core.errors import EXIT_INTERRUPTED, ConfigError
+from gvz.core.registry import OwnFiles
 from gvz.core.stop import StopRequest
 from gvz.evaluation.selection import ALL_TASKS, TaskSelection
 from gvz.evaluation.simple import SimplePlayerName
@@ -44,6 +45,8 @@ class Evaluate:
     scenario's simple script, which gets names and places of what is in sight"""
     agent: Path | None = None
     """the Python file of the run's agent, if it is in a file of its own: playing executes it"""
+    encoder: Path | None = None
+    """likewise, of its encoder"""
     checkpoints: tuple[str, ...] = ("newest",)
     """which of a run's policies: newest, all, last5 (or another number), or numbers of gradient steps"""
     select: Annotated[TaskSelection, tyro.conf.arg(name="")] = ALL_TASKS
@@ -68,8 +71,9 @@ class Evaluate:
 
         player_specs = self._player_specs()
         files: dict[Path, RecordFile] = {}
+        stop = StopRequest()
         try:
-            with StopRequest() as stop:
+            with stop:
                 held: dict[PlayerSpec, RecordFile] = {}
                 jobs = []
                 for player_spec, (tasks, out) in player_specs.items():
@@ -82,20 +86,24 @@ class Evaluate:
                 self._print_scores(player_spec, tasks, held[player_spec].rows)
         except KeyboardInterrupt:
             print("interrupted; the same command goes on from here", file=sys.stderr)
-            return EXIT_INTERRUPTED
+            return stop.exit_code or EXIT_INTERRUPTED
         finally:
             for file in files.values():
                 file.close()
         return 0
 
     def _check(self, workers: int) -> None:
-        if (self.player is None) == (not self.run_dirs):
-            raise ConfigError("evaluate: want run directories or --player")
+        if self.player is not None and self.run_dirs:
+            raise ConfigError(f"evaluate: got --player {self.player} and also {self.run_dirs[0]}, want one of them")
+        if self.player is None and not self.run_dirs:
+            raise ConfigError("evaluate: want --player or run directories (before --tasks, which takes what follows)")
+        if not self.checkpoints:
+            raise ConfigError("--checkpoints: got none, want newest, all, last5 (or another number), or gradient steps")
         for name, value in (("episodes", self.episodes), ("workers", workers)):
             if value < 1:
                 raise ConfigError(f"--{name}: got {value}, want at least 1")
-        if any(seed < 0 for seed in self.seeds) or not self.seeds:
-            raise ConfigError(f"--seeds: got {list(self.seeds)}, want numbers of at least 0")
+        if not self.seeds or len(set(self.seeds)) < len(self.seeds) or not all(0 <= n < 2**63 for n in self.seeds):
+            raise ConfigError(f"--seeds: got {list(self.seeds)}, want different numbers from 0 to 2^63 - 1")
 
     def _player_specs(self) -> "dict[PlayerSpec, tuple[tuple[Task, ...], Path]]":
         """Who plays -> what, and the record file."""
@@ -108,7 +116,7 @@ class Evaluate:
             return {simple_player(self.player, EnvConfig(profile=self.profile)): (self.select.resolve(), out)}
         found = {}
         for run_dir in dict.fromkeys(map(run_directory, self.run_dirs)):
-            config = read_run_config(run_dir, self.agent)
+            config = read_run_config(run_dir, OwnFiles(self.agent, self.encoder))
             tasks = self.select.of_run([scenario.id for scenario in config.table.scenarios])
             check_tasks(config, tasks)
             out = run_dir / "evaluation.jsonl" if self.out is None else self.out

@@ -52,8 +52,8 @@ class TrainSegmenter:
     """processes that play and change frames while this one learns, to keep a GPU busy; with 0 this one does it all.
     They share the frames in files of the temporary directory (TMPDIR), 185 KB each"""
     tints_and_patches: bool = True
-    """whether walls and floors of some frames get tints and patches: better in Health Gathering, worse in Seek and Kill
-    (docs/FINDINGS.md)"""
+    """walls and floors of some frames get tints and patches; --no-tints-and-patches: of none. With them, the network is
+    better in Health Gathering, worse in Seek and Kill (docs/FINDINGS.md)"""
     seed: int = 1111
     """of the first parameters and of the changes of frames"""
 

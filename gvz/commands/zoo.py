@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import tyro
 
 from gvz.core.errors import ConfigError
+from gvz.core.registry import OwnFiles
 from gvz.evaluation.zoo import EVALUATION, PREFIX, pack, run_directory, score_card, zoo_names
 
 if TYPE_CHECKING:
@@ -35,10 +36,14 @@ class Zoo:
     renewed by the episodes that were evaluated of it"""
     name: str | None = None
     """of the policy that is added"""
+    replace: bool = False
+    """take the place of another policy of that name"""
     checkpoint: str = "newest"
     """which of the run's policies is added: gradient steps, or newest"""
     agent: Path | None = None
     """the Python file of the run's agent, if it is in a file of its own"""
+    encoder: Path | None = None
+    """likewise, of its encoder"""
 
     def run(self) -> int:
         """Prints the policies, or what was added."""
@@ -47,7 +52,9 @@ class Zoo:
         if self.add is not None and self.name is not None:
             if self.names:
                 raise ConfigError(f"zoo: got {' '.join(self.names)} beside --add; the policy's name is that of --name")
-            packed = pack(run_directory(self.add), self.name, self.checkpoint, self.agent)
+            if self.name in zoo_names() and not self.replace and str(self.add) != f"{PREFIX}{self.name}":
+                raise ConfigError(f"--name: the zoo has a policy {self.name} already; give another name, or --replace")
+            packed = pack(run_directory(self.add), self.name, self.checkpoint, OwnFiles(self.agent, self.encoder))
             print(f"{packed.file}: {packed.num_updates:,} updates, {packed.num_bytes:,} bytes")
             if not packed.num_episodes:
                 print(f"no score card yet: gvz evaluate {PREFIX}{self.name}, then add {PREFIX}{self.name} again")

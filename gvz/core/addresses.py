@@ -19,6 +19,9 @@ def resolve(host: str, where: str) -> str:
 
 
 def require_private(ip: str, where: str, advice: str) -> None:
-    """Raises ConfigError for an address that the whole Internet can reach; `advice` ends the message."""
-    if ipaddress.ip_address(ip).is_global:
+    """Raises ConfigError for an address that the whole Internet may reach; `advice` ends the message."""
+    address = ipaddress.ip_address(ip)
+    if address.is_global:
         raise ConfigError(f"{where}: {ip} is a public address; {advice}")
+    if address.is_unspecified:
+        raise ConfigError(f"{where}: {ip} stands for all addresses of a machine, public ones too; {advice}")

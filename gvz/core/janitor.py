@@ -54,25 +54,26 @@ ViZDoom's client may still start an engine."""
 
 
 def runtime_dir() -> Path:
-    """This user's private directory for records and locks (made if missing, mode 0700).
+    """This user's private directory for records and locks (made if missing, mode 0700): in $GVZ_RUNTIME_DIR, or else
+    the temporary directory. All processes of a user have to find it, so it is not in $XDG_RUNTIME_DIR, which cron,
+    containers and batch jobs lack.
 
     Raises:
         ResourceError: the directory exists but is not ours alone, or cannot be made.
     """
-    base = os.environ.get("XDG_RUNTIME_DIR")
-    if not base or not os.access(base, os.W_OK | os.X_OK):
-        base = tempfile.gettempdir()
-    path = Path(base) / f"gvizdoom-{os.getuid()}"
+    path = Path(os.environ.get("GVZ_RUNTIME_DIR") or tempfile.gettempdir()) / f"gvizdoom-{os.getuid()}"
     try:
         path.mkdir(mode=0o700, exist_ok=True)
         found = path.lstat()
     except OSError as error:
-        raise ResourceError(f"runtime directory {path}: {error}; set TMPDIR to a writable directory") from error
+        raise ResourceError(
+            f"runtime directory {path}: {error}; set GVZ_RUNTIME_DIR or TMPDIR to a writable directory"
+        ) from error
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
         raise ResourceError(
             f"runtime directory {path}: got owner {found.st_uid}, mode {stat.filemode(found.st_mode)}, "
             f"want a directory of user {os.getuid()} that nobody else can enter (drwx------); "
-            "remove it, or set TMPDIR to another directory"
+            "remove it, or set GVZ_RUNTIME_DIR to another directory"
         )
     return path
 

@@ -8,9 +8,19 @@ from importlib import import_module
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 from gvz.core.errors import ConfigError, nearest
+
+
+class OwnFiles(NamedTuple):
+    """Python files outside the package that a run is made of. They are executed, so only the user names them."""
+
+    agent: Path | None = None
+    encoder: Path | None = None
+
+
+NO_OWN_FILES = OwnFiles()
 
 
 def discover(package: str, constant: str | None = None) -> dict[str, ModuleType]:
@@ -49,7 +59,7 @@ def find(package: str, constant: str, name: str, field: str) -> Any:
         field: the field of the configuration that `name` was read from; errors begin with it.
 
     Raises:
-        ConfigError: no such module or file, or the file does not set the constant.
+        ConfigError: no such module or file, the file cannot be executed, or it does not set the constant.
     """
     if name.endswith(".py"):
         file = Path(name).resolve()
@@ -82,5 +92,9 @@ def _module_in_file(file: Path) -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = sys.modules[name] = module_from_spec(spec)
-    spec.loader.exec_module(module)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # the file is the user's own program: anything may come out of it
+        del sys.modules[name]
+        raise ConfigError(f"{file}: {type(error).__name__}: {error}") from error
     return module

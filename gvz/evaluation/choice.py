@@ -9,6 +9,7 @@ import tyro
 
 from gvz.core.env_config import EnvConfig, Profile
 from gvz.core.errors import ConfigError
+from gvz.core.registry import OwnFiles
 from gvz.evaluation.simple import SimplePlayerName
 from gvz.scenarios.base import Task
 from gvz.tasks import parse_task
@@ -27,9 +28,11 @@ class EpisodeChoice:
     ] = None
     """a run directory, or zoo:NAME (see gvz zoo): its policy plays greedily, noise off"""
     player: SimplePlayerName | None = None
-    """instead: random, idle, or the scenario's simple script"""
+    """instead: random, idle, sweep (a fixed sequence of buttons), or the scenario's simple script"""
     agent: Path | None = None
     """the Python file of the run's agent, if it is in a file of its own: playing executes it"""
+    encoder: Path | None = None
+    """likewise, of its encoder"""
     checkpoint: str = "newest"
     """which of the run's policies: gradient steps, or newest"""
     task: str | None = None
@@ -51,18 +54,20 @@ class EpisodeChoice:
         from gvz.evaluation.trained import check_tasks, find_checkpoints, read_run_config, trained_player
         from gvz.evaluation.zoo import run_directory
 
-        if (self.player is None) == (self.run_dir is None):
+        if self.player is not None and self.run_dir is not None:
+            raise ConfigError(f"got --player {self.player} and also {self.run_dir}, want one of them")
+        if self.player is None and self.run_dir is None:
             raise ConfigError("want a run directory or --player")
         for name, value in (("episode", self.episode), ("seed", self.seed)):
-            if value < 0:
-                raise ConfigError(f"--{name}: got {value}, want at least 0")
+            if not 0 <= value < 2**63:
+                raise ConfigError(f"--{name}: got {value}, want a number from 0 to 2^63 - 1")
         if self.run_dir is None:
             assert self.player is not None
             if self.task is None:
                 raise ConfigError("--task: want a task id, for example defend_the_center/gore (gvz tasks lists them)")
             return simple_player(self.player, EnvConfig(profile=self.profile)), parse_task(self.task)
         run_dir = run_directory(self.run_dir)
-        config = read_run_config(run_dir, self.agent)
+        config = read_run_config(run_dir, OwnFiles(self.agent, self.encoder))
         task = config.table.tasks[0] if self.task is None else parse_task(self.task)
         check_tasks(config, [task])
         found = find_checkpoints(run_dir, [self.checkpoint])

@@ -56,6 +56,13 @@ class PlayerSpec:
     recycle_episodes: int | None = None
     """of DoomEnv; 0 for players that do not see fuzz, the only thing that a fresh engine changes"""
 
+    def make_env(self, task: str) -> "DoomEnv":
+        """A game of a task by these rules, without what is for training alone."""
+        from gvz.env import DoomEnv
+
+        env = dataclasses.replace(self.env, reward_weights=(), repeat_action_probability=0.0)
+        return DoomEnv(task, env, recycle_episodes=self.recycle_episodes)
+
 
 def episode_seed(task: str, episode: int, base_seed: int = 0) -> int:
     """The engine's seed of an evaluation episode, 31 bits: the same for every player, run and machine."""
@@ -179,7 +186,7 @@ class _Worker:
     def __init__(self) -> None:
         self._player: tuple[int, Player] | None = None
         self._env: DoomEnv | None = None
-        self._recycle_episodes: int | None = None
+        self._rules: tuple[str, EnvConfig, int | None] | None = None
 
     def play(self, player_spec: PlayerSpec, key: int, episode: Episode) -> Row:
         """Plays an episode. `key` is the same for the same player_spec, however often it was pickled."""
@@ -188,15 +195,10 @@ class _Worker:
         return play_episode(self._game(player_spec, episode.task), self._player[1], episode.episode, episode.base_seed)
 
     def _game(self, player_spec: PlayerSpec, task: str) -> "DoomEnv":
-        # what is for training alone
-        env = dataclasses.replace(player_spec.env, reward_weights=(), repeat_action_probability=0.0)
-        wanted = (task, env, player_spec.recycle_episodes)
-        if self._env is None or (self._env.task.id, self._env.config, self._recycle_episodes) != wanted:
-            from gvz.env import DoomEnv
-
+        rules = (task, player_spec.env, player_spec.recycle_episodes)
+        if self._env is None or self._rules != rules:
             self.close()
-            self._recycle_episodes = player_spec.recycle_episodes
-            self._env = DoomEnv(task, env, recycle_episodes=player_spec.recycle_episodes)
+            self._env, self._rules = player_spec.make_env(task), rules
         return self._env
 
     def close(self) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from gvz.core.errors import ConfigError
 from gvz.scenarios.base import Suite, Task
-from gvz.tasks import TaskSet, named_tasks, parse_task
+from gvz.tasks import TaskSet, named_tasks, parse_task, scenario_named
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +30,8 @@ class TaskSelection:
         Raises:
             TaskError: an unknown name. ConfigError: ids together with another choice, or no task fits the choice.
         """
+        if self.scenario is not None and self.suite != "core" and scenario_named(self.scenario).suite != self.suite:
+            raise ConfigError(f"--suite: got {self.suite} and also --scenario {self.scenario}, which is none of it")
         if not self.tasks:
             return self._named((self.scenario,))
         if (self.scenario, self.split, self.level) != (None, None, None):

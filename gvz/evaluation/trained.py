@@ -19,8 +19,10 @@ import numpy as np
 
 from actors.preprocess import ObservationBatch
 from gvz.core.errors import CheckpointError, ConfigError
+from gvz.core.registry import NO_OWN_FILES, OwnFiles
 from gvz.evaluation.episode_log import row_identity
 from gvz.evaluation.play import PlayerSpec
+from gvz.evaluation.zoo import run_directory
 from gvz.run.config import RunConfig
 from gvz.run.config_files import config_from_dict
 from gvz.segmentation import KEPT_SEGMENTERS, segmenter_file, with_kept_segmenters
@@ -48,19 +50,21 @@ class Values:
     """of what it sees, if the agent has one; with action values, the largest of them"""
 
 
-def read_run_config(run_dir: Path, agent_file: Path | None = None) -> RunConfig:
+def read_run_config(run_dir: Path, own_files: OwnFiles = NO_OWN_FILES) -> RunConfig:
     """The configuration a run was trained with, and the segmentation networks that the run has kept.
 
-    `agent_file` is the Python file of its agent, if that is none of learner/agents; playing executes it.
+    `own_files` are the Python files of its agent and encoder, if those are none of this package; playing executes them.
 
     Raises:
-        ConfigError: not a run directory, its config.json is damaged, or its agent is in a file that is not given.
+        ConfigError: not a run directory, its config.json is damaged, or a file of its own is not given.
     """
     file = run_dir / "config.json"
     try:
-        config = config_from_dict(json.loads(file.read_text()), agent_file)
+        config = config_from_dict(json.loads(file.read_text()), own_files)
     except OSError as error:
-        raise ConfigError(f"{run_dir} is not a run directory ({file.name}: {error.strerror})") from error
+        inside = sorted(run_dir.glob("*/config.json"))
+        hint = f"; did you mean {inside[0].parent}?" if inside else ""
+        raise ConfigError(f"{run_dir} is not a run directory ({file.name}: {error.strerror}){hint}") from error
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{file} cannot be read: {error}") from error
     return dataclasses.replace(config, env=with_kept_segmenters(config.env, run_dir / KEPT_SEGMENTERS))
@@ -93,7 +97,10 @@ def find_checkpoints(run_dir: Path, wanted: Sequence[str]) -> list[int]:
     directory = run_dir / "policies"
     known = sorted(int(p.name) for p in directory.glob("*") if p.is_dir() and p.name.isdecimal())
     if not known:
-        raise ConfigError(f"{directory} holds no policy yet; the first comes with the first checkpoint")
+        raise ConfigError(
+            f"{directory} holds no policy: a run's first one comes with its first checkpoint, and published results "
+            "have records alone (`gvz zoo` lists policies to play)"
+        )
     chosen: set[int] = set()
     for text in wanted:
         if last := re.fullmatch(r"last(\d{1,9})", text):
@@ -138,10 +145,26 @@ def trained_player(run_dir: Path, config: RunConfig, num_updates: int) -> Player
         "params": digest.hexdigest(),
     }
     return PlayerSpec(
-        make_player=partial(TrainedPlayer, run_dir, num_updates, config.agent_file),
+        make_player=partial(TrainedPlayer, run_dir, num_updates, config.own_files),
         env=dataclasses.replace(config.env, repeat_action_probability=0.0),  # of training alone
         identity=row_identity(player, config.env),
     )
+
+
+def load_player(run: str | Path, checkpoint: str = "newest", own_files: OwnFiles = NO_OWN_FILES) -> PlayerSpec:
+    """A policy to play with: its `make_player` gives the player, its `make_env` the game of a task.
+
+    Args:
+        run: a run directory, or "zoo:NAME".
+        checkpoint: which of the run's policies: gradient steps, or "newest".
+        own_files: as for `read_run_config`.
+
+    Raises:
+        ConfigError, CheckpointError: there is no such policy, or it is damaged.
+    """
+    run_dir = run_directory(Path(run))
+    [num_updates] = find_checkpoints(run_dir, [checkpoint])
+    return trained_player(run_dir, read_run_config(run_dir, own_files), num_updates)
 
 
 class TrainedPlayer:
@@ -151,8 +174,8 @@ class TrainedPlayer:
         ConfigError, CheckpointError: it cannot be read.
     """
 
-    def __init__(self, run_dir: Path, num_updates: int, agent_file: Path | None = None):
-        config = read_run_config(run_dir, agent_file)
+    def __init__(self, run_dir: Path, num_updates: int, own_files: OwnFiles = NO_OWN_FILES):
+        config = read_run_config(run_dir, own_files)
         agent, params = read_params(run_dir, config, num_updates)
         import jax
 

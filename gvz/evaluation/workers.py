@@ -117,7 +117,8 @@ class _Processes(Executor):
 def _work(parent_pid: int, pipe: Connection) -> None:
     """The life of a process: calls come over the pipe, results or errors go back."""
     janitor.die_with_parent(parent_pid)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    for number in (signal.SIGINT, signal.SIGTERM):  # they go to the whole process group; the parent ends this process
+        signal.signal(number, signal.SIG_IGN)
     os.set_inheritable(pipe.fileno(), False)  # it is to close with this process, not with its engines
     os.environ |= one_core()
     with contextlib.suppress(EOFError, ConnectionError):

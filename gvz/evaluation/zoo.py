@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from gvz.core.cache import cache_directory
 from gvz.core.errors import ConfigError, ResourceError, nearest
+from gvz.core.registry import NO_OWN_FILES, OwnFiles
 
 if TYPE_CHECKING:
     import numpy as np
@@ -83,7 +84,7 @@ class Packed:
     """evaluation episodes of this very policy, its score card"""
 
 
-def pack(run_dir: Path, name: str, checkpoint: str = "newest", agent_file: Path | None = None) -> Packed:
+def pack(run_dir: Path, name: str, checkpoint: str = "newest", own_files: OwnFiles = NO_OWN_FILES) -> Packed:
     """Puts a policy of a run into the zoo. Its parameters are rounded to bfloat16: less than half of the bytes.
 
     Only evaluation episodes of the rounded parameters go with it. So pack, evaluate `zoo:NAME`, and pack `zoo:NAME`
@@ -93,7 +94,7 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", agent_file: Path 
         run_dir: of the run.
         name: of the policy in the zoo.
         checkpoint: which of its policies, as for `gvz evaluate`.
-        agent_file: of an agent in a file of its own.
+        own_files: as for `read_run_config`.
 
     Raises:
         ConfigError: not a run, no such policy, a name that no file can have, or a file that would be too large.
@@ -107,7 +108,7 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", agent_file: Path 
 
     if not name.replace("_", "").replace("-", "").isalnum():
         raise ConfigError(f"zoo: got name {name!r}, want letters, digits, _ and -")
-    config = read_run_config(run_dir, agent_file)
+    config = read_run_config(run_dir, own_files)
     [num_updates] = find_checkpoints(run_dir, [checkpoint])
     _, params = read_params(run_dir, config, num_updates)
     with tempfile.TemporaryDirectory() as temporary:
@@ -123,7 +124,7 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", agent_file: Path 
         saved = config_to_dict(dataclasses.replace(config, env=env, run_dir=None))  # no path of this machine
         (packed / RECORDS[0]).write_text(json.dumps(saved, indent=2) + "\n")
         checkpoints.write(packed / "policies" / str(num_updates), _rounded(params), {"num_updates": num_updates})
-        player = trained_player(packed, read_run_config(packed, agent_file), num_updates)
+        player = trained_player(packed, read_run_config(packed, own_files), num_updates)
         rows = score_card(records.read_stored(run_dir / EVALUATION)[0])
         rows = [row for row in rows if player.identity.items() <= row.items()]
         (packed / EVALUATION).write_text("".join(json.dumps(row) + "\n" for row in rows))

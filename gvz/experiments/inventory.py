@@ -114,8 +114,12 @@ def last_processor_s(directory: Path) -> float:
 
 
 def _last_number(directory: Path, field: str, kind: type[Number]) -> Number:
+    file = directory / "metrics.jsonl"
+    if not file.exists():  # it may be a finished run's, compressed
+        rows = (row for row in reversed(records.read_stored(file)[0]) if field in row)
+        return kind(next(rows, {field: kind()})[field])
     for num_bytes in (records.TAIL_BYTES, 2 * records.MAX_LINE_LENGTH):  # a row with many tasks is long
-        for line in reversed(records.last_lines(directory / "metrics.jsonl", num_bytes)):
+        for line in reversed(records.last_lines(file, num_bytes)):
             try:
                 return kind(json.loads(line)[field])
             except (ValueError, KeyError, TypeError, OverflowError, RecursionError):  # half-written, or no row of ours

@@ -74,9 +74,9 @@ class RunJob:
             following = Command(step="train", arguments=arguments, total=goal, unit=unit)
         elif now.missing:
             which = (directory, "--checkpoints", *map(str, now.missing))
-            agent_file = self.run.run_config.agent_file
-            agent = () if agent_file is None else ("--agent", str(agent_file))
-            arguments = ("-m", "gvz.cli", "evaluate", *which, *agent, *_episodes(self.evaluation))
+            own = self.run.run_config.own_files._asdict().items()
+            files = [text for name, file in own if file is not None for text in (f"--{name}", str(file))]
+            arguments = ("-m", "gvz.cli", "evaluate", *which, *files, *_episodes(self.evaluation))
             following = Command(step="evaluate", arguments=arguments, total=total, unit="episodes")
         return Outlook(next=following, begun=now.num_updates > 0, text=text)
 
@@ -86,7 +86,7 @@ class RunJob:
         if not file.exists() or not self._trained():
             return []
         try:
-            saved = config_from_dict(json.loads(file.read_text()), self.run.run_config.agent_file)
+            saved = config_from_dict(json.loads(file.read_text()), self.run.run_config.own_files)
         except (ValueError, OSError, RecursionError) as error:
             return [f"{file} cannot be read: {error}"]
         games = {"actors.num_actors": saved.num_actors, "actors.games_per_actor": saved.games_per_actor}

@@ -12,6 +12,7 @@ from actors.config import MAX_LANES, ActorsConfig
 from gvz.cluster.config import ClusterConfig
 from gvz.core.env_config import EnvConfig, leaves
 from gvz.core.errors import ConfigError
+from gvz.core.registry import OwnFiles
 from gvz.run.curriculum_config import CurriculumConfig, check_curriculum
 from gvz.run.group_config import GroupConfig
 from gvz.task_table import TaskTable, task_table
@@ -230,9 +231,10 @@ class RunConfig:
         return self.agent.support(*self.table.return_range)
 
     @property
-    def agent_file(self) -> Path | None:
-        """The Python file of an agent that is not in learner/agents."""
-        return Path(self.agent.name) if self.agent.name.endswith(".py") else None
+    def own_files(self) -> OwnFiles:
+        """Those of the agent and the encoder, if they are none of this package."""
+        found = (Path(name) if name.endswith(".py") else None for name in (self.agent.name, self.agent.encoder))
+        return OwnFiles(*found)
 
     def with_support(self, support: tuple[float, float] | None) -> "RunConfig":
         """The same with atoms of this range, if its agent has atoms."""

@@ -12,6 +12,7 @@ from typing import Any, get_args, get_type_hints
 
 from gvz.core.env_config import typed
 from gvz.core.errors import ConfigError, TaskError, nearest
+from gvz.core.registry import NO_OWN_FILES, OwnFiles
 from gvz.run.config import RunConfig, with_agent
 from gvz.tasks import scenario_named
 from learner.config import AgentConfig, LearnerConfig, OnPolicyConfig, agent_config_class
@@ -133,15 +134,15 @@ def config_to_dict(config: RunConfig) -> dict[str, Any]:
     }
 
 
-def config_from_dict(saved: Any, agent_file: Path | None = None) -> RunConfig:
+def config_from_dict(saved: Any, own_files: OwnFiles = NO_OWN_FILES) -> RunConfig:
     """The configuration that `config_to_dict` wrote, with the derived numbers it ran with made explicit.
 
     Args:
         saved: what was written, by this version or by one before it.
-        agent_file: the Python file of the run's agent, if it has one; it is executed. The path that `saved` has is not.
+        own_files: the Python files of the run, if it has any. They are executed; the paths that `saved` has are not.
 
     Raises:
-        ConfigError: another schema, an unknown or missing key, a wrong type or value, or an agent's file is missing.
+        ConfigError: another schema, an unknown or missing key, a wrong type or value, or a file is missing.
     """
     if isinstance(saved, dict) and saved.get("schema") == 1:
         saved = _from_schema_1(saved)
@@ -149,16 +150,9 @@ def config_from_dict(saved: Any, agent_file: Path | None = None) -> RunConfig:
         raise ConfigError(f"saved configuration: want a map with schema {CONFIG_SCHEMA}")
     plain, kind = saved.get("config"), AgentConfig
     match plain:
-        case {"agent": {"name": str(name), **agent}}:
-            if name.endswith(".py"):
-                if agent_file is None:
-                    raise ConfigError(
-                        f"its agent is a Python file ({name}), which is never executed only because a run directory "
-                        f"names it; if you trust that file, name it: --agent {name}"
-                    )
-                name = str(agent_file)
-                plain = {**plain, "agent": {**agent, "name": name}}
-            kind = agent_config_class(name)
+        case {"agent": {"name": str()} as agent}:
+            plain = {**plain, "agent": _with_own_files(agent, own_files)}
+            kind = agent_config_class(plain["agent"]["name"])
         case _:  # what is wrong is said below
             pass
     resolved = _from_plain(_Resolved, saved.get("resolved"), "resolved")
@@ -172,6 +166,19 @@ def config_from_dict(saved: Any, agent_file: Path | None = None) -> RunConfig:
     if resolved.tasks != (tasks := config.table.ids):
         raise ConfigError(f"resolved.tasks: got {list(resolved.tasks)}, but the configuration has {list(tasks)}")
     return config.with_support(resolved.support)
+
+
+def _with_own_files(agent: dict[str, Any], own_files: OwnFiles) -> dict[str, Any]:
+    named = dict(agent)
+    for what, field, file in (("agent", "name", own_files.agent), ("encoder", "encoder", own_files.encoder)):
+        if str(agent.get(field)).endswith(".py"):
+            if file is None:
+                raise ConfigError(
+                    f"its {what} is a Python file ({agent[field]}), which is never executed only because a run "
+                    f"directory names it; if you trust that file, name it: --{what} {agent[field]}"
+                )
+            named[field] = str(file)
+    return named
 
 
 def build_config(plain: Any, where: str, agent: type[AgentConfig]) -> RunConfig:

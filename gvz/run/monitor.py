@@ -46,6 +46,7 @@ class Monitor:
 
     def __init__(self, config: RunConfig, parts: RunParts, progress: Progress, telemetry: Telemetry, counts: Counts):
         self._config, self._progress, self._telemetry, self._counts = config, progress, telemetry, counts
+        self._num_actors = config.num_actors  # before cores are kept for actors: it may follow from their number
         self._num_slots, self._batch_size = parts.learner.num_slots, parts.learner.batch_size
         self._expected, self._warned = _expected(config, parts), set[str]()
         self._rates, self._last_look_s, self._loss = Rates(), 0.0, float("nan")
@@ -93,7 +94,7 @@ class Monitor:
                 "actors/decisions_per_s": counts.env_steps,
                 "actors/frames_per_s": counts.env_steps * self._config.env.frame_skip,
                 "learner/wait_share": statistics.waited_for_records_s,
-                "actors/wait_share": statistics.waited_for_space_s / self._config.num_actors,
+                "actors/wait_share": statistics.waited_for_space_s / self._num_actors,
             }
         )
         return {

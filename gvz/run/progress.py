@@ -99,7 +99,7 @@ def _figures(status: Status) -> tuple[str, ...]:
         f"{row['learner/updates_per_s']:.1f} updates/s",
         f"{row['actors/decisions_per_s']:,.0f} decisions/s",
         f"{row['actors/frames_per_s']:,.0f} frames/s",
-        f"loss {status.loss:.4f}",
+        "loss -" if math.isnan(status.loss) else f"loss {status.loss:.4f}",
         f"replay {row['replay/fill_share']:.0%}",
         f"learner waits {row['learner/wait_share']:.0%}",
         f"actors wait {row['actors/wait_share']:.0%}",

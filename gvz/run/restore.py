@@ -27,6 +27,7 @@ def restore(run: RunDir, template: Any, group: Group, say: Callable[[str], None]
             )
         say(f"new run in {run.path}")
         run.truncate_records(dict.fromkeys(run.record_lengths(), 0))
+        run.discard_policies(0)
         return None
     for damage in restored.damage:
         say(f"damaged checkpoint passed over: {damage}")
@@ -42,7 +43,7 @@ def note_start(run: RunDir, restored: Restored | None) -> None:
 
 @contextlib.contextmanager
 def state_checked(run: RunDir, restored: Restored | None) -> Generator[None]:
-    """Cuts the records back; within it, a host state that no run can go on from is named.
+    """Cuts the records and the policies back; within it, a host state that no run can go on from is named.
 
     Raises:
         CheckpointError: the checkpoint's host state is not one of a run.
@@ -50,6 +51,7 @@ def state_checked(run: RunDir, restored: Restored | None) -> Generator[None]:
     try:
         if restored is not None:
             run.truncate_records(restored.host["records"])
+            run.discard_policies(restored.num_updates)
         yield
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         if restored is None or isinstance(error, GvzError):

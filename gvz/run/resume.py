@@ -4,6 +4,7 @@ from typing import Any
 
 from gvz.core.env_config import leaves
 from gvz.run.config import RunConfig
+from learner.config import OnPolicyConfig
 
 _MAY_CHANGE = (
     "run_dir",
@@ -27,7 +28,7 @@ _MAY_CHANGE = (
     "checkpoint.*",
     "log.*",
 )
-"""Fields that leave a run what it was. Everything else changes its meaning."""
+"""Fields that leave a run what it was; of a longer one, `changed_schedules` tells. The others change its meaning."""
 
 
 def may_change(name: str) -> bool:
@@ -51,6 +52,25 @@ def differences(old: RunConfig, new: RunConfig) -> list[str]:
             f"learner.total_updates: {old.learner.total_updates} -> {new.learner.total_updates} (it may only grow)"
         )
     return changed
+
+
+def changed_schedules(old: RunConfig, new: RunConfig) -> list[str]:
+    """What goes by the number of gradient steps of the whole run and so has other values from now on, a line each."""
+    before, after = old.learner.total_updates, new.learner.total_updates
+    if before == after:
+        return []
+    found: list[str] = []
+    if isinstance(new.learner, OnPolicyConfig) and new.learner.learning_rate_decay:
+        found.append("the learning rate, which falls to 0 at its end,")
+    replay = new.replay
+    if replay is not None and replay.prioritized:
+        first, last = replay.importance_sampling_exponent, replay.importance_sampling_exponent_end
+        if first != last:
+            found.append(f"the importance-sampling exponent, which goes from {first:g} to {last:g} by its end,")
+    return [
+        f"learner.total_updates: {before} -> {after}: {what} is from now on that of a run of {after} gradient steps"
+        for what in found
+    ]
 
 
 def _values(config: RunConfig) -> dict[str, Any]:

@@ -19,9 +19,10 @@ from typing import Any
 from gvz.core import records
 from gvz.core.durable import fsync
 from gvz.core.errors import ConfigError, GvzError, ResumeError
+from gvz.core.registry import NO_OWN_FILES, OwnFiles
 from gvz.run.config import RunConfig
 from gvz.run.config_files import CONFIG_SCHEMA, config_from_dict, config_to_dict
-from gvz.run.resume import differences
+from gvz.run.resume import changed_schedules, differences
 
 RECORD_FILES = ("metrics.jsonl", "episodes.jsonl", "faults.jsonl")
 START_RECORDS = "starts.jsonl"
@@ -31,15 +32,20 @@ START_RECORDS = "starts.jsonl"
 class RunDir:
     """An open run directory. One process at a time holds it."""
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, *, in_another: bool = False):
         """Creates the directory if need be and locks it.
+
+        Args:
+            path: of the directory.
+            in_another: it lies in a further run directory, which may not be there yet: that of process 0 of a group.
 
         Raises:
             ResumeError: another live process holds it, or it cannot be created.
         """
         self.path = path
         with disk_checked(path):
-            path.mkdir(parents=True, exist_ok=True, mode=0o700)
+            for made in (path.parent, path) if in_another else (path,):  # a mode does not hold for parents
+                made.mkdir(parents=True, exist_ok=True, mode=0o700)
             self._lock = os.fdopen(os.open(path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600), "a+")
             locked = records.lock(self._lock)
         if not locked:
@@ -52,8 +58,8 @@ class RunDir:
         # what orbax, TensorBoard, actors and engines make while it is open is this user's alone, too
         self._umask = os.umask(0o077)
 
-    def saved_config(self, agent_file: Path | None = None) -> RunConfig | None:
-        """The configuration of the run that lives here, or None in an empty directory. `agent_file`: as for
+    def saved_config(self, own_files: OwnFiles = NO_OWN_FILES) -> RunConfig | None:
+        """The configuration of the run that lives here, or None in an empty directory. `own_files`: as for
         `config_from_dict`.
 
         Raises:
@@ -64,7 +70,7 @@ class RunDir:
             return None
         try:
             saved = json.loads(file.read_text())
-            config = config_from_dict(saved, agent_file)
+            config = config_from_dict(saved, own_files)
         except (ValueError, OSError, RecursionError) as error:
             raise ResumeError(f"{file} cannot be read: {error}; start again with --fresh or --run-dir") from error
         if saved["schema"] < CONFIG_SCHEMA:
@@ -74,19 +80,24 @@ class RunDir:
             )
         return config
 
-    def check_resumable(self, config: RunConfig) -> None:
+    def check_resumable(self, config: RunConfig) -> list[str]:
         """Refuses a configuration that would change the meaning of the run that lives here.
+
+        Returns: what the user should know of changes that are allowed, a line each.
 
         Raises:
             ResumeError: names every differing field.
         """
-        saved = self.saved_config(config.agent_file)
-        if saved is not None and (changed := differences(saved, config)):
+        saved = self.saved_config(config.own_files)
+        if saved is None:
+            return []
+        if changed := differences(saved, config):
             raise ResumeError(
                 f"run directory {self.path} holds a run with another configuration:\n  "
                 + "\n  ".join(changed)
                 + "\nGive the same configuration to go on, --fresh to move that run aside, or another --run-dir."
             )
+        return changed_schedules(saved, config)
 
     def write_config(self, config: RunConfig) -> None:
         """Writes config.json atomically: after a power cut too it is the old one or the new one.
@@ -131,6 +142,20 @@ class RunDir:
             return sum(
                 records.cut(self.path / name, length, self.path / "discarded" / name) for name, length in known.items()
             )
+
+    def discard_policies(self, num_updates: int) -> None:
+        """Moves policies of more gradient steps to `discarded/`: the run that goes on from there never had them.
+
+        Raises:
+            ResumeError: they cannot be moved.
+        """
+        moved = self.path / "discarded" / "policies"
+        with disk_checked(self.path):
+            for policy in (self.path / "policies").glob("*"):
+                if policy.name.isdecimal() and int(policy.name) > num_updates:
+                    moved.mkdir(parents=True, exist_ok=True)
+                    shutil.rmtree(moved / policy.name, ignore_errors=True)
+                    policy.rename(moved / policy.name)
 
     def close(self) -> None:
         """Closes the record files and releases the lock. Can be repeated.

@@ -75,8 +75,8 @@ class Saver:
         if (due and group.may_save()) or (alone and self._num_failed and time.monotonic() > self._retry_at_s):
             self._begin(group.num_common_saved)
 
-    def save_last(self, begun: Callable[[], None]) -> None:
-        """Writes the last checkpoint and waits for it; if it fails it is tried once more.
+    def save_last(self, group: Group, begun: Callable[[], None]) -> None:
+        """Writes the last checkpoint and waits for it; if it fails it is tried once more. The one that all have stays.
 
         Args:
             begun: called when the checkpoint's content is fixed, before it is waited for.
@@ -89,7 +89,7 @@ class Saver:
         for _ in range(_LAST_ATTEMPTS):
             if not self.behind:
                 break
-            self._begin()
+            self._begin(group.num_common_saved)
             begun()
             failure = self.wait()
         begun()
@@ -113,7 +113,7 @@ class Saver:
         self._checkpointer.wait()
         return self._hear()
 
-    def _begin(self, keep_from: int | None = None) -> None:
+    def _begin(self, keep_from: int | None) -> None:
         self._counts.saved_updates = self._counts.updates
         self._checkpointer.save(self._counts.updates, *self._take(), keep_from=keep_from)
 

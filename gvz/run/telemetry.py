@@ -71,8 +71,8 @@ class Telemetry:
 
     def episode(self, stats: EpisodeStats, *, num_updates: int, env_steps: int) -> None:
         """Records a finished episode."""
-        self._episodes[stats.task] += 1
         if not stats.cut:
+            self._episodes[stats.task] += 1
             self._recent[stats.task].append(stats.score)
         self._run.append(
             "episodes.jsonl",

@@ -98,11 +98,11 @@ class Trainer:
                     self._saver.save_when_due(self._group)
         except (WorkerError, WaitTimeoutError):
             with contextlib.suppress(CheckpointError, WaitTimeoutError):  # already reported; the first error is raised
-                self._saver.save_last(self._record_row)
+                self._saver.save_last(self._group, self._record_row)
             raise
         last = "writing the last checkpoint" if self._saver.behind else "no new gradient steps to save"
         self._progress.say(f"{'stopping' if stop.requested else 'done'}: {last}")
-        self._saver.save_last(self._record_row)
+        self._saver.save_last(self._group, self._record_row)
 
     def close(self, *, abandon_save: bool = False) -> None:
         """Ends every actor, waits for the checkpoint (or abandons both), closes the records. Can be repeated."""

@@ -118,7 +118,7 @@ class Rainbow(NetworkAgent):
         logits_t = self.outputs(target, batch.obs_t)
         q_tm1, q_t = self.q_values(logits_tm1), self.q_values(logits_t)
         q_t_selector = q_t
-        if self.config.double:
+        if config.double and not config.munchausen:
             selector = add_noise(online_params, key_selector, self.config.noisy)
             q_t_selector = self.q_values(self.outputs(selector, batch.obs_t))
         q_t_selector = allowed_values(q_t_selector, batch.obs_t.mask)

@@ -213,7 +213,7 @@ def test_bad_flags_are_one_line(flags, text, tmp_path, capsys, monkeypatch):
 
 def test_a_core_has_one_holder_and_too_few_free_cores_are_none(monkeypatch, tmp_path):
     tmp_path.chmod(0o700)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("GVZ_RUNTIME_DIR", str(tmp_path))
     allowed = sorted(os.sched_getaffinity(0))
     first, locks = hold_cores(1)
     assert first == tuple(allowed[:1])

@@ -82,6 +82,12 @@ def test_private_addresses_are_allowed(ip):
     addresses.require_private(ip, "here", "")
 
 
+@pytest.mark.parametrize("ip", ["0.0.0.0", "::"])
+def test_all_addresses_of_a_machine_are_refused_because_public_ones_are_among_them(ip):
+    with pytest.raises(ConfigError, match=rf"^here: {ip} stands for all addresses of a machine, public ones too; so$"):
+        addresses.require_private(ip, "here", "so")
+
+
 @pytest.mark.usefixtures("token")
 def test_an_address_without_a_listener_is_refused():
     with socket.socket() as reserved:

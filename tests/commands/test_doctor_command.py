@@ -29,7 +29,7 @@ def test_a_bad_finding_gives_exit_code_1_and_its_remedy(capsys, monkeypatch, tmp
 
 def test_clean_removes_what_a_dead_run_left(capsys, monkeypatch, tmp_path):
     tmp_path.chmod(0o700)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("GVZ_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setattr(doctor, "CHECKS", (doctor.check_leftovers,))
     left = tmp_path / "gvz-engine-0123456789abcdef"
     left.mkdir()

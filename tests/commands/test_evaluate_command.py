@@ -1,6 +1,7 @@
 """gvz evaluate, as it is called: bad input, several checkpoints, interruption and going on."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -17,11 +18,15 @@ from gvz.tasks import named_tasks
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("", "evaluate: want run directories or --player"),
-        ("{run} --player idle", "evaluate: want run directories or --player"),
+        ("", "evaluate: want --player or run directories (before --tasks, which takes what follows)"),
+        ("{run} --player idle", "evaluate: got --player idle and also "),
+        ("{run} --checkpoints", "--checkpoints: got none, want newest, all, last5"),
+        ("--player idle --seeds 0 0", "--seeds: got [0, 0], want different numbers"),
+        ("--player idle --seeds 9223372036854775808", "--seeds: got [9223372036854775808], want different numbers"),
+        ("{above}", "did you mean {run}?"),
         ("--player idle --episodes 0", "--episodes: got 0, want at least 1"),
         ("--player idle --workers 0", "--workers: got 0, want at least 1"),
-        ("--player idle --seeds -1", "--seeds: got [-1], want numbers of at least 0"),
+        ("--player idle --seeds -1", "--seeds: got [-1], want different numbers from 0 to 2^63 - 1"),
         ("--player idle --out {file}/below/rows.jsonl", "cannot be written: Not a directory"),
         ("--player idle --out {file}", "line 1: not JSON (half-written?); move the file aside"),
         ("--player idle --level 5", "level: got 5, want 0..4"),
@@ -35,11 +40,12 @@ from gvz.tasks import named_tasks
 )
 def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, tmp_path, small_run):
     (tmp_path / "file").write_text("nonsense\n")
-    assert cli.main(["evaluate", *arguments.format(file=tmp_path / "file", run=small_run).split()]) == 2
+    places = {"file": tmp_path / "file", "run": small_run, "above": small_run.parent}
+    assert cli.main(["evaluate", *arguments.format(**places).split()]) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith("error: ")
-    assert message in err
+    assert message.format(**places) in err
     assert not (small_run / "evaluation.jsonl").exists()
 
 
@@ -115,14 +121,16 @@ def test_an_interrupted_evaluation_goes_on_and_ends_with_a_table(tmp_path):
     ]
     num_rows = 0
     for signal_number in (signal.SIGINT, signal.SIGTERM):
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, start_new_session=True
+        )
         deadline = time.monotonic() + 120
         while not out.exists() or out.read_text().count("\n") == num_rows:
             assert time.monotonic() < deadline, "waited 120 s for a row"
             time.sleep(0.02)
-        process.send_signal(signal_number)
+        os.killpg(process.pid, signal_number)  # the whole group, as a shell and a batch system do
         _, err = process.communicate(timeout=120)
-        assert process.returncode == 130, err
+        assert process.returncode == 128 + signal_number, err
         assert "interrupted; the same command goes on from here" in err
         assert "Traceback" not in err
         assert num_rows < len(read_rows(out)) < 30

@@ -27,7 +27,7 @@ STOCK_WAD = Path(vizdoom.scenarios_path) / "defend_the_center.wad"
 def registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A registry of this test's own, so that records can be forged."""
     tmp_path.chmod(0o700)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("GVZ_RUNTIME_DIR", str(tmp_path))
     return janitor.runtime_dir()
 
 
@@ -355,11 +355,14 @@ def test_a_runtime_directory_that_is_a_link_is_refused(registry: Path, tmp_path:
 def test_a_runtime_directory_that_cannot_be_made_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     file = tmp_path / "file"
     file.touch(mode=0o700)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(file))
-    with pytest.raises(ResourceError, match="set TMPDIR to a writable directory"):
+    monkeypatch.setenv("GVZ_RUNTIME_DIR", str(file))
+    with pytest.raises(ResourceError, match="set GVZ_RUNTIME_DIR or TMPDIR to a writable directory"):
         janitor.runtime_dir()
 
 
-def test_without_a_users_runtime_directory_the_temporary_one_is_taken(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", "/nowhere")
+def test_records_are_in_the_temporary_directory_also_where_a_login_has_one_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.delenv("GVZ_RUNTIME_DIR")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))  # cron and batch jobs lack it, and must find the same records
     assert janitor.runtime_dir() == Path(tempfile.gettempdir()) / f"gvizdoom-{os.getuid()}"

@@ -83,3 +83,20 @@ def test_a_file_that_is_missing_or_does_not_set_the_constant_is_refused(tmp_path
     (tmp_path / "empty.py").write_text("")
     with pytest.raises(ConfigError, match=r"empty\.py does not set NAME, want a line `NAME = \.\.\.` at its end"):
         find("", "NAME", str(tmp_path / "empty.py"), "zoo.animal")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("NAME = (", r"mine\.py: SyntaxError: '\(' was never closed"),
+        ("raise ValueError('so')", r"mine\.py: ValueError: so$"),
+        ("import no_such_module_anywhere", r"mine\.py: ModuleNotFoundError: No module named 'no_such_module_anywhere'"),
+    ],
+)
+def test_what_a_file_raises_is_told_in_one_line_and_the_file_can_be_mended(tmp_path: Path, text: str, message: str):
+    file = tmp_path / "mine.py"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        find("zoo", "NAME", str(file), "zoo.animal")
+    file.write_text("NAME = 1")
+    assert find("zoo", "NAME", str(file), "zoo.animal") == 1

@@ -158,7 +158,7 @@ def test_nothing_is_written_into_the_working_directory_or_home(tmp_path: Path):
 
 
 def test_nothing_but_our_records_is_written_into_the_temporary_directory(tmp_path: Path):
-    environment = {name: value for name, value in os.environ.items() if name != "XDG_RUNTIME_DIR"}  # as in a container
+    environment = {name: value for name, value in os.environ.items() if name != "GVZ_RUNTIME_DIR"}
     done = run("Engine(config).new_episode(1)", env={**environment, "TMPDIR": str(tmp_path)})
     assert done.returncode == 0, done.stderr
     [records] = tmp_path.iterdir()

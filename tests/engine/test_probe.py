@@ -31,7 +31,7 @@ def test_a_good_file_loads_and_its_log_is_returned():
 
 def test_a_file_that_crashes_the_engine_is_an_error_with_its_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     tmp_path.chmod(0o700)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("GVZ_RUNTIME_DIR", str(tmp_path))
     wad = with_decorate(tmp_path / "bad.wad", "ACTOR Foo : NoSuchParent { }")
     with pytest.raises(EngineError, match=r"bad\.wad: the engine crashed .*Script error(.|\n)*NoSuchParent"):
         probe_wad(wad)

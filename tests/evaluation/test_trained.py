@@ -11,6 +11,7 @@ import pytest
 
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import CheckpointError, ConfigError
+from gvz.core.registry import OwnFiles
 from gvz.env import DoomEnv
 from gvz.evaluation.choice import EpisodeChoice
 from gvz.evaluation.selection import TaskSelection
@@ -45,7 +46,7 @@ def test_a_checkpoint_that_is_not_there_is_an_error(tmp_path, run):
         find_checkpoints(run, ["latest"])
     with pytest.raises(ConfigError, match=r"--checkpoints: got last4, but .*policies holds 3 policies"):
         find_checkpoints(run, ["last4"])
-    with pytest.raises(ConfigError, match="holds no policy yet"):
+    with pytest.raises(ConfigError, match="holds no policy: "):
         find_checkpoints(tmp_path, ["newest"])
 
 
@@ -135,6 +136,22 @@ def test_what_is_no_run_is_an_error(tmp_path, run):
         read_run_config(run)
 
 
+def test_an_encoders_file_is_executed_only_if_it_is_named(tmp_path, run):
+    source, mark = tmp_path / "theirs.py", tmp_path / "executed"
+    source.write_text(
+        f"open({str(mark)!r}, 'w').close()\nfrom learner.encoders.{CONFIG.agent.encoder} import ENCODER as ENCODER\n"
+    )
+    config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, encoder=str(source)))
+    (run / "config.json").write_text(json.dumps(config_to_dict(config)))
+    for read in (lambda: read_run_config(run), lambda: TrainedPlayer(run, 20)):
+        with pytest.raises(ConfigError, match=r"its encoder is a Python file .* name it: --encoder "):
+            read()
+    assert not mark.exists()
+    player_spec = trained_player(run, read_run_config(run, OwnFiles(encoder=source)), 20)
+    assert pickle.loads(pickle.dumps(player_spec)).make_player().values is None
+    assert mark.exists()
+
+
 def test_an_agents_file_is_executed_only_if_it_is_named(tmp_path, run):
     source, mark = tmp_path / "theirs.py", tmp_path / "executed"
     source.write_text(
@@ -149,7 +166,7 @@ def test_an_agents_file_is_executed_only_if_it_is_named(tmp_path, run):
     with pytest.raises(ConfigError, match="its agent is a Python file"):
         TrainedPlayer(run, 20)
     assert not mark.exists()
-    player_spec = trained_player(run, read_run_config(run, source), 20)
+    player_spec = trained_player(run, read_run_config(run, OwnFiles(agent=source)), 20)
     assert pickle.loads(pickle.dumps(player_spec)).make_player().values is None
     assert mark.exists()
 

@@ -12,7 +12,7 @@ from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError
 from gvz.evaluation import zoo
 from gvz.evaluation.episode_log import RecordFile, read_rows
-from gvz.evaluation.trained import read_params, read_run_config, trained_player
+from gvz.evaluation.trained import find_checkpoints, read_params, read_run_config, trained_player
 from gvz.evaluation.zoo import pack, run_directory, zoo_names
 from gvz.run.rundir import RunDir
 from gvz.segmentation import segmenter_file
@@ -104,6 +104,17 @@ def test_it_is_evaluated_recorded_and_listed_with_its_score_card(run, tmp_path, 
     assert task in shown
     assert cli.main(["record", "zoo:one", "--out", "episode.gif", "--seconds", "0.5"]) == 0
     assert (tmp_path / "episode.gif").stat().st_size > 1000
+
+
+def test_a_policy_takes_the_place_of_another_only_if_that_is_wanted(run, capsys):
+    add = ["zoo", "--add", str(run), "--name", "one"]
+    assert cli.main(add) == 0
+    assert cli.main([*add, "--checkpoint", "20"]) == 2
+    assert "--name: the zoo has a policy one already; give another name, or --replace" in capsys.readouterr().err
+    assert find_checkpoints(run_directory("zoo:one"), ["newest"]) == [100]
+    assert cli.main(["zoo", "--add", "zoo:one", "--name", "one"]) == 0  # with its new score card
+    assert cli.main([*add, "--checkpoint", "20", "--replace"]) == 0
+    assert find_checkpoints(run_directory("zoo:one"), ["newest"]) == [20]
 
 
 def test_an_unknown_policy_is_named(run):

@@ -96,6 +96,13 @@ def test_the_newest_row_of_metrics_is_found_however_many_tasks_it_has(tmp_path):
     assert (progress.last_update(tmp_path), progress.last_processor_s(tmp_path)) == (200, 100.0)
 
 
+def test_a_finished_run_whose_records_are_compressed_is_as_far_as_they_say():
+    """Of the committed results."""
+    directory = Path(__file__).parents[2] / "results/quick_comparison/runs/dqn_quick/defend_the_center/train4/seed_1111"
+    assert not (directory / "metrics.jsonl").exists()
+    assert progress.last_update(directory) == 20_000
+
+
 def test_episodes_of_another_base_seed_do_not_count(tmp_path):
     directory = save_policies(tmp_path, 100, 200, 300)
     (directory / "evaluation.jsonl").write_text(row("a", 0, num_updates=100, base_seed=7))

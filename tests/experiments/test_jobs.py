@@ -54,12 +54,15 @@ def test_a_trained_run_with_other_settings_is_known(name, scale, tmp_path, monke
     assert "config.json cannot be read: " in job.other_settings()[0]
 
 
-def test_an_agent_in_a_file_is_given_to_the_evaluation(tmp_path):
+def test_an_agent_and_an_encoder_in_files_are_given_to_the_evaluation(tmp_path):
     agent = tmp_path / "mine.py"
     (text,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "AGENTS.md").read_text(), flags=re.DOTALL)
     agent.write_text(text)
+    encoder = tmp_path / "encoder.py"
     quick = dataclasses.replace(
-        experiments()["quick_comparison"], configs=("dqn_quick",), variants={"mine": {"agent.name": str(agent)}}
+        experiments()["quick_comparison"],
+        configs=("dqn_quick",),
+        variants={"mine": {"agent.name": str(agent), "agent.encoder": str(encoder)}},
     )
     run = quick.runs()[0]
     directory = progress.run_directory(tmp_path, run)
@@ -68,7 +71,7 @@ def test_an_agent_in_a_file_is_given_to_the_evaluation(tmp_path):
     (directory / "metrics.jsonl").write_text(json.dumps({"num_updates": run.total_updates}) + "\n")
     following = RunJob(results=tmp_path, run=run, evaluation=EVALUATION, scale=1).outlook().next
     assert following is not None
-    assert f" --agent {agent} --tasks " in " ".join(following.arguments)
+    assert f" --agent {agent} --encoder {encoder} --tasks " in " ".join(following.arguments)
 
 
 def test_a_run_is_trained_then_evaluated_where_episodes_are_missing_then_done(tmp_path):

@@ -49,7 +49,7 @@ class Fuzz:
             return 2
         found: dict[str, dict[str, Any]] = {}
         with tempfile.TemporaryDirectory(prefix="gvz-fuzz-") as directory:
-            os.environ |= {"TMPDIR": directory, "XDG_RUNTIME_DIR": directory, "JAX_PLATFORMS": "cpu"}
+            os.environ |= {"TMPDIR": directory, "GVZ_RUNTIME_DIR": directory, "JAX_PLATFORMS": "cpu"}
             try:
                 for name in self.targets or TARGETS:
                     found[name] = fuzz(name, Path(directory), self.seconds)

@@ -205,8 +205,8 @@ def janitor_record(directory: Path) -> Target:
 
     def run(data: bytes) -> bool:
         record, _, instance = data.partition(b"\n%%%%\n")
-        environment, shm_directory = os.environ.get("XDG_RUNTIME_DIR"), janitor.SHM_DIR
-        os.environ["XDG_RUNTIME_DIR"], janitor.SHM_DIR = str(runtime), shm
+        environment, shm_directory = os.environ.get("GVZ_RUNTIME_DIR"), janitor.SHM_DIR
+        os.environ["GVZ_RUNTIME_DIR"], janitor.SHM_DIR = str(runtime), shm
         try:
             (janitor.runtime_dir() / "gvz-engine-x.json").write_bytes(record)
             engine.mkdir(exist_ok=True)
@@ -219,9 +219,9 @@ def janitor_record(directory: Path) -> Target:
             return bool(dead)
         finally:
             janitor.SHM_DIR = shm_directory
-            os.environ.pop("XDG_RUNTIME_DIR")
+            os.environ.pop("GVZ_RUNTIME_DIR")
             if environment is not None:
-                os.environ["XDG_RUNTIME_DIR"] = environment
+                os.environ["GVZ_RUNTIME_DIR"] = environment
 
     def record(name: str) -> bytes:
         return json.dumps({"directory": name, "owner_pid": 1}).encode()

@@ -182,6 +182,8 @@ BAD = {
         "learner.warmup_steps: got 191, want at least 192, which is agent.n_steps (3) for each of 64 games"
     ),
     "--tasks defend_the_center/gor": "gore",
+    "--tasks defend_the_center/gore --scenario seek_and_kill": "--scenario: got seek_and_kill and also --tasks",
+    "--tasks defend_the_center/gore --training-set=4": "--training-set: got 4 and also --tasks",
     "--tasks defend_the_center/gore health_gathering/lava": "want one scenario",
     "--tasks defend_the_center/gore defend_the_center/gore": "one task twice",
     "--scenario doom": "defend_the_center",

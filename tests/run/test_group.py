@@ -261,6 +261,7 @@ def test_what_a_group_cannot_do_is_refused(changes, message):
     ("host", "message"),
     [
         ("8.8.8.8", r"8\.8\.8\.8 is a public address; the group asks nobody"),
+        ("0.0.0.0", r"0\.0\.0\.0 stands for all addresses of a machine, public ones too; the group asks nobody"),
         ("no.such.host.invalid", "no machine has"),
     ],
 )

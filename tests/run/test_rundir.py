@@ -3,6 +3,7 @@
 import dataclasses
 import gzip
 import json
+import os
 import stat
 from pathlib import Path
 
@@ -23,6 +24,47 @@ def test_it_is_private_and_held_by_one(tmp_path):
         with pytest.raises(ResumeError, match="another running process uses it"):
             RunDir(tmp_path / "run")
     RunDir(tmp_path / "run").close()
+
+
+def test_the_directory_of_process_0_is_private_also_if_another_process_of_the_group_makes_it(tmp_path):
+    before = os.umask(0)
+    with RunDir(tmp_path / "runs" / "one" / "process_1", in_another=True):
+        assert stat.S_IMODE((tmp_path / "runs" / "one").stat().st_mode) == 0o700
+        assert stat.S_IMODE((tmp_path / "runs").stat().st_mode) == 0o777
+    os.umask(before)
+
+
+def test_policies_that_a_run_does_not_go_on_from_are_kept_apart(tmp_path):
+    with RunDir(tmp_path) as run:
+        for directory in ("policies/10", "policies/20", "policies/25", "discarded/policies/25"):
+            (tmp_path / directory).mkdir(parents=True)
+            (tmp_path / directory / "which").write_text(directory)
+        (tmp_path / "policies" / "30.tmp").mkdir()
+        run.discard_policies(10)
+        assert {p.name for p in (tmp_path / "policies").iterdir()} == {"10", "30.tmp"}
+        moved = {p.name: (p / "which").read_text() for p in (tmp_path / "discarded" / "policies").iterdir()}
+        assert moved == {"20": "policies/20", "25": "policies/25"}
+
+
+def test_what_goes_by_the_length_of_a_run_is_said_when_that_changes(tmp_path):
+    longer = dataclasses.replace(CONFIG.learner, total_updates=2 * CONFIG.learner.total_updates)
+    with RunDir(tmp_path) as run:
+        run.write_config(CONFIG)
+        (note,) = run.check_resumable(dataclasses.replace(CONFIG, learner=longer))
+        assert note == (
+            "learner.total_updates: 200000 -> 400000: the importance-sampling exponent, which goes from 0.4 to 1 by "
+            "its end, is from now on that of a run of 400000 gradient steps"
+        )
+        constant = dataclasses.replace(CONFIG.replay, importance_sampling_exponent_end=0.4)
+        run.write_config(dataclasses.replace(CONFIG, replay=constant))
+        assert run.check_resumable(dataclasses.replace(CONFIG, replay=constant, learner=longer)) == []
+        ppo = load_config("ppo_quick")
+        ppo = dataclasses.replace(ppo, learner=dataclasses.replace(ppo.learner, learning_rate_decay=True))
+        run.write_config(ppo)
+        assert run.check_resumable(ppo) == []
+        ppo = dataclasses.replace(ppo, learner=dataclasses.replace(ppo.learner, total_updates=10**6))
+        (note,) = run.check_resumable(ppo)
+        assert "the learning rate, which falls to 0 at its end, is from now on" in note
 
 
 def test_a_path_that_cannot_be_made_says_so(tmp_path):

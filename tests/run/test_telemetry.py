@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from gvz.core import records
@@ -17,6 +18,7 @@ from gvz.run.config_files import load_config
 from gvz.run.rundir import RunDir
 from gvz.run.telemetry import Telemetry
 from gvz.task_table import task_table
+from gvz.transport.messages import EpisodeStats
 from tests.full_disk import full_disk
 from tests.tensorboard_events import read_events
 
@@ -124,6 +126,25 @@ def test_on_a_full_disk_the_events_end_and_the_records_go_on(tmp_path):
 def telemetry(run: RunDir) -> Telemetry:
     run.write_config(load_config("rainbow_quick"))
     return Telemetry(run, TABLE, LogConfig(tensorboard=False, wandb=True), 0)
+
+
+def test_an_episode_that_was_cut_is_recorded_and_has_no_part_in_the_score_of_its_task(tmp_path):
+    stats = EpisodeStats(
+        lane=0, task=1, episode=0, seed=1, score=9.0, reward=0.0, reward_components={}, length_frames=8,
+        length_steps=2, params_version=0, terminated=False, truncated=True, cut=True,
+    )  # fmt: skip
+    with RunDir(tmp_path) as run:
+        telemetry = Telemetry(run, TABLE, LogConfig(tensorboard=False), 0)
+        telemetry.episode(stats, num_updates=0, env_steps=0)
+        telemetry.scalars(0, {})
+        assert [status.episodes for status in telemetry.task_statuses()] == [0, 0]
+        for score in (2.0, 4.0):
+            telemetry.episode(msgspec.structs.replace(stats, cut=False, score=score), num_updates=1, env_steps=0)
+        telemetry.scalars(1, {})
+    first, second = records.read(tmp_path / "metrics.jsonl")[0]
+    assert not [name for name in first if name.startswith("task/")]
+    assert {name: second[name] for name in second if name.startswith("task/")} == {f"task/{TASKS[1]}/score": 3.0}
+    assert [row["cut"] for row in records.read(tmp_path / "episodes.jsonl")[0]] == [True, False, False]
 
 
 def test_wandb_that_is_not_installed_is_an_error_with_its_remedy(tmp_path, monkeypatch):

@@ -199,7 +199,7 @@ def test_nothing_is_left_after_the_programs_end(tmp_path: Path, end: str | signa
     process = subprocess.Popen(
         [sys.executable, "program.py", end if isinstance(end, str) else "plays"],
         cwd=tmp_path,
-        env={**os.environ, "TMPDIR": str(places[0]), "XDG_RUNTIME_DIR": str(places[1])},
+        env={**os.environ, "TMPDIR": str(places[0]), "GVZ_RUNTIME_DIR": str(places[1])},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -20,7 +20,7 @@ class RainbowConfig(ValueConfig):
     name: str = "rainbow"
     """module in learner/agents, or the path of a Python file (docs/AGENTS.md)"""
     double: bool = True
-    """double Q-learning (thesis eq. 4.9)"""
+    """double Q-learning (thesis eq. 4.9); without effect on Munchausen's target, which takes no maximum"""
     dueling: bool = True
     """dueling streams (eq. 4.10)"""
     noisy: Noisy = "factorized"
