@@ -61,6 +61,13 @@ def action_buttons(scenario: Scenario, action_set: ActionSet) -> tuple[Buttons, 
     return tuple(held if one else () for held, one in zip(_FIXED[action_set], allowed, strict=True))
 
 
+def choice_mask(scenario: Scenario, action_set: ActionSet) -> tuple[bool, ...]:
+    """Whether the scenario allows each action; of a MultiDiscrete action, each choice of each axis in turn."""
+    if action_set == "multi_discrete_v1":
+        return tuple(button in ("", *scenario.buttons) for axis in AXES_V1 for button in axis)
+    return action_mask(scenario, action_set)
+
+
 def action_mask(scenario: Scenario, action_set: ActionSet) -> tuple[bool, ...]:
     """Whether the scenario allows each action: it has all of the action's buttons. Allowed actions all differ, except
     those of multi_discrete_v1, which allows everything.

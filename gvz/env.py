@@ -1,7 +1,6 @@
 """A task as a Gymnasium environment: observation, actions, reward, time-out, seeds, crashes of the engine."""
 
 import dataclasses
-import operator
 import time
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -12,8 +11,8 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Discrete, MultiDiscrete
 
-from gvz.actions import AXES_V1, action_buttons, action_mask
-from gvz.core.env_config import EnvConfig, typed
+from gvz.actions import AXES_V1, action_buttons, choice_mask
+from gvz.core.env_config import EnvConfig, as_integer, typed
 from gvz.core.errors import ConfigError, EngineError
 from gvz.engine.engine import Engine, EngineConfig, check_config
 from gvz.engine.probe import ensure_loads
@@ -175,7 +174,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         if unknown := (options or {}).keys() - {"episode_seed"}:
             raise ValueError(f"reset: unknown options {sorted(unknown)}, want episode_seed")
         if options and "episode_seed" in options:
-            episode_seed = _integer(options["episode_seed"])
+            episode_seed = as_integer(options["episode_seed"])
         else:
             episode_seed = int(self.np_random.integers(EPISODE_SEEDS))
         if not 0 <= episode_seed < EPISODE_SEEDS:
@@ -215,7 +214,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             if not self.action_space.contains(held):
                 raise ValueError(f"DoomEnv.step: action {action!r}, want integers of {self.action_space}")
             chosen = int(np.ravel_multi_index(tuple(held), tuple(self.action_space.nvec)))
-        elif not 0 <= (chosen := _integer(action)) < len(self._actions):
+        elif not 0 <= (chosen := as_integer(action)) < len(self._actions):
             raise ValueError(f"DoomEnv.step: action {action!r}, want 0..{len(self._actions) - 1}")
         if self._repeat_rng.random() >= self.config.repeat_action_probability or self._held is None:
             self._held = self._actions[chosen]
@@ -236,8 +235,11 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         return observation, sum(components.values()), terminated, truncated, info
 
     def action_masks(self) -> np.ndarray:
-        """bool[A]: the actions that the task allows. (sb3-contrib's algorithms with masks ask for it by this name.)"""
-        return np.array(action_mask(self.task.scenario, self.config.action_set))
+        """bool[A]: the actions that the task allows; of `multi_discrete_v1` bool[15], the choices of each axis in turn.
+
+        sb3-contrib's algorithms with masks ask for it by this name.
+        """
+        return np.array(choice_mask(self.task.scenario, self.config.action_set))
 
     def render(self) -> np.ndarray | None:
         """The last rendered screen, uint8 [render_height, render_width, 3]; None in mode human."""
@@ -383,14 +385,6 @@ def make_env(task_id: str, env_config: Mapping[str, Any], **options: Any) -> Doo
 def is_solved(solved_episodes: Sequence[bool]) -> bool:
     """Whether a survival scenario is solved: the last ten episodes all reached the time-out (thesis 3.1)."""
     return len(solved_episodes) >= _SOLVED_EPISODES and all(solved_episodes[-_SOLVED_EPISODES:])
-
-
-def _integer(value: object) -> int:
-    """The value as an integer; -1 for anything else, such as 1.5 or an array."""
-    try:
-        return operator.index(value)  # pyright: ignore[reportArgumentType]
-    except TypeError:
-        return -1
 
 
 def _with_fields(config: EnvConfig, fields: Mapping[str, Any]) -> EnvConfig:

@@ -46,6 +46,7 @@ _CLASS_OF_NAME = {
     "Poison": "poison",  # a class of our own, derived from Health as kits are
     "BulletPuff": "effect",  # ViZDoom's category of these two is Explosive, as for missiles
     "RevenantTracerSmoke": "effect",
+    "RocketSmokeTrail": "effect",
 }
 _CLASS_OF_CATEGORY = {
     "Self": "weapon",
@@ -55,6 +56,7 @@ _CLASS_OF_CATEGORY = {
     "Decoration": "scenery",
     "Gore": "scenery",
     "LightSource": "scenery",
+    "Vegetation": "scenery",
     "Gibs": "effect",
     "Key": "key",
 }

@@ -16,6 +16,7 @@ import pytest
 from gymnasium.error import ResetNeeded
 
 import gvz
+from gvz.actions import AXES_V1
 from gvz.core.errors import ConfigError, TaskError
 from gvz.engine.engine import Engine
 from gvz.env import DoomEnv, is_solved, make_env
@@ -134,6 +135,16 @@ def test_unified_actions_differ_where_they_are_allowed_and_forbidden_ones_do_not
     ]
     assert len({played[action].tobytes() for action in allowed}) == len(allowed)
     assert all((played[action] == played[0]).all() for action in played if action not in allowed)
+
+
+def test_the_mask_of_a_multi_discrete_action_has_an_entry_for_each_choice_of_each_axis():
+    env = DoomEnv("seek_and_kill/default", action_set="multi_discrete_v1")
+    assert isinstance(env.action_space, gymnasium.spaces.MultiDiscrete)
+    choices = [button for axis in AXES_V1 for button in axis]
+    assert len(env.action_masks()) == len(choices) == env.action_space.nvec.sum()
+    forbidden = [button for button, allowed in zip(choices, env.action_masks(), strict=True) if not allowed]
+    assert forbidden == ["MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "USE"]
+    env.close()
 
 
 def test_a_multi_discrete_action_holds_one_button_of_each_axis():

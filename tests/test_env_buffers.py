@@ -11,7 +11,7 @@ from gvz import LABEL_CLASSES
 from gvz.core.env_config import SIGHT_CLASSES, SIGHT_COLUMNS, EnvConfig
 from gvz.core.errors import ConfigError
 from gvz.env import DoomEnv
-from gvz.observation import CLASS_GREYS
+from gvz.observation import CLASS_GREYS, label_class
 
 pytestmark = pytest.mark.engine
 
@@ -83,6 +83,24 @@ def test_labels_are_classes_that_mean_the_same_in_every_frame(task: str, actions
             observation, _ = env.reset()
     env.close()
     assert seen == expected
+
+
+@pytest.mark.parametrize(
+    "task", ["dodge_projectiles/procedural-test", "seek_and_kill/varied", "health_gathering/varied"]
+)
+def test_whatever_drawn_maps_have_is_of_a_class(task: str):
+    env = DoomEnv(task, buffers=("labels",))
+    for episode_seed in range(12):
+        observation, _ = env.reset(options={"episode_seed": episode_seed})
+        assert isinstance(observation, dict)
+        assert not (observation["labels"] == LABEL_CLASSES.index("other")).any()
+    env.close()
+
+
+def test_trees_are_scenery_and_the_smoke_of_a_rocket_is_an_effect():
+    """Categories as ViZDoom gives them."""
+    assert label_class("Vegetation", "BigTree") == "scenery"
+    assert label_class("SFX", "RocketSmokeTrail") == "effect"
 
 
 def test_the_automap_is_whole_and_stands_still_and_buffers_change_no_screen():

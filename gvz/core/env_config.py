@@ -1,6 +1,7 @@
 """The vocabulary of sizes that game, actors and learner share, and the check of a field's type."""
 
 import math
+import operator
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from numbers import Integral, Real
@@ -189,3 +190,11 @@ def check_types(config: Any, prefix: str) -> None:
     """
     for name, kind in get_type_hints(type(config)).items():
         object.__setattr__(config, name, typed(kind, getattr(config, name), f"{prefix}.{name}"))
+
+
+def as_integer(value: object) -> int:
+    """The value as an integer; -1 for anything else, such as 1.5 or an array."""
+    try:
+        return operator.index(value)  # pyright: ignore[reportArgumentType]
+    except TypeError:
+        return -1

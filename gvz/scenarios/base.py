@@ -169,6 +169,8 @@ class Attribute:
     """what replaces parts of `content` in profile levdoom"""
     aliases: tuple[str, ...] = ()
     """the thesis's shorter names in combined tasks ("fast+flying")"""
+    not_drawn: tuple[str, ...] = ()
+    """properties of entities that drawn maps with this attribute leave as they are, beside those that `content` sets"""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

@@ -298,7 +298,8 @@ def _draw_of_set(task: Task, maps: MapSet, content: Content, number: int) -> tup
         content = content.overlaid(Content(things={content.base_wad or "": ()}, parameters=layout.parameters))
     drawn = _draw(task, content, layout)
     floor = None if layout is None else Floor(drawn)
-    given = {name for attribute in task.attributes for name in scenario.attribute(attribute).content.entity}
+    attributes = map(scenario.attribute, task.attributes)
+    given = {name for attribute in attributes for name in (*attribute.content.entity, *attribute.not_drawn)}
     content = looks.draw_look(scenario, content, drawn, maps, number, given, layout, floor)
     if layout is not None and floor is not None:
         solids = looks.solid_places(drawn)

@@ -133,6 +133,7 @@ script 2 ENTER
         times_left++;
         has_key = 0;
         TakeInventory($key, 1);
+        TakeInventory($shown_key, 1);
         for (i = 0; i < $decoys_at_once; i++)
             TakeInventory(decoys[i], 1);
     }
@@ -142,6 +143,7 @@ script 2 ENTER
 script 3 (void)
 {
     has_key = 1;
+    GiveInventory($shown_key, 1);  // the status bar has no place for the tinted keys of drawn maps
     keys_taken++;
     for (int i = 0; i < 8; i++)
         Thing_Remove(110 + i);
@@ -201,6 +203,7 @@ SCENARIO = Scenario(
         things={WAD: starts_at(ROOM_SPOTS, 10)},
         parameters={
             "key": '"BlueCard"',
+            "shown_key": '"BlueCard"',
             "decoys": ("RedCard", "YellowCard", "RedSkull", "YellowSkull"),
             "decoys_at_once": 0,
             "first_spot": 10,
@@ -232,7 +235,11 @@ SCENARIO = Scenario(
         retextured("moss", "A-MOSBRI", "FLOOR4_6", "CEIL5_1"),
         retextured("metal", "AQSECT09", "FLAT19", "AQF052"),
         retextured("bricks", "BRICK12", "CRATOP1", "CRATOP1"),
-        Attribute(name="skulls", groups=("entity_type",), content=Content(parameters={"key": '"BlueSkull"'})),
+        Attribute(
+            name="skulls",
+            groups=("entity_type",),
+            content=Content(parameters={"key": '"BlueSkull"', "shown_key": '"BlueSkull"'}),
+        ),
         Attribute(name="resized_things", groups=("entity_size",), aliases=("resized",), content=RESIZED_THINGS),
         Attribute(
             name="glowing_things",
@@ -245,7 +252,12 @@ SCENARIO = Scenario(
             groups=("agent_height",),
             content=Content(agent={"ViewHeight": Uniform(0.0, 100.0)}),
         ),
-        Attribute(name="decoys", groups=("decoys",), content=Content(parameters={"decoys_at_once": 4})),
+        Attribute(
+            name="decoys",
+            groups=("decoys",),
+            content=Content(parameters={"decoys_at_once": 4}),
+            not_drawn=("RenderStyle", "Translation"),  # in one colour, keys and decoys look the same
+        ),
     ),
     complete=words("maze obstacles metal skulls resized_things glowing_things short_agent decoys"),
     tasks=words(

@@ -199,7 +199,7 @@ def draw_look(
         room: its map; changed in place, before the content's things are added.
         maps: the set with the map.
         number: of the map.
-        given: properties of entities that an attribute sets; they keep these.
+        given: properties of entities that are not drawn: an attribute sets them, or keeps them as they are.
         layout: of the map, if it has one of its own.
         floor: of this layout.
 
@@ -357,7 +357,7 @@ def _draw_entities(
     elif style == "STYLE_Stencil":
         entity |= {"RenderStyle": style, "StencilColor": rng.choice(pool(SILHOUETTES, maps.split, strength))}
     names = {name: name for name in variety.entities}
-    if rng.random() < 0.5 * strength:
+    if rng.random() < 0.5 * strength and "Translation" not in given:
         tints = pool(TINTS, maps.split, strength)
         names = {name: _tinted(name, TINTS.index(rng.choice(tints))) for name in variety.entities}
     parameters = {name: _renamed(content.parameters[name], names) for name in variety.entity_parameters}

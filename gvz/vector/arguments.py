@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium.spaces import Discrete, MultiDiscrete
 from gymnasium.vector import AutoresetMode
 
-from gvz.core.env_config import typed
+from gvz.core.env_config import as_integer, typed
 from gvz.core.errors import ConfigError
 from gvz.env import EPISODE_SEEDS
 from gvz.scenarios.base import Task
@@ -107,9 +107,9 @@ def reset_options(options: dict[str, object] | None, num_envs: int) -> tuple[int
         raise ValueError(f"reset: unknown options {sorted(unknown)}, want episode_seed or reset_mask")
     episode_seed, mask = options.get("episode_seed"), options.get("reset_mask")
     if episode_seed is not None:
-        episode_seed = int(episode_seed)  # pyright: ignore[reportArgumentType]  # what is none raises ValueError here
-        if not 0 <= episode_seed < EPISODE_SEEDS:
-            raise ValueError(f"reset: episode_seed {episode_seed}, want 0..{EPISODE_SEEDS - 1}")
+        if not 0 <= (number := as_integer(episode_seed)) < EPISODE_SEEDS:
+            raise ValueError(f"reset: episode_seed {episode_seed!r}, want an integer, 0..{EPISODE_SEEDS - 1}")
+        episode_seed = number
     if mask is None:
         return episode_seed, np.ones(num_envs, bool)
     if not isinstance(mask, np.ndarray) or mask.dtype != bool or mask.shape != (num_envs,) or not mask.any():

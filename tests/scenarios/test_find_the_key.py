@@ -1,8 +1,10 @@
 """Find the Key: what a running engine shows, against what the scenario's file says."""
 
+import re
 from collections import Counter
 from math import hypot
 
+import numpy as np
 import pytest
 
 from gvz.core.env_config import LABEL_CLASSES, EnvConfig
@@ -79,6 +81,44 @@ def test_the_key_opens_the_portal_and_nothing_else_does(start):
     go_to(player, things(player, "BlueCard")[0])
     go_to(player, again[1])
     assert (player["GOALS"], player["KITS_TAKEN"], player["HEALTH"]) == (2, 2, 100)
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("task", ["default", "skulls", "varied"])
+def test_the_status_bar_shows_the_key_until_the_agent_leaves_also_where_a_map_tints_it(task: str):
+    whole = parse_task(f"find_the_key/{task}")
+    numbers = (n for n in range(20) if task != "varied" or "BlueCardTint" in map_source(whole, "thesis", n).script)
+    env = DoomEnv(whole.id, render_mode="rgb_array", buffers=("labels",))
+
+    def key_field() -> np.ndarray:
+        for _ in range(3):
+            env.step(1)  # turns
+        screen = env.render()
+        assert screen is not None
+        return screen[121:129, 172:182]
+
+    env.reset(options={"episode_seed": next(numbers)})
+    without = key_field()
+    env._engine.command("puke 3")  # the script that a taken key runs
+    assert (key_field() != without).any()
+    while not (portals := [label for label in env.labels() if label.object_name == "Portal"]):
+        env.step(1)
+    env._engine.command(f"warp {portals[0].object_position_x} {portals[0].object_position_y}")
+    env.step(0)
+    assert (key_field() == without).all()
+    env.close()
+
+
+@pytest.mark.parametrize("profile", ["thesis", "levdoom"])
+def test_drawn_maps_leave_keys_and_decoys_their_colours(profile):
+    """In one colour, they look the same."""
+    drawn = [
+        [map_source(parse_task(f"find_the_key/varied{attributes}"), profile, n).script for n in range(30)]
+        for attributes in ("", "+decoys")
+    ]
+    with_colours = [[n for n, text in enumerate(texts) if re.search("STYLE_Stencil|CardTint", text)] for texts in drawn]
+    assert len(with_colours[0]) > 10
+    assert with_colours[1] == []
 
 
 @pytest.mark.engine

@@ -1,6 +1,8 @@
 """Adapters to other libraries, as far as they can be tried without these (`make test-interop` has them)."""
 
 import importlib
+import os
+import signal
 import sys
 from types import ModuleType
 
@@ -8,6 +10,7 @@ import numpy as np
 import pytest
 
 import gvz
+from gvz.vector.adapters.tianshou import TianshouVectorEnv
 
 
 class FakeVecEnv:
@@ -58,4 +61,37 @@ def test_stable_baselines3_can_render(sb3_vec_env):
     assert len(images) == 2
     assert images[0].shape[2] == 3
     assert images[0].dtype == np.uint8
+    envs.close()
+
+
+@pytest.mark.engine
+def test_stable_baselines3_is_told_that_an_episode_ended_because_its_engine_died(sb3_vec_env):
+    envs = sb3_vec_env(gvz.make_vec("defend_the_center/default", 2, num_workers=1, autoreset_mode="SameStep"))
+    envs.reset()
+    os.kill(envs.envs._crew.pids[0], signal.SIGKILL)
+    envs.step_async(np.zeros(2, np.int64))
+    _, _, over, infos = envs.step_wait()
+    assert over.all()
+    assert [info["engine_crash"] for info in infos] == [True, True]
+    envs.close()
+
+
+@pytest.mark.engine
+def test_tianshou_seeds_its_games_and_is_told_that_an_episode_ended_because_its_engine_died():
+    envs = TianshouVectorEnv(gvz.make_vec("seek_and_kill/default", 2, batch_size=1, autoreset_mode="Disabled"))
+    first, infos = envs.reset(seed=7)
+    assert [info["env_id"] for info in infos] == [0, 1]
+    assert (envs.reset(seed=7)[0] == first).all()
+    one, _ = envs.reset([1], options={"episode_seed": 5})
+    assert (envs.reset([1], options={"episode_seed": 5})[0] == one).all()
+    with pytest.raises(TypeError, match="episode_seed"):
+        envs.reset(episode_seed=5)
+    _, _, terminated, truncated, infos = envs.step(np.zeros(2, np.int64), np.array([0, 1]))
+    assert not (terminated | truncated).any()
+    assert [info["engine_crash"] for info in infos] == [False, False]
+    assert [info["score"] for info in infos] == [0.0, 0.0]
+    os.kill(envs.envs._crew.pids[0], signal.SIGKILL)
+    _, _, _, truncated, infos = envs.step(np.zeros(1, np.int64), np.array([0]))
+    assert truncated.all()
+    assert infos[0]["engine_crash"]
     envs.close()

@@ -148,7 +148,10 @@ def test_calls_out_of_turn_are_errors_and_change_nothing(envs: DoomVectorEnv):
         envs.step(np.array([1, 1, 1]))
     for options, message in (
         ({"seed": 1}, "unknown options \\['seed'\\], want episode_seed or reset_mask"),
-        ({"episode_seed": -1}, "episode_seed -1, want 0..2147483647"),
+        ({"episode_seed": -1}, "episode_seed -1, want an integer, 0..2147483647"),
+        ({"episode_seed": 2**31}, "episode_seed 2147483648, want an integer, 0..2147483647"),
+        ({"episode_seed": 3.7}, r"episode_seed 3\.7, want an integer"),
+        ({"episode_seed": [1]}, r"episode_seed \[1\], want an integer"),
         ({"reset_mask": [True] * 3}, r"want a numpy array bool\[3\] with at least one True"),
         ({"reset_mask": np.zeros(3, bool)}, r"want a numpy array bool\[3\] with at least one True"),
     ):

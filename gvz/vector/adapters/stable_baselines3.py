@@ -15,7 +15,7 @@ class Sb3VecEnv(VecEnv):
     """Games in worker processes; an episode begins in the same step in which the last one ends.
 
     Infos have the episode's `score` so far in every step, and in its last one the final score (`VecMonitor` takes it by
-    `info_keywords=("score",)`), `terminal_observation` and `TimeLimit.truncated`.
+    `info_keywords=("score",)`), `terminal_observation`, `TimeLimit.truncated` and `engine_crash`: leave these out.
 
     Args:
         envs: of `gvz.make_vec(..., autoreset_mode="SameStep")`; closed together with this object.
@@ -47,11 +47,12 @@ class Sb3VecEnv(VecEnv):
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Observations u8[N, 84, 84, C], rewards f32[N], whether episodes are over bool[N], and N infos."""
         observations, rewards, terminated, truncated, infos = self.envs.recv()
-        over = terminated | truncated
+        over, never = terminated | truncated, np.zeros(self.num_envs, bool)
         of_game: list[dict[str, Any]] = [{"score": score} for score in infos["score"].tolist()]
         for i in over.nonzero()[0]:
             of_game[i] = {
                 "score": float(infos["final_info"]["score"][i]),
+                "engine_crash": bool(infos["final_info"].get("engine_crash", never)[i]),
                 "terminal_observation": infos["final_obs"][i],
                 "TimeLimit.truncated": bool(truncated[i]),
             }

@@ -43,23 +43,45 @@ class TianshouVectorEnv:
     def __len__(self) -> int:
         return self.env_num
 
-    def reset(self, env_id: Sequence[int] | None = None, **_: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Begins episodes of these games, of all by default: observations, and infos with the `env_id` of each."""
+    def reset(
+        self, env_id: Sequence[int] | None = None, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Begins episodes of these games, of all by default: observations, and infos.
+
+        Args:
+            env_id: numbers of the games.
+            seed, options: as for `DoomVectorEnv.reset`.
+        """
         games = np.arange(self.env_num) if env_id is None else np.asarray(env_id)
-        frames, _ = self.envs.reset(options={"reset_mask": np.isin(np.arange(self.env_num), games)})
+        mask = np.isin(np.arange(self.env_num), games)
+        frames, infos = self.envs.reset(seed=seed, options={**(options or {}), "reset_mask": mask})
         self._stacks[games] = frames[games, None]
-        return self._stacks[games], np.array([{"env_id": game} for game in games])
+        return self._stacks[games], np.array([_info(game, infos, game) for game in games])
 
     def step(self, action: np.ndarray, id: np.ndarray) -> tuple[np.ndarray, ...]:
-        """One decision of each of these games: observations, rewards, terminated, truncated, infos."""
+        """One decision of each of these games: observations, rewards, terminated, truncated, infos.
+
+        An info has the game's `env_id`, the episode's `score` so far, and whether it ended in an `engine_crash`.
+        """
         self.envs.send(np.asarray(action), id)
         answers = {int(answer[-1]["env_id"][0]): answer for answer in (self.envs.recv() for _ in id)}
         frames, rewards, terminated, truncated = (
             np.concatenate([answers[game][part] for game in id]) for part in range(4)
         )
         self._stacks[id] = np.concatenate([self._stacks[id][:, 1:], frames[:, None]], axis=1)
-        return self._stacks[id], rewards, terminated, truncated, np.array([{"env_id": game} for game in id])
+        return (
+            self._stacks[id],
+            rewards,
+            terminated,
+            truncated,
+            np.array([_info(game, answers[game][-1], 0) for game in id]),
+        )
 
     def close(self) -> None:
         """Ends the games and their processes."""
         self.envs.close()
+
+
+def _info(game: int, infos: dict[str, Any], row: int) -> dict[str, Any]:
+    crashed = "engine_crash" in infos and bool(infos["engine_crash"][row])
+    return {"env_id": int(game), "score": float(infos["score"][row]), "engine_crash": crashed}
