@@ -51,7 +51,7 @@ class PlanCluster:
         config = load_config(self.config)
         if config.agent.on_policy:
             raise ConfigError(
-                f"--config: got {self.config}, whose agent {config.agent.name} learns on-policy; actor hosts are for "
+                f"--config: got {self.config}, whose agent {config.agent.name} learns on-policy; the plan is for "
                 "agents that learn from a replay"
             )
         ask = self._cluster(config)

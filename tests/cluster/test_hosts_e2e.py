@@ -27,11 +27,18 @@ pytestmark = [
 ]
 METRICS_PAGE = Path(__file__).parents[2] / "docs" / "reference" / "metrics.md"
 SMALL = (
-    "--config rainbow_4task --actors.num-actors 1 --actors.games-per-actor 2 --actors.placement free "
+    "--actors.num-actors 1 --actors.games-per-actor 2 --actors.placement free "
     "--env.frame-height 36 --env.frame-width 44 --env.grayscale --agent.conv-channels 8 8 --agent.conv-kernels 8 4 "
-    "--agent.conv-strides 4 2 --agent.hidden-units 32 --replay.capacity 4000 --learner.warmup-steps 300 "
-    "--learner.batch-size 8 --log.period-updates 20 --checkpoint.period-updates 50 "
-    "--learner.target-period-updates 50 --cluster.hosts 2 --cluster.batch-records 64"
+    "--agent.conv-strides 4 2 --agent.hidden-units 32 --log.period-updates 20 --checkpoint.period-updates 50 "
+    "--cluster.hosts 2 --cluster.batch-records 64"
+).split()
+RAINBOW = (
+    "--config rainbow_4task --replay.capacity 4000 --learner.warmup-steps 300 --learner.batch-size 8 "
+    "--learner.target-period-updates 50"
+).split()
+PPO = (
+    "--config ppo_quick --learner.rollout-steps 32 --learner.num-minibatches 2 --learner.num-epochs 2 "
+    "--learner.total-updates 60"
 ).split()
 
 
@@ -41,8 +48,8 @@ class Command:
     def __init__(self, cluster: RayCluster, run: Path):
         self.run, self._cluster = run, cluster
 
-    def start(self, *flags: str) -> subprocess.Popen[str]:
-        words = [*SMALL, "--run-dir", str(self.run), "--cluster.address", self._cluster.address, *flags]
+    def start(self, *flags: str, agent: list[str] = RAINBOW) -> subprocess.Popen[str]:
+        words = [*agent, *SMALL, "--run-dir", str(self.run), "--cluster.address", self._cluster.address, *flags]
         return subprocess.Popen(
             [sys.executable, "-m", "gvz.launch", *words],
             env=self._cluster.environment,
@@ -137,12 +144,23 @@ def test_a_run_survives_a_killed_host_a_stop_and_a_killed_learner(command: Comma
 
 
 @pytest.mark.slow
+def test_an_agent_that_learns_on_policy_can_have_hosts(command: Command):
+    learner = command.start(agent=PPO)
+    _, err = learner.communicate(timeout=240)
+    assert learner.returncode == 0, err
+    row = command.rows("metrics.jsonl")[-1]
+    assert (row["num_updates"], row["cluster/hosts"]) == (60, 2)
+    assert row["rollout/age_max_versions"] >= row["rollout/age_mean_versions"] > 0
+    assert not [fault for fault in command.rows("faults.jsonl") if fault["kind"] != "warning"]
+
+
+@pytest.mark.slow
 def test_a_run_of_two_hosts_goes_on_on_one_machine(command: Command):
     """The lanes of a run are fixed; who plays them is not."""
     first = command.start("--learner.total-updates", "40")
     _, err = first.communicate(timeout=240)
     assert first.returncode == 0, err
-    words = [*SMALL[: SMALL.index("--cluster.hosts")], "--run-dir", str(command.run)]
+    words = [*RAINBOW, *SMALL[: SMALL.index("--cluster.hosts")], "--run-dir", str(command.run)]
     changes = ["--actors.num-actors", "2", "--learner.total-updates", "60"]
     words[words.index("--actors.num-actors") : words.index("--actors.num-actors") + 2] = []
     done = subprocess.run(
@@ -159,8 +177,9 @@ def test_a_run_of_two_hosts_goes_on_on_one_machine(command: Command):
 
 @pytest.mark.slow
 def test_the_short_soak_loses_nothing_and_leaves_nothing(cluster: RayCluster):
-    flags = [*SMALL[SMALL.index("--env.frame-height") : SMALL.index("--log.period-updates")], "--cluster.batch-records"]
-    options = hosts_soak.HostsSoak(minutes=0.3, kill_every_s=8.0, hosts=2, sample_s=1.0, flags=(*flags, "64"))
+    frames = SMALL[SMALL.index("--env.frame-height") : SMALL.index("--log.period-updates")]
+    flags = (*RAINBOW[2:], *frames, "--cluster.batch-records", "64")
+    options = hosts_soak.HostsSoak(minutes=0.3, kill_every_s=8.0, hosts=2, sample_s=1.0, flags=flags)
     made = hosts_soak.soak(options, cluster, Console(quiet=True))
     assert len(made["kills"]) >= 1
     assert made["host_restarts"] == len(made["kills"]) == made["faults"]["host_died"]
@@ -176,7 +195,7 @@ def test_bad_input_is_one_line_and_exit_2_before_anything_starts(tmp_path: Path)
         (["--actors.inference", "device"], 'actors.inference: got "device" with cluster.hosts 2; want "actors"'),
         (["--replay.capacity", "500"], "replay.capacity: got 500, want at least 512 with cluster.hosts"),
     ):
-        words = [*SMALL, "--run-dir", str(tmp_path / "run"), "--cluster.address", "10.0.0.1:6379", *flags]
+        words = [*RAINBOW, *SMALL, "--run-dir", str(tmp_path / "run"), "--cluster.address", "10.0.0.1:6379", *flags]
         if "--replay.capacity" in flags:
             words[words.index("--replay.capacity") : words.index("--replay.capacity") + 2] = []
         done = subprocess.run([sys.executable, "-m", "gvz.launch", *words], capture_output=True, text=True, check=False)

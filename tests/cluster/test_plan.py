@@ -101,7 +101,7 @@ def test_what_cannot_be_is_refused(flags, name, got, capsys):
 
 def test_an_agent_without_a_replay_has_no_plan(capsys):
     assert cli.main("cluster plan --hosts 4 --cores 16 --config ppo_quick".split()) == 2
-    assert "--config: got ppo_quick, whose agent ppo learns on-policy; actor hosts are for" in capsys.readouterr().err
+    assert "--config: got ppo_quick, whose agent ppo learns on-policy; the plan is for" in capsys.readouterr().err
 
 
 def test_the_time_of_a_decision_is_that_of_the_committed_record():
