@@ -4,22 +4,45 @@ of the tests' processor time, and many tests compile the same functions.
 """
 
 import atexit
+import contextlib
 import os
 import shutil
 import signal
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+from gvz.core import janitor, records
+from gvz.core.errors import GvzError
 from tests.learner import seeds
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "xla"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
-os.environ["GVZ_RUNTIME_DIR"] = tempfile.mkdtemp(prefix="gvz-tests-")
+
+
+def _own_directory() -> tuple[Path, IO[str]]:
+    """A new directory and its lock, which tells other test processes that this one lives."""
+    while True:
+        path = Path(tempfile.mkdtemp(prefix="gvz-tests-"))
+        with contextlib.suppress(OSError):  # another one took it, still without a lock, for that of a dead process
+            file = (path / "lock").open("w")
+            if records.lock(file) and (path / "lock").exists():
+                return path, file
+
+
+for _left in Path(tempfile.gettempdir()).glob("gvz-tests-*"):
+    with contextlib.suppress(OSError, GvzError), (_left / "lock").open("r+") as _file:
+        if records.lock(_file):  # its test process was killed
+            os.environ["GVZ_RUNTIME_DIR"] = str(_left)
+            janitor.clean_dead_instances()
+            shutil.rmtree(_left)
+_DIRECTORY, _LOCK = _own_directory()
+_OWNER = os.getpid()
+os.environ["GVZ_RUNTIME_DIR"] = str(_DIRECTORY)
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job; programs under test would inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -32,10 +55,11 @@ settings.load_profile("any machine")
 @atexit.register
 def _clean_up() -> None:
     """Removes what tests that kill with SIGKILL have left, as the next start would; then the records of it."""
-    from gvz.core import janitor
-
+    if os.getpid() != _OWNER:
+        return  # a fork
     janitor.clean_dead_instances()
-    shutil.rmtree(os.environ["GVZ_RUNTIME_DIR"], ignore_errors=True)
+    shutil.rmtree(_DIRECTORY, ignore_errors=True)
+    _LOCK.close()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -151,7 +151,7 @@ def trained_player(run_dir: Path, config: RunConfig, num_updates: int) -> Player
     )
 
 
-def load_player(run: str | Path, checkpoint: str = "newest", own_files: OwnFiles = NO_OWN_FILES) -> PlayerSpec:
+def load_player(run: str | Path, checkpoint: str | int = "newest", own_files: OwnFiles = NO_OWN_FILES) -> PlayerSpec:
     """A policy to play with: its `make_player` gives the player, its `make_env` the game of a task.
 
     Args:
@@ -163,8 +163,10 @@ def load_player(run: str | Path, checkpoint: str = "newest", own_files: OwnFiles
         ConfigError, CheckpointError: there is no such policy, or it is damaged.
     """
     run_dir = run_directory(Path(run))
-    [num_updates] = find_checkpoints(run_dir, [checkpoint])
-    return trained_player(run_dir, read_run_config(run_dir, own_files), num_updates)
+    found = find_checkpoints(run_dir, [str(checkpoint)])
+    if len(found) > 1:
+        raise ConfigError(f"checkpoint: got {checkpoint}, want one of {', '.join(map(str, found))}")
+    return trained_player(run_dir, read_run_config(run_dir, own_files), found[0])
 
 
 class TrainedPlayer:

@@ -41,7 +41,7 @@ from gvz.tasks import named_tasks
 def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, tmp_path, small_run):
     (tmp_path / "file").write_text("nonsense\n")
     places = {"file": tmp_path / "file", "run": small_run, "above": small_run.parent}
-    assert cli.main(["evaluate", *arguments.format(**places).split()]) == 2
+    assert cli.main(["evaluate", *(word.format(**places) for word in arguments.split())]) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith("error: ")

@@ -151,7 +151,7 @@ def test_status_tells_done_failed_and_waiting_apart(tmp_path, capsys):
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capsys, arguments, message):
-    assert main(["experiment", *arguments.format(tmp_path).split()]) == 2
+    assert main(["experiment", *(word.format(tmp_path) for word in arguments.split())]) == 2
     err = capsys.readouterr().err
     assert message in err
     assert err.count("\n") == 1

@@ -41,7 +41,7 @@ def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys,
     (tmp_path / "file").touch()
     (tmp_path / "d.webp").mkdir()
     places = {"file": tmp_path / "file", "run": small_run, "tmp_path": tmp_path}
-    assert cli.main(["record", *arguments.format(**places).split()]) == 2
+    assert cli.main(["record", *(word.format(**places) for word in arguments.split())]) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith("error: ")

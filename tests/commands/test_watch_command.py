@@ -18,7 +18,7 @@ from gvz import cli
     ],
 )
 def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, small_run):
-    assert cli.main(["watch", *arguments.format(run=small_run).split()]) == 2
+    assert cli.main(["watch", *(word.format(run=small_run) for word in arguments.split())]) == 2
     assert capsys.readouterr().err == f"error: {message}\n"
 
 

@@ -127,13 +127,17 @@ def test_a_signal_saves_and_ends_everything(tmp_path, number, code):
 
 def test_a_second_signal_ends_at_once_and_clean(tmp_path):
     run = tmp_path / "run"
-    process = launch(run, "--learner.total-updates", "1000000")
+    stuck = "gvz.run.saver.Saver.save_last = lambda *_: __import__('time').sleep(600)"
+    process = launch(run, "--learner.total-updates", "1000000", patch=stuck)
     wait_until(lambda: num_updates(run) >= 20, "20 updates")
     children = descendants(process)
     process.send_signal(signal.SIGINT)
-    process.send_signal(signal.SIGINT)
-    code, err = finish(process)
-    assert code == 130, err
+    assert process.stderr is not None
+    while "stopping: " not in (line := process.stderr.readline()):
+        assert line, "it has ended"
+    process.send_signal(signal.SIGINT)  # only now, since two signals at once are one
+    code, err = finish(process, 120)
+    assert (code, err.splitlines()[-1]) == (130, "stopped at once")
     assert not alive(children)
 
 

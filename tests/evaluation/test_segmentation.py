@@ -169,6 +169,7 @@ def test_workers_make_the_same_batches(tmp_path):
         theirs = list(
             itertools.islice(segmentation.batches_of_workers(executor, 3, tasks, tmp_path, BatchSpec(2, seed=5)), 6)
         )
+    assert len(theirs) == 6
     for (screens, labels), (screens_there, labels_there) in zip(here, theirs, strict=False):
         np.testing.assert_array_equal(screens_there, screens)
         np.testing.assert_array_equal(labels_there, labels)
@@ -225,9 +226,9 @@ def test_workers_have_nothing_in_shared_memory_that_a_kill_of_all_processes_woul
     assert workers
     assert not any("/dev/shm" in maps for maps in mapped)
     deadline = time.monotonic() + 60
-    while any(map(psutil.pid_exists, workers)) and time.monotonic() < deadline:
+    while any(map(janitor.process_start, workers)) and time.monotonic() < deadline:
         time.sleep(0.05)
-    assert not any(map(psutil.pid_exists, workers))
+    assert not any(map(janitor.process_start, workers))
 
 
 def test_a_screen_is_normalized_in_training_as_it_is_later():

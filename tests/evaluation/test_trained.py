@@ -15,7 +15,14 @@ from gvz.core.registry import OwnFiles
 from gvz.env import DoomEnv
 from gvz.evaluation.choice import EpisodeChoice
 from gvz.evaluation.selection import TaskSelection
-from gvz.evaluation.trained import TrainedPlayer, check_tasks, find_checkpoints, read_run_config, trained_player
+from gvz.evaluation.trained import (
+    TrainedPlayer,
+    check_tasks,
+    find_checkpoints,
+    load_player,
+    read_run_config,
+    trained_player,
+)
 from gvz.run.assemble import run_agent
 from gvz.run.config_files import config_to_dict
 from gvz.tasks import named_tasks, parse_task
@@ -134,6 +141,15 @@ def test_what_is_no_run_is_an_error(tmp_path, run):
     (run / "config.json").write_text("{}")
     with pytest.raises(ConfigError, match=r"config\.json cannot be read"):
         read_run_config(run)
+
+
+def test_a_loaded_player_is_of_one_policy(run):
+    wanted = trained_player(run, read_run_config(run), 20)
+    for checkpoint in ("20", 20):
+        assert load_player(run, checkpoint).identity == wanted.identity
+    assert load_player(str(run)).identity["num_updates"] == 100
+    with pytest.raises(ConfigError, match=r"checkpoint: got all, want one of .*20, 100"):
+        load_player(run, "all")
 
 
 def test_an_encoders_file_is_executed_only_if_it_is_named(tmp_path, run):

@@ -86,7 +86,9 @@ def saved_config(directory: Path) -> Target:
         return True
 
     fresh = [json.dumps(config_to_dict(load_config(name))).encode() for name in ("rainbow_4task", "dqn_4task")]
-    keys = [json.dumps(key).encode() for key in {*config_to_dict(default)["config"], "v_min", "num_actors", "tasks"}]
+    keys = [
+        json.dumps(key).encode() for key in sorted({*config_to_dict(default)["config"], "v_min", "num_actors", "tasks"})
+    ]
     return Target(run=run, seeds=[CONFIG_JSON, *fresh], words=[*JSON_WORDS, *keys, b"64", b'"sync"', b'"x.py"'])
 
 

@@ -34,7 +34,7 @@ def task_name(_directory: Path) -> Target:
         assert len(set(groups)) == len(groups)
         return True
 
-    attributes = {name for one in scenarios().values() for a in one.attributes for name in (a.name, *a.aliases)}
+    attributes = sorted({name for one in scenarios().values() for a in one.attributes for name in (a.name, *a.aliases)})
     words = [*scenarios(), *attributes, "default", "complete", "/", "+"]
     return Target(
         run=run,

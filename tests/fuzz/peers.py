@@ -116,7 +116,7 @@ def message(_directory: Path) -> Target:
         assert decode(encode(heard)) == heard
         return True
 
-    names = {name for one in MESSAGES for name in (one.__struct_config__.tag, *one.__struct_fields__)}
+    names = sorted({name for one in MESSAGES for name in (one.__struct_config__.tag, *one.__struct_fields__)})
     words = [bytes([0xA0 + len(name)]) + name.encode() for name in names if len(name) < 32]
     odd = [
         b"\xc0",

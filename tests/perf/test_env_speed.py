@@ -1,7 +1,6 @@
 """What the environment costs on top of the engine, and how long it takes to the first frame and to the next episode.
 
-`make bench` times the bodies and holds `step` to its limit; a plain test run goes through each body once and holds
-`step` to a limit that no noise on a busy machine reaches.
+`make bench-micro` times the bodies; a plain test run goes through each of them once.
 """
 
 import itertools
@@ -71,13 +70,13 @@ def median_costs(env: DoomEnv, bare: Engine, first: int, num_episodes: int) -> t
 
 
 def test_a_step_costs_little_more_than_the_bare_engine(env: DoomEnv, bare: Engine, benchmark: BenchmarkFixture):
-    """The goal is a ratio of at most 1.15 in the best round; it stands in the record, since machines are shared."""
+    """The goal is a ratio of at most 1.15 in the best round; it stands in the record, since machines are shared, and no
+    test asserts times. That both play the same episodes is asserted."""
     rounds, num_episodes = (1, 2) if benchmark.disabled else (5, 12)
     costs = [median_costs(env, bare, 100 * r, num_episodes) for r in range(rounds)]
     ratios = [step / bare_step for step, bare_step in costs]
     benchmark.extra_info.update(ratios=ratios, step_us=costs[0][0] * 1e6, bare_us=costs[0][1] * 1e6)
     benchmark.pedantic(lambda: median_costs(env, bare, 0, 1), rounds=1)
-    assert all(ratio > 0 for ratio in ratios)
 
 
 def test_a_steps_cost(env: DoomEnv, benchmark: BenchmarkFixture):
