@@ -71,14 +71,14 @@ def _memory(node: Node) -> Finding:
 def _clocks(nodes: Sequence[Node]) -> Generator[Finding]:
     """Asked once more: by now every node has a worker that waits for work."""
     begin_s = time.time()
-    for node, theirs_s in zip(nodes, (time_s for _, time_s in on_nodes(clock)), strict=True):
+    names = {node.id: node.name for node in nodes}
+    for answered, theirs_s in on_nodes(clock):
+        name = names.get(answered["NodeID"], answered["NodeID"])  # one may have come or left since
         apart_s = max(begin_s - theirs_s, theirs_s - time.time(), 0.0)
         if apart_s > CLOCK_TOLERANCE_S:
-            yield Finding(
-                "clock", "note", f"{node.name}: {apart_s:.1f} s apart from here", "run an NTP client on all nodes"
-            )
+            yield Finding("clock", "note", f"{name}: {apart_s:.1f} s apart from here", "run an NTP client on all nodes")
         else:
-            yield Finding("clock", "ok", f"{node.name}: less than {max(apart_s, time.time() - begin_s):.2f} s apart")
+            yield Finding("clock", "ok", f"{name}: less than {max(apart_s, time.time() - begin_s):.2f} s apart")
 
 
 def clock() -> float:

@@ -40,7 +40,7 @@ class Placement:
     def check_room(self) -> None:
         """Raises ConfigError: the machines have not the cores for `min_hosts` hosts."""
         need, machines = self.cores(self._hosts[0]), self._backend.machines()
-        if sum(m.cpus // need if need else 1 for m in machines) < self._config.min_hosts:
+        if need and sum(m.cpus // need for m in machines) < self._config.min_hosts:
             sizes = ", ".join(f"{m.name} {m.cpus}" for m in machines)
             raise ConfigError(
                 f"cluster.hosts: got {len(self._hosts)} hosts of {need} cores each, but the cluster's nodes have "

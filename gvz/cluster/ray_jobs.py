@@ -102,10 +102,12 @@ class RemoteProcess:
         self._asked_s = time.monotonic()
         self._started = False
         self._code: int | None = None
+        self.problem = ""
 
     def poll(self) -> int | None:
         """Exit code, TAKEN, LOST; None while it runs or waits for a node. Never waits itself."""
         import ray
+        from ray.exceptions import RayTaskError
 
         if self._code is not None:
             return self._code
@@ -115,6 +117,10 @@ class RemoteProcess:
             return self._code
         try:
             answer: Any = ray.get(self._call)
+        except RayTaskError as error:  # the node is alive, and the job cannot run there
+            self.problem = str(error).strip().splitlines()[-1]
+            self._end(1)
+            return self._code
         except Exception:  # Ray's errors have no common class; whatever it is, the node has not kept the job
             self._end(LOST)
             return self._code

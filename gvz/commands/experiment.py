@@ -187,7 +187,7 @@ class Status:
     results: Path = DEFAULT_RESULTS
     """results directory"""
     shard: str = "1/1"
-    """i/n: only the jobs of this shard"""
+    """i/n: only the jobs of this shard of all experiments of the directory; a command with some of them has others"""
     json: bool = False
     """one JSON object a line for each job, instead of text"""
 

@@ -149,9 +149,8 @@ def job_state(results: Path, job: str, *, done: bool, begun: bool) -> State:
 def exit_code(log: Path) -> int | None:
     """Of the last command in a log; None if it has not ended, or was killed before it could be noted."""
     lines = records.last_lines(log)
-    if not lines or not lines[-1].startswith(END_MARK):
-        return None
-    return int(lines[-1].removeprefix(END_MARK).split()[0])
+    ended = re.fullmatch(rf"{END_MARK}(\d+) after \d+ s", lines[-1]) if lines else None
+    return None if ended is None else int(ended[1])
 
 
 def seconds_of(log: Path, step: str) -> float:

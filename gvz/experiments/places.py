@@ -1,4 +1,4 @@
-"""Where jobs run: shares of this machine's cores and GPUs. `gvz/cluster/jobs.py` has those of a cluster."""
+"""Where jobs run: shares of this machine's cores and GPUs. `gvz/cluster/ray_jobs.py` has those of a cluster."""
 
 import os
 import shutil

@@ -13,7 +13,7 @@ from gvz.core import records
 from gvz.core.errors import ConfigError
 from gvz.evaluation.simple import SimplePlayerName
 from gvz.experiments.base import Experiment, TrainingRun, experiment_named
-from gvz.experiments.scale import scaled
+from gvz.experiments.scale import CHECK_BELOW, scaled
 from gvz.tasks import scenario_named
 
 PLAN_SCHEMA = 2
@@ -122,12 +122,14 @@ class Plan:
                 f"--scale: got {other.scale:g}, but the results there have {self.scale:g}, and scales cannot be mixed; "
                 "give the same, or another --results"
             )
-        both = dict(self.asked)
-        for name, scenarios in other.asked.items():
-            before = both.get(name, ())
-            both[name] = None
-            if before is not None and scenarios is not None:
-                both[name] = tuple(dict.fromkeys((*before, *scenarios)))
+        both, mine = dict(self.asked), {experiment.name: experiment.scenarios for experiment in self.experiments()}
+        for experiment in other.experiments():
+            name, new = experiment.name, other.asked[experiment.name]
+            wanted = (both.get(name, new), new)
+            if wanted == (None, None) or (None in wanted and self.scale >= CHECK_BELOW):
+                both[name] = None
+            else:  # at a smaller scale, None is the first scenario alone
+                both[name] = tuple(dict.fromkeys((*mine.get(name, ()), *experiment.scenarios)))
         return Plan(asked=both, scale=self.scale)
 
 
@@ -154,7 +156,8 @@ def read_plan(results: Path) -> Plan | None:
         )
     except (ValueError, KeyError, TypeError, OSError, RecursionError) as error:
         if isinstance(error, ConfigError):
-            raise
+            text = str(error).removeprefix(f"{file}: ")
+            raise ConfigError(f"{file}: {text}; change it there, or move the file aside") from error
         raise ConfigError(f"{file} cannot be read: {error!r}; move it aside to make a new plan") from error
 
 

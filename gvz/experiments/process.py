@@ -1,5 +1,6 @@
 """The process of a job's command, its log, and how it ends."""
 
+import contextlib
 import os
 import shlex
 import signal
@@ -21,6 +22,9 @@ LOST = -2
 
 class Process(Protocol):
     """A command at work, here or on another machine."""
+
+    problem: str
+    """why it could not begin; empty if it could"""
 
     @property
     def where(self) -> str:
@@ -48,6 +52,7 @@ class LocalProcess:
     """
 
     where = ""
+    problem = ""  # where it cannot begin, `start` raises
 
     def __init__(
         self,
@@ -131,4 +136,5 @@ class LocalProcess:
             self.poll()
 
     def _note(self, line: str) -> None:
-        self._log.write(f"{line}\n".encode())
+        with contextlib.suppress(OSError):  # a full disk: the command is worth more than this line
+            self._log.write(f"{line}\n".encode())

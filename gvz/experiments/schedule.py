@@ -52,6 +52,9 @@ def run_jobs(jobs: Sequence[Job], places: Places) -> int:
             return schedule.summary()
         except KeyboardInterrupt:  # a second signal
             return stop.exit_code
+        except Exception:  # such as a cluster without its head: what runs saves itself first
+            schedule.stop()
+            raise
         finally:
             schedule.kill()
 
@@ -71,6 +74,7 @@ class Schedule:
 
     def step(self) -> bool:
         """Looks for commands that have ended, and starts others; False when nothing is left."""
+        self._places.room()  # raises if there will be none any more, also when nothing waits
         for running in list(self._running):
             code = running.process.poll()
             if code is not None and not (code == 0 and self._settles(running)):
@@ -136,7 +140,8 @@ class Schedule:
             self._waiting.appendleft(job)
             return
         else:
-            why = f"exit code {code}" if code else f"it ended as if all were done, but {outlook.next} is left"
+            ended = f"exit code {code}" if code else f"it ended as if all were done, but {outlook.next} is left"
+            why = running.process.problem or ended
         log = inventory.log_file(job.results, job.id)
         self._failed.append(job)
         self._end(job, f"FAILED ({running.command.step}: {why}; log {log})")

@@ -72,6 +72,12 @@ def problem(path: str, text: str) -> str:
         return f"reads old contents in {file.parent}; {_MOUNT}"
     if not records.is_locked(file):
         return f"does not see locks of others in {file.parent}; {_MOUNT}"
+    try:
+        beside = file.with_name(f"{file.name}-{secrets.token_hex(4)}")
+        beside.touch()
+        beside.unlink()
+    except OSError as error:
+        return f"cannot write to {file.parent} ({error.strerror}); mount it for writing"
     return ""
 
 

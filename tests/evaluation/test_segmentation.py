@@ -18,6 +18,7 @@ import numpy as np
 import psutil
 import pytest
 
+from gvz.core import janitor
 from gvz.core.env_config import LABEL_CLASSES
 from gvz.core.errors import GvzError
 from gvz.env import DoomEnv

@@ -103,6 +103,15 @@ def test_a_finished_run_whose_records_are_compressed_is_as_far_as_they_say():
     assert progress.last_update(directory) == 20_000
 
 
+def test_an_end_line_that_a_full_disk_has_cut_is_no_end(tmp_path):
+    line = f"{progress.END_MARK}130 after 12 s"
+    for length in range(len(line)):
+        (tmp_path / "one.log").write_text(f"launching\n{line[:length]}")
+        assert progress.exit_code(tmp_path / "one.log") is None or length == len(line)
+    (tmp_path / "one.log").write_text(f"launching\n{line}\n")
+    assert progress.exit_code(tmp_path / "one.log") == 130
+
+
 def test_episodes_of_another_base_seed_do_not_count(tmp_path):
     directory = save_policies(tmp_path, 100, 200, 300)
     (directory / "evaluation.jsonl").write_text(row("a", 0, num_updates=100, base_seed=7))

@@ -71,6 +71,22 @@ def test_plan_json_gathers_what_was_asked_for(tmp_path):
     assert {p.name for p in tmp_path.iterdir()} == {"plan.json", ".plan.lock"}
 
 
+@pytest.mark.parametrize("first", [None, ("seek_and_kill",)])
+def test_at_a_scale_that_takes_one_scenario_a_further_one_can_be_asked_for(tmp_path, first):
+    later = ("seek_and_kill",) if first is None else None
+    for chosen in (first, later, later, first):
+        write_plan(tmp_path, Plan.of("rainbow_evaluation", scale=0.001, scenarios=chosen))
+    plan = read_plan(tmp_path)
+    assert {run.scenario for run in plan.runs()} == {"defend_the_center", "seek_and_kill"}
+
+
+def test_a_plan_of_an_experiment_that_is_gone_is_named_with_its_file(tmp_path):
+    saved = {"schema": 2, "scale": 1.0, "experiments": {"gate_old": None, "gate_ammo": None}}
+    (tmp_path / "plan.json").write_text(json.dumps(saved))
+    with pytest.raises(ConfigError, match=r"plan\.json: unknown experiment 'gate_old'.*; change it there, or move"):
+        read_plan(tmp_path)
+
+
 @pytest.mark.parametrize("chosen", [None, ["seek_and_kill", "health_gathering"]])
 def test_the_first_schema_had_one_choice_of_scenarios_for_all_experiments(tmp_path, chosen):
     names = ["training_set_size", "rainbow_evaluation"]

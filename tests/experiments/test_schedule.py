@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from gvz.core import records
-from gvz.core.errors import ConfigError
+from gvz.core.errors import ConfigError, GvzError
 from gvz.experiments import inventory as progress
 from gvz.experiments.jobs import Command, Outlook
 from gvz.experiments.places import Machine, Slot, gpus, make_slots
@@ -67,6 +67,31 @@ def test_jobs_are_done_command_by_command_and_done_ones_are_left_alone(tmp_path,
     assert log(two).count("# ended with exit code 0") == 2
     assert not progress.log_file(tmp_path, "done").exists()
     assert "done: two" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("waiting", [0, 1])
+def test_jobs_save_themselves_when_there_will_be_no_room_any_more(tmp_path, waiting):
+    saves = f"""
+import pathlib, signal, sys, time
+def save(*_):
+    pathlib.Path({str(tmp_path / "saved")!r}).touch()
+    sys.exit(130)
+signal.signal(signal.SIGINT, save)
+pathlib.Path({str(tmp_path / "begun")!r}).touch()
+time.sleep(60)
+"""
+
+    class Gone(Machine):
+        def room(self, step: str | None = None) -> bool:
+            if (tmp_path / "begun").exists():
+                raise GvzError("its head is gone")
+            return super().room(step)
+
+    jobs = [Program(id=str(n), results=tmp_path, first=saves) for n in range(1 + waiting)]
+    with pytest.raises(GvzError, match="its head is gone"):
+        run_jobs(jobs, Gone([SLOT]))
+    assert (tmp_path / "saved").exists()
+    assert progress.job_state(tmp_path, "0", done=False, begun=True) == "stopped"
 
 
 def test_a_failure_sinks_no_other_job_and_is_named_with_its_log(tmp_path, capsys):

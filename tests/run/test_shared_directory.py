@@ -1,12 +1,15 @@
 """A directory that several machines share: what its checks find, and what they find where it is not fit."""
 
+import errno
 import fcntl
 import json
+import os
 import re
 import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -72,6 +75,17 @@ def test_a_mark_is_known_by_its_place_text_and_lock(tmp_path):
     unlocked = tmp_path / "file"
     unlocked.write_text(text)
     assert "does not see locks of others" in shared_directory.problem(str(unlocked), text)
+
+
+def test_a_directory_that_a_machine_cannot_write_to_is_named(tmp_path, monkeypatch):
+    def refused(*_: object, **__: object) -> None:
+        raise PermissionError(errno.EROFS, os.strerror(errno.EROFS))
+
+    with shared_directory.mark(tmp_path) as (path, text):
+        monkeypatch.setattr(Path, "touch", refused)
+        assert shared_directory.problem(path, text) == (
+            f"cannot write to {tmp_path} (Read-only file system); mount it for writing"
+        )
 
 
 def test_an_old_lock_file_says_nothing(tmp_path):
