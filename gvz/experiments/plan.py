@@ -125,8 +125,10 @@ class Plan:
         both, mine = dict(self.asked), {experiment.name: experiment.scenarios for experiment in self.experiments()}
         for experiment in other.experiments():
             name, new = experiment.name, other.asked[experiment.name]
-            wanted = (both.get(name, new), new)
-            if wanted == (None, None) or (None in wanted and self.scale >= CHECK_BELOW):
+            before = both.setdefault(name, new)
+            if before == new:
+                continue
+            if None in (before, new) and self.scale >= CHECK_BELOW:
                 both[name] = None
             else:  # at a smaller scale, None is the first scenario alone
                 both[name] = tuple(dict.fromkeys((*mine.get(name, ()), *experiment.scenarios)))
