@@ -229,6 +229,7 @@ class Dispatcher:
                 self._call(host, life, call, self._take)
             if self._sent is not None and not life.taking_params and life.params_version < self._sent[1].version:
                 life.taking_params, life.params_version = True, self._sent[1].version
+                life.params_asked_s = self._clock.now_s
                 self._call(host, life, life.remote.set_params(*self._sent), self._took_params)
         except HostError as error:
             self._discard(host, "host_died", str(error))
@@ -297,24 +298,32 @@ class Dispatcher:
             self._discard(host, "host_failed", failure)
 
     def _params_age_s(self, batch: Batch) -> float:
-        """Mean time since the publication of the parameters that chose the actions; 0 if that is too long ago."""
+        """Mean time since the publication of the parameters that chose the actions; less for forgotten ones."""
         now_s, published_s = time.monotonic(), self._published_s
         versions, counts = np.unique(batch.block.steps["params_version"], return_counts=True)
-        ages = [now_s - published_s.get(version, now_s) for version in versions.tolist()]
+        oldest_s = min(published_s.values(), default=now_s)
+        ages = [now_s - published_s.get(version, oldest_s) for version in versions.tolist()]
         return float(np.average(ages, weights=counts))
 
     # ------------------------------------------------------------------------------------------- faults
 
     def _check_silence(self, host: SupervisedHost) -> None:
-        life = host.incarnation
-        if life is None or (host.is_playing and not life.asked):
+        life, limit_s = host.incarnation, self._config.silence_timeout_s
+        if life is None:
             return
-        silent_s = self._clock.now_s - life.heard_s
-        if not host.is_playing and silent_s > (limit_s := host.pool.actors.start_timeout_s):
-            what = f"gave no answer for {silent_s:.0f} s (actors.start_timeout_s {limit_s:g}) while it was started"
-            self._discard(host, "host_start", what)
-        elif host.is_playing and silent_s > (limit_s := self._config.silence_timeout_s):
+        silent_s, taking_s = self._clock.now_s - life.heard_s, self._clock.now_s - life.params_asked_s
+        if not host.is_playing:
+            if silent_s > (start_s := host.pool.actors.start_timeout_s):
+                what = f"gave no answer for {silent_s:.0f} s (actors.start_timeout_s {start_s:g}) while it was started"
+                self._discard(host, "host_start", what)
+        elif life.asked and silent_s > limit_s:
             what = f"gave no sign of life for {silent_s:.1f} s (cluster.silence_timeout_s {limit_s:g})"
+            self._discard(host, "host_silent", what)
+        elif life.taking_params and taking_s > limit_s:
+            what = (
+                f"did not take parameters for {taking_s:.1f} s (cluster.silence_timeout_s {limit_s:g}); can it reach "
+                "the learner's ports? See gvz cluster doctor"
+            )
             self._discard(host, "host_silent", what)
 
     def _discard(self, host: SupervisedHost, kind: str, what: str) -> None:

@@ -41,6 +41,8 @@ class Incarnation:
     params_version: int = -1
     """newest parameters that it was given"""
     taking_params: bool = False
+    params_asked_s: float = 0.0
+    """when it was last given parameters"""
     newest: BatchHeader | None = None
 
     def was_stable(self, now_s: float) -> bool:

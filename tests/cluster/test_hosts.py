@@ -224,6 +224,31 @@ def test_a_host_that_dies_or_is_silent_is_replaced(play, fault: str, monkeypatch
         time.sleep(0.1)
 
 
+def test_a_host_that_parameters_do_not_reach_is_replaced(play, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Although its batches come: it would play old ones for the rest of the run."""
+    import ray
+
+    from gvz.cluster.ray_hosts import RayRemote
+
+    monkeypatch.setattr(supervised, "_FIRST_BACKOFF_S", 0.05)
+    cut_off: list[RayRemote] = []
+    never, set_params = ray.remote(num_cpus=0)(lambda: time.sleep(600)), RayRemote.set_params
+
+    def first_is_cut_off(remote: RayRemote, params: Any, header: ParamsHeader) -> Any:
+        if not cut_off:
+            cut_off.append(remote)
+        return never.remote() if remote in cut_off else set_params(remote, params, header)
+
+    monkeypatch.setattr(RayRemote, "set_params", first_is_cut_off)
+    games = ObservationBatch.of(config(tmp_path, {}), 2)
+    policy = export_act(lambda leaves, *_: leaves[0][:2].astype("int32"), [(4,)], games)
+    played = play({"length": 20}, policy=policy, num_params=4, layout_hash=7, silence_timeout_s=3.0)
+    played.pool.publish(np.full(4, 1, np.float32), ParamsHeader(version=1, num_updates=1, layout_hash=7))
+    told = played.until_fault("host_silent")
+    assert "did not take parameters for 3." in told.message
+    played.until_replaced()
+
+
 def _host_of(process: psutil.Process) -> int:
     """The host's index: its actors' logs are named by their numbers."""
     for child in process.children(recursive=True):
