@@ -158,8 +158,9 @@ def read_plan(results: Path) -> Plan | None:
         )
     except (ValueError, KeyError, TypeError, OSError, RecursionError) as error:
         if isinstance(error, ConfigError):
-            text = str(error).removeprefix(f"{file}: ")
-            raise ConfigError(f"{file}: {text}; change it there, or move the file aside") from error
+            if str(error).startswith(str(file)):
+                raise
+            raise ConfigError(f"{file}: {error}; change it there, or move the file aside") from error
         raise ConfigError(f"{file} cannot be read: {error!r}; move it aside to make a new plan") from error
 
 

@@ -152,7 +152,7 @@ class RunDir:
         moved = self.path / "discarded" / "policies"
         with disk_checked(self.path):
             for policy in (self.path / "policies").glob("*"):
-                if policy.name.isdecimal() and int(policy.name) > num_updates:
+                if policy.is_dir() and policy.name.isdecimal() and int(policy.name) > num_updates:
                     moved.mkdir(parents=True, exist_ok=True)
                     shutil.rmtree(moved / policy.name, ignore_errors=True)
                     policy.rename(moved / policy.name)
