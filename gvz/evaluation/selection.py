@@ -31,7 +31,9 @@ class TaskSelection:
             TaskError: an unknown name. ConfigError: ids together with another choice, or no task fits the choice.
         """
         if self.scenario is not None and self.suite != "core" and scenario_named(self.scenario).suite != self.suite:
-            raise ConfigError(f"--suite: got {self.suite} and also --scenario {self.scenario}, which is of another suite")
+            raise ConfigError(
+                f"--suite: got {self.suite} and also --scenario {self.scenario}, which is of another suite"
+            )
         if not self.tasks:
             return self._named((self.scenario,))
         if (self.scenario, self.split, self.level) != (None, None, None):
