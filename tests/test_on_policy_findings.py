@@ -50,7 +50,7 @@ def test_the_findings_say_what_ppo_has_beside_segmented_frames(scenario):
 
 def test_the_findings_say_what_ppo_has_in_the_mean_of_the_scenarios():
     rainbow, ppo = (means({name: scores_of(name)[agent] for name in scenarios()}) for agent in (0, 1))
-    assert f"| mean | Rainbow, two or three seeds | {' | '.join(rainbow)} |" in PAGE
+    assert f"| mean | Rainbow, three seeds | {' | '.join(rainbow)} |" in PAGE
     assert f"| mean | PPO, one seed | {' | '.join(ppo)} |" in PAGE
     assert f"On level 4 it has {ppo[3]}, Rainbow {rainbow[3]}." in WORDS
 

@@ -225,12 +225,12 @@ def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
         )
         in page
     )
-    assert f"Projectiles the gate tasks lose**: both seeds together have {of_both[9]} points." in page
+    assert f"Projectiles no gain is shown on the gate tasks**: all three seeds together have {of_both[9]} points." in page
     before = of_short["dodge_projectiles", "train8"]
     assert f"The training tasks had {before:.1f} before, and gain {of_both[8]} points; the test" in page
     assert f"points; the test tasks gain {of_both[10]}." in page
-    assert f"Both seeds of Dodge Projectiles together have {of_both[11]} points more." in page
-    assert f"gate tasks lose**: both seeds together have {of_both[13]} points, and each is below all three" in page
+    assert f"All three seeds of Dodge Projectiles together have {of_both[11]} points more." in page
+    assert f"gate tasks lose**: all three seeds together have {of_both[13]} points, and each is below all three" in page
     assert f"On training and test tasks no gain is shown: {of_both[12]} and {of_both[14]}." in page
     assert f"those of Health Gathering below ({of_both[15]} points)" in page
     for tasks in task_sets("health_gathering")[1::2]:
@@ -240,16 +240,16 @@ def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
     for task in ("short_agent", "short_agent+water"):
         assert f"health_gathering/{task}" not in task_sets("health_gathering")[0]
         of_task = [one.filter(task=f"health_gathering/{task}") for one in (all_long, short)]
-        seeds = [of_task[0].filter(run_seed=seed)["normalized_score"].mean() for seed in (1111, 2222)]
+        seeds = [of_task[0].filter(run_seed=seed)["normalized_score"].mean() for seed in (1111, 2222, 3333)]
         said += [f"{score:.0f}" for score in (*seeds, of_task[1]["normalized_score"].mean())]
-    words = "`short_agent` has {} and {} instead of {}, and `short_agent+water` {} and {} instead of {}."
+    words = "`short_agent` has {}, {} and {} instead of {}, and `short_agent+water` {}, {} and {} instead of {}."
     assert words.format(*said) in page
     said = []
     for task in ("arachnotron", "mancubus+resized_agent"):
         of_task = [one.filter(task=f"dodge_projectiles/{task}") for one in (all_long, short)]
-        seeds = [of_task[0].filter(run_seed=seed)["normalized_score"].mean() for seed in (1111, 2222)]
+        seeds = [of_task[0].filter(run_seed=seed)["normalized_score"].mean() for seed in (1111, 2222, 3333)]
         said += [f"{score:.0f}" for score in (*seeds, of_task[1]["normalized_score"].mean())]
-    words = "`arachnotron` has {} and {} instead of {}, `mancubus+resized_agent` {} and {} instead of {}."
+    words = "`arachnotron` has {}, {} and {} instead of {}, `mancubus+resized_agent` {}, {} and {} instead of {}."
     assert words.format(*said) in page
 
     said = []
