@@ -225,7 +225,7 @@ def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
         )
         in page
     )
-    assert f"Projectiles no gain is shown on the gate tasks**: all three seeds together have {of_both[9]} points." in page
+    assert f"no gain is shown on the gate tasks**: all three seeds together have {of_both[9]} points." in page
     before = of_short["dodge_projectiles", "train8"]
     assert f"The training tasks had {before:.1f} before, and gain {of_both[8]} points; the test" in page
     assert f"points; the test tasks gain {of_both[10]}." in page
