@@ -298,7 +298,10 @@ class Dispatcher:
             self._discard(host, "host_failed", failure)
 
     def _params_age_s(self, batch: Batch) -> float:
-        """Mean time since the publication of the parameters that chose the actions; less for forgotten ones."""
+        """Mean time since the publication of the parameters that chose the actions.
+
+        Versions that are not known any more count as the oldest known one: they are at least as old.
+        """
         now_s, published_s = time.monotonic(), self._published_s
         versions, counts = np.unique(batch.block.steps["params_version"], return_counts=True)
         oldest_s = min(published_s.values(), default=now_s)

@@ -51,7 +51,7 @@ class EpisodeChoice:
             ConfigError, TaskError, CheckpointError: there is no such player, task or checkpoint.
         """
         from gvz.evaluation.episode_log import simple_player
-        from gvz.evaluation.trained import check_tasks, find_checkpoints, read_run_config, trained_player
+        from gvz.evaluation.trained import check_tasks, find_checkpoint, read_run_config, trained_player
         from gvz.evaluation.zoo import run_directory
 
         if self.player is not None and self.run_dir is not None:
@@ -70,12 +70,10 @@ class EpisodeChoice:
         config = read_run_config(run_dir, OwnFiles(self.agent, self.encoder))
         task = config.table.tasks[0] if self.task is None else parse_task(self.task)
         check_tasks(config, [task])
-        found = find_checkpoints(run_dir, [self.checkpoint])
-        if len(found) > 1:
-            raise ConfigError(f"--checkpoint: got {self.checkpoint}, want one of {', '.join(map(str, found))}")
+        num_updates = find_checkpoint(run_dir, self.checkpoint)
         if task.scenario not in config.table.scenarios:  # a run's weights are of its own scenario's components
             config = dataclasses.replace(config, env=dataclasses.replace(config.env, reward_weights=()))
-        return trained_player(run_dir, config, found[0]), task
+        return trained_player(run_dir, config, num_updates), task
 
 
 ANY_EPISODE = EpisodeChoice()

@@ -120,6 +120,18 @@ def find_checkpoints(run_dir: Path, wanted: Sequence[str]) -> list[int]:
     return sorted(chosen)
 
 
+def find_checkpoint(run_dir: Path, wanted: str) -> int:
+    """One policy of a run, as gradient steps.
+
+    Raises:
+        ConfigError: as `find_checkpoints`, or `wanted` means several.
+    """
+    found = find_checkpoints(run_dir, [wanted])
+    if len(found) > 1:
+        raise ConfigError(f"--checkpoint: got {wanted}, want one of {', '.join(map(str, found))}")
+    return found[0]
+
+
 def trained_player(run_dir: Path, config: RunConfig, num_updates: int) -> PlayerSpec:
     """The policy of a run after `num_updates` gradient steps. Its parameters are read here, so that damage is reported
     before anything is played.
@@ -163,10 +175,7 @@ def load_player(run: str | Path, checkpoint: str | int = "newest", own_files: Ow
         ConfigError, CheckpointError: there is no such policy, or it is damaged.
     """
     run_dir = run_directory(Path(run))
-    found = find_checkpoints(run_dir, [str(checkpoint)])
-    if len(found) > 1:
-        raise ConfigError(f"checkpoint: got {checkpoint}, want one of {', '.join(map(str, found))}")
-    return trained_player(run_dir, read_run_config(run_dir, own_files), found[0])
+    return trained_player(run_dir, read_run_config(run_dir, own_files), find_checkpoint(run_dir, str(checkpoint)))
 
 
 class TrainedPlayer:

@@ -101,7 +101,7 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", own_files: OwnFil
         CheckpointError: the policy is damaged.
     """
     from gvz.core import records
-    from gvz.evaluation.trained import find_checkpoints, read_params, read_run_config, trained_player
+    from gvz.evaluation.trained import find_checkpoint, read_params, read_run_config, trained_player
     from gvz.run.config_files import config_to_dict
     from gvz.segmentation import KEPT_SEGMENTERS, keep_segmenters
     from learner import checkpoint as checkpoints
@@ -109,7 +109,7 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", own_files: OwnFil
     if not name.replace("_", "").replace("-", "").isalnum():
         raise ConfigError(f"zoo: got name {name!r}, want letters, digits, _ and -")
     config = read_run_config(run_dir, own_files)
-    [num_updates] = find_checkpoints(run_dir, [checkpoint])
+    num_updates = find_checkpoint(run_dir, checkpoint)
     _, params = read_params(run_dir, config, num_updates)
     with tempfile.TemporaryDirectory() as temporary:
         packed = Path(temporary) / name

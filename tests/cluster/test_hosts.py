@@ -29,6 +29,7 @@ from gvz.core import janitor
 from gvz.core.errors import ConfigError, ResumeError, WorkerError
 from gvz.transport.messages import EpisodeStats, Fault, ParamsHeader, Ready
 from tests.cluster.conftest import FAKE_GAMES, RayCluster
+from tests.cluster.host_processes import host_of, host_processes, processes
 from tests.processes import arguments
 
 pytestmark = pytest.mark.e2e
@@ -117,33 +118,18 @@ def play(backend_of, tmp_path: Path, nodes: RayCluster):
         time.sleep(0.1)
 
 
-def processes() -> list[psutil.Process]:
-    """Of hosts and actors of this module's cluster, on all its nodes."""
-    return [p for p in _ours() if "RemoteHost" in "".join(arguments(p)) or "actors.worker" in arguments(p)]
-
-
-def host_processes() -> list[psutil.Process]:
-    """Of hosts, oldest first."""
-    return sorted((p for p in _ours() if "RemoteHost" in "".join(arguments(p))), key=lambda p: p.create_time())
-
-
-def _ours() -> list[psutil.Process]:
-    mine = {p.pid for p in psutil.Process().children(recursive=True)}
-    found = []
-    for process in psutil.process_iter():
-        with contextlib.suppress(psutil.Error):
-            if process.pid in mine and process.status() != psutil.STATUS_ZOMBIE:
-                found.append(process)
-    return found
+def params_decide(tmp_path: Path) -> dict[str, Any]:
+    """Options of a pool whose actions are the first two of four parameters."""
+    games = ObservationBatch.of(config(tmp_path, {}), 2)
+    policy = export_act(lambda leaves, *_: leaves[0][:2].astype("int32"), [(4,)], games)
+    return {"policy": policy, "num_params": 4, "layout_hash": 7}
 
 
 # --------------------------------------------------------------------------------------------- play
 
 
 def test_hosts_on_different_nodes_play_all_lanes_by_the_newest_parameters(play, tmp_path: Path):
-    games = ObservationBatch.of(config(tmp_path, {}), 2)
-    policy = export_act(lambda leaves, *_: leaves[0][:2].astype("int32"), [(4,)], games)
-    played = play({"length": 20}, policy=policy, num_params=4, layout_hash=7, publish_period_s=0.2)
+    played = play({"length": 20}, **params_decide(tmp_path), publish_period_s=0.2)
 
     def publish(version: int) -> None:
         header = ParamsHeader(version=version, num_updates=version, layout_hash=7)
@@ -208,7 +194,7 @@ def test_a_host_that_dies_or_is_silent_is_replaced(play, fault: str, monkeypatch
     played.until_all_ready()
     played.play(500)
     before = played.node_of(0)
-    victim = next(p for p in host_processes() if _host_of(p) == 0)
+    victim = next(p for p in host_processes() if host_of(p) == 0)
     victim.send_signal(signal.SIGKILL if fault == "kill" else signal.SIGSTOP)
     told = played.until_fault("host_died" if fault == "kill" else "host_silent")
     assert told.actor == -1
@@ -240,23 +226,11 @@ def test_a_host_that_parameters_do_not_reach_is_replaced(play, tmp_path: Path, m
         return never.remote() if remote in cut_off else set_params(remote, params, header)
 
     monkeypatch.setattr(RayRemote, "set_params", first_is_cut_off)
-    games = ObservationBatch.of(config(tmp_path, {}), 2)
-    policy = export_act(lambda leaves, *_: leaves[0][:2].astype("int32"), [(4,)], games)
-    played = play({"length": 20}, policy=policy, num_params=4, layout_hash=7, silence_timeout_s=3.0)
+    played = play({"length": 20}, **params_decide(tmp_path), silence_timeout_s=3.0)
     played.pool.publish(np.full(4, 1, np.float32), ParamsHeader(version=1, num_updates=1, layout_hash=7))
     told = played.until_fault("host_silent")
     assert "did not take parameters for 3." in told.message
     played.until_replaced()
-
-
-def _host_of(process: psutil.Process) -> int:
-    """The host's index: its actors' logs are named by their numbers."""
-    for child in process.children(recursive=True):
-        if "actors.worker" in arguments(child):
-            with contextlib.suppress(psutil.Error, OSError):
-                log = Path(f"/proc/{child.pid}/fd/1").readlink().stem
-                return int(log.removeprefix("actor_")) // 2
-    return -1
 
 
 def test_an_actor_that_dies_is_its_hosts_matter(play):
@@ -327,7 +301,7 @@ def test_what_comes_too_late_is_dropped_and_counted(play, monkeypatch: pytest.Mo
 
     played = play({"length": 50, "step_s": 0.001}, silence_timeout_s=3.0)
     played.until_all_ready()
-    victim = next(p for p in host_processes() if _host_of(p) == 0)
+    victim = next(p for p in host_processes() if host_of(p) == 0)
     with monkeypatch.context() as patch:
         patch.setattr(RayRemote, "kill", lambda _: None)  # the network is cut: the host does not hear of its end
         lost = played.pool._hosts[0].incarnation
