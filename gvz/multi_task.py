@@ -10,6 +10,7 @@ from gvz.core.errors import ConfigError, TaskError
 from gvz.env import EPISODE_SEEDS, DoomEnv
 from gvz.observation import Observation
 from gvz.scenarios.base import Task
+from gvz.tasks import parse_task
 
 if TYPE_CHECKING:
     from gvz.engine.engine import Label
@@ -88,12 +89,12 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
                 sequence does not advance.
 
         Raises:
-            TaskError: the task is none of the environment's.
+            TaskError: no task has this id, or it is none of the environment's.
             ValueError, EngineError, ResourceError: as DoomEnv.
         """
         super().reset(seed=seed)
         rest = dict(options or {})
-        task = rest.pop("task") if "task" in rest else self._sampler(self.np_random)
+        task = parse_task(rest.pop("task") if "task" in rest else self._sampler(self.np_random)).id
         if task not in self._games:
             raise TaskError(f"reset: got task {task!r}, want one of {', '.join(self._games)}")
         self._game = game = self._games[task]

@@ -60,6 +60,14 @@ def test_the_sampler_chooses_and_the_seed_repeats_the_sequence():
 
 
 @pytest.mark.engine
+def test_a_task_may_be_chosen_by_any_of_its_names():
+    written = ["defend_the_center/resized_enemies+fuzzy_enemies", "defend_the_center/default"]
+    with gvz.make(written, sampler=lambda _rng: written[0]) as env:
+        assert env.reset(seed=1)[1]["task"] == env.tasks[0] == "defend_the_center/fuzzy_enemies+resized_enemies"
+        assert env.reset(options={"task": written[0]})[1]["task"] == env.tasks[0]
+
+
+@pytest.mark.engine
 def test_gymnasiums_checker_passes():
     env = gvz.make(["health_gathering/default", "health_gathering/lava"])
     check_env(env, skip_render_check=True)
@@ -73,5 +81,10 @@ def test_bad_input_is_named():
         gvz.make([TASKS[0], TASKS[0]])
     with pytest.raises(ConfigError, match="max_engines: got 0, want at least 1"):
         gvz.make(TASKS, action_set="unified_v1", max_engines=0)
-    with pytest.raises(TaskError, match="reset: got task 'doom', want one of defend_the_center/default, seek"):
-        gvz.make(TASKS, action_set="unified_v1").reset(options={"task": "doom"})
+    env = gvz.make(TASKS, action_set="unified_v1")
+    with pytest.raises(
+        TaskError, match="got task 'defend_the_center/gore', want one of defend_the_center/default, seek"
+    ):
+        env.reset(options={"task": "defend_the_center/gore"})
+    with pytest.raises(TaskError, match="'doom'"):
+        env.reset(options={"task": "doom"})

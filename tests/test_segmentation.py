@@ -171,3 +171,5 @@ def test_what_is_no_network_is_refused_by_name(tmp_path: Path):
         EnvConfig(segmenter="mine.onnx")
     with pytest.raises(ConfigError, match=r"env\.segmenter_temperature: got 2\.0 with env\.frames screen, want 1"):
         EnvConfig(segmenter_temperature=2.0)
+    with pytest.raises(ConfigError, match=r"env\.grayscale: got True with env\.frames segmented"):
+        EnvConfig(frames="segmented", grayscale=True)

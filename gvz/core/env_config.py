@@ -95,6 +95,8 @@ class EnvConfig:
             raise ConfigError(
                 f"env.segmenter_temperature: got {self.segmenter_temperature} with env.frames {self.frames}, want 1"
             )
+        if self.grayscale and self.frames == "segmented":
+            raise ConfigError("env.grayscale: got True with env.frames segmented, whose three channels are classes")
         for name, low, high in (
             ("frame_height", 8, 1080),
             ("frame_width", 8, 1920),

@@ -66,7 +66,9 @@ MAX_COMPONENTS = 64
 """of a file: every name is a column, and a small file could have more cells than fit into memory"""
 
 _IDENTITY = ("run_dir", "player", "params", "profile", "action_set", "frame_skip", "task", "episode", "seed")
-"""rows equal in these are one and the same episode"""
+"""rows of one directory that are equal in these are one and the same episode"""
+_POLICY_IDENTITY = tuple(name for name in _IDENTITY if name != "run_dir")
+"""of rows outside a run directory, whose policy is known by its weights"""
 
 _NOT_RECORDS = {"discarded", "work", "checkpoints", "policies", "tensorboard"}
 """directories of a run that hold no records, or only discarded ones"""
@@ -111,12 +113,26 @@ def collect_evaluations(paths: Iterable[Path | str]) -> tuple[pl.DataFrame, list
     """
     empty = pl.DataFrame(schema=REQUIRED | OPTIONAL | DERIVED)
     frames, problems = [empty], []
-    for file in evaluation_files(paths):
+    for file in sorted(evaluation_files(paths), key=lambda file: not _is_of_run(file)):
         frame, found = _read_file(file)
         frames.append(frame)
         problems += found
-    together = pl.concat(frames, how="diagonal")
-    return together.unique(_IDENTITY, keep="first", maintain_order=True), problems
+    together = pl.concat(frames, how="diagonal").unique(_IDENTITY, keep="first", maintain_order=True)
+    outside = pl.col("trained_on").is_null() & pl.col("params").is_not_null()
+    seen_before = pl.int_range(pl.len()).over(_POLICY_IDENTITY) > 0
+    together = together.filter(~(outside & seen_before))
+    policies = together.drop_nulls("params").group_by("run_dir", "player", "num_updates", maintain_order=True)
+    for run_dir, player, _, num_policies in policies.agg(pl.col("params").n_unique()).iter_rows():
+        if num_policies > 1:
+            problems.append(
+                f"{run_dir}: {player} has episodes of {num_policies} policies (`params`), which are put together as if "
+                "they were of one; leave out the records of the others"
+            )
+    return together, problems
+
+
+def _is_of_run(file: Path) -> bool:
+    return (file.parent / "config.json").is_file()
 
 
 def evaluation_files(paths: Iterable[Path | str]) -> list[Path]:

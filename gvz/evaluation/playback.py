@@ -76,7 +76,7 @@ def perform(player_spec: PlayerSpec, episode: Episode) -> Generator[Moment, None
         yield _moment(stage, stage_info, rewards, decided=True)
         ended = False
         while not ended:
-            action = np.int64(player.act())
+            action = player.act()
             values = player.values if isinstance(player, TrainedPlayer) else None
             observation, reward, terminated, truncated, info = env.step(action)
             ended = terminated or truncated

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from gvz.observation import Observation
 
 
+Action = int | np.integer | np.ndarray
+"""what `DoomEnv.step` takes"""
+
+
 class Player(Protocol):
     """Chooses one action at a time. Everything it does follows from the episode's seed."""
 
@@ -24,8 +28,8 @@ class Player(Protocol):
         """An episode of `env` has begun with `observation`. The player may look at `env`, never step it."""
         ...
 
-    def act(self) -> int:
-        """The next action."""
+    def act(self) -> Action:
+        """The next action, as `DoomEnv.step` takes it."""
         ...
 
     def observe(self, observation: "Observation", info: dict[str, Any]) -> None:
@@ -105,13 +109,13 @@ CLASSES: Mapping[str, Callable[[], Player]] = {
 
 
 class FramePlayer:
-    """Plays by a function of the last frames, `choose(stack) -> action`.
+    """Plays by a function of the last frames, `choose(stack) -> action`; the action is what `DoomEnv.step` takes.
 
     The stack is uint8[H, W, stack_size * C], oldest frame first along the channels; at an episode's start the first
     frame is repeated. It changes with the next decision: copy it to keep it.
     """
 
-    def __init__(self, choose: Callable[[np.ndarray], int], stack_size: int = 4):
+    def __init__(self, choose: Callable[[np.ndarray], Action], stack_size: int = 4):
         self._choose, self._stack_size = choose, stack_size
 
     def begin(self, env: "DoomEnv", observation: "Observation", info: dict[str, Any], seed: int) -> None:
@@ -120,8 +124,8 @@ class FramePlayer:
         self._stack = np.zeros((height, width, self._stack_size * channels), np.uint8)
         start_stack(self._stack, observation)
 
-    def act(self) -> int:
-        return int(self._choose(self._stack))
+    def act(self) -> Action:
+        return self._choose(self._stack)
 
     def observe(self, observation: "Observation", info: dict[str, Any]) -> None:
         assert isinstance(observation, np.ndarray)

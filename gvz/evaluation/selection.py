@@ -1,7 +1,7 @@
 """The flags that choose tasks."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from gvz.core.errors import ConfigError
 from gvz.scenarios.base import Suite, Task
@@ -36,8 +36,10 @@ class TaskSelection:
             )
         if not self.tasks:
             return self._named((self.scenario,))
-        if (self.scenario, self.split, self.level) != (None, None, None):
-            raise ConfigError("--tasks: got ids and also --scenario, --split or --level, want one or the other")
+        if replace(self, tasks=()) != ALL_TASKS:
+            raise ConfigError(
+                "--tasks: got ids and also --scenario, --split, --suite or --level, want one or the other"
+            )
         return tuple(dict.fromkeys(parse_task(text) for text in self.tasks))
 
     def of_run(self, scenarios: Sequence[str]) -> tuple[Task, ...]:
@@ -46,9 +48,16 @@ class TaskSelection:
         Raises:
             TaskError, ConfigError: as `resolve`.
         """
-        if self == ALL_TASKS:
-            return TaskSelection(split="test")._named(scenarios)
-        return self.resolve() if self.tasks or self.scenario else self._named(scenarios)
+        if self.tasks or self.scenario:
+            return self.resolve()
+        for scenario in map(scenario_named, scenarios) if self.suite != "core" else ():
+            if scenario.suite != self.suite:
+                raise ConfigError(
+                    f"--suite: got {self.suite}, but the run was trained on {scenario.id}, which is of the suite "
+                    f"{scenario.suite}; choose tasks of other scenarios by --scenario or --tasks"
+                )
+        split = "test" if replace(self, suite="core") == ALL_TASKS else self.split
+        return replace(self, split=split)._named(scenarios)
 
     def _named(self, scenarios: Sequence[str | None]) -> tuple[Task, ...]:
         """The named tasks of these scenarios; None stands for all.

@@ -31,7 +31,6 @@ MIN_REPLAY_CAPACITY = 16_384
 CHECK_SETTINGS: Settings = {
     "env.frame_height": 36,
     "env.frame_width": 44,
-    "env.grayscale": True,
     "agent.conv_channels": (8, 8),
     "agent.conv_kernels": (8, 4),
     "agent.conv_strides": (4, 2),

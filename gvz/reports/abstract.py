@@ -46,19 +46,21 @@ def what_was_run(results: Results) -> list[str]:
 
 def who_has_more(results: Results) -> list[str]:
     """For each scenario the trained agents in order, each compared with the next on the tasks that all of them played;
-    then the best of them with the players that do not learn.
+    then the best of them with the players that do not learn. Agents without a seed that played all of these are left
+    out.
     """
     sentences = []
     for name in all_scenarios():
         episodes = results.episodes.filter(scenario=name).drop_nulls("normalized_score")
         scores = {agent: agent_scores(episodes, agent) for agent in agents_of(episodes)}
         tasks = _common_tasks(name, episodes, scores)
+        scores = {agent: one for agent, one in scores.items() if one.complete_seeds(tasks)}
         if len(scores) < 2 or not tasks:
             continue
         means = {
             agent: np.mean([[np.mean(c) for c in run] for run in one.cells(tasks)]) for agent, one in scores.items()
         }
-        trained = set(episodes.drop_nulls("run")["agent"])
+        trained = scores.keys() & set(episodes.drop_nulls("run")["agent"])
         order = sorted(means, key=lambda agent: (agent not in trained, -means[agent]))
         learners, players = order[: len(trained)], order[len(trained) :]
         pairs = list(itertools.pairwise(learners or players))

@@ -131,7 +131,7 @@ def _other_rules() -> list[pl.Expr]:
     """ " (levdoom)" for rows of an agent that played by several rules, for each kind of rule; else nothing."""
     return [
         pl.when(pl.col(rule).drop_nulls().n_unique().over("agent") > 1)
-        .then(pl.format(" ({})", pl.col(rule).fill_null("unknown " + rule)))
+        .then(pl.format(text, pl.col(rule).cast(pl.String).fill_null("unknown " + rule)))
         .otherwise(pl.lit(""))
-        for rule in ("profile", "action_set")
+        for rule, text in (("profile", " ({})"), ("action_set", " ({})"), ("frame_skip", " (frame_skip {})"))
     ]

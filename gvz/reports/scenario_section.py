@@ -95,11 +95,16 @@ def _cell(scores: Scores, tasks: Sequence[str], statistic: Statistic = mean, not
     return replace(cell, note="; ".join(filter(None, (cell.note, note))))
 
 
+def _named(scenario: Scenario, tasks: Sequence[Task]) -> list[Task]:
+    """The named ones of these tasks: drawn and graded tasks have a level, too, but would change its mean."""
+    return [task for task in tasks if task in named_tasks(scenario.id)]
+
+
 def level_table(scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task]) -> Table:
-    """Agents as rows; levels as columns, then statistics of the test tasks."""
+    """Agents as rows; levels as columns, then statistics of the test tasks. Of named tasks alone."""
     test = [task.id for task in named_tasks(scenario.id, split="test")]
     played = {task.id for task in tasks}
-    levels = [(f"level {n}", [t.id for t in tasks if t.level == n]) for n in LEVELS]
+    levels = [(f"level {n}", [t.id for t in _named(scenario, tasks) if t.level == n]) for n in LEVELS]
     levels = [(title, ids) for title, ids in levels if ids]
     rows = []
     for agent, one in scores.items():
@@ -175,7 +180,8 @@ def gap_table(
     """How much lower agents score on other tasks than on their training tasks, and on levels 2 to 4 than on 0 and 1."""
     trained_on = {results.agents[str(r.path)]: r.tasks for r in results.runs if scenario.id in r.scenarios}
     test = [task.id for task in named_tasks(scenario.id, split="test")]
-    low, high = [t.id for t in tasks if t.level <= 1], [t.id for t in tasks if t.level >= 2]
+    named = _named(scenario, tasks)
+    low, high = [t.id for t in named if t.level <= 1], [t.id for t in named if t.level >= 2]
     rows = []
     for agent, one in scores.items():
         if agent in trained_on and not one.agents_of_tasks:

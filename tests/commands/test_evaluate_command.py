@@ -10,9 +10,10 @@ import time
 import pytest
 
 from gvz import cli
+from gvz.core.errors import ConfigError
 from gvz.evaluation.episode_log import RecordFile, read_rows
 from gvz.evaluation.selection import TaskSelection
-from gvz.tasks import named_tasks
+from gvz.tasks import named_tasks, scenarios
 
 
 @pytest.mark.parametrize(
@@ -63,6 +64,12 @@ def test_a_run_is_evaluated_on_the_test_tasks_of_its_scenario_unless_told_otherw
     assert TaskSelection(level=2).of_run([scenario]) == named_tasks(scenario, level=2)
     assert TaskSelection(split="train4").of_run([scenario]) == named_tasks(scenario, split="train4")
     assert TaskSelection(scenario="seek_and_kill").of_run([scenario]) == named_tasks("seek_and_kill")
+    later = next(iter(scenarios("extended")))
+    assert TaskSelection(suite="extended").of_run([later]) == TaskSelection().of_run([later])
+    with pytest.raises(ConfigError, match="--suite: got extended, but the run was trained on dodge_projectiles, which"):
+        TaskSelection(suite="extended").of_run([scenario])
+    with pytest.raises(ConfigError, match="--tasks: got ids and also --scenario, --split, --suite or --level"):
+        TaskSelection(tasks=("dodge_projectiles/default",), suite="extended").resolve()
 
 
 @pytest.mark.engine

@@ -75,6 +75,24 @@ def test_an_episode_found_twice_is_there_once(tmp_path):
     assert sorted(frame["player"]) == ["r/seed_1@9", "r/seed_1@9", "random"]
 
 
+def test_episodes_of_a_run_are_there_once_with_those_of_a_file_elsewhere(tmp_path):
+    policy = {"player": "r/seed_1@9", "run": "r", "run_seed": 1, "num_updates": 9, "params": "abc"}
+    run_dir = tmp_path / "z"
+    run_dir.mkdir()
+    (run_dir / "config.json").write_text(json.dumps({"resolved": {"tasks": [GORE]}}))
+    (run_dir / "evaluation.jsonl").write_text(line(**policy))
+    (tmp_path / "mine.jsonl").write_text(line(**policy) + line(**policy, episode=1))
+    frame = read_evaluations(tmp_path / "mine.jsonl", run_dir).sort("episode")
+    assert frame.select("episode", "run_dir").rows() == [(0, str(run_dir)), (1, str(tmp_path))]
+
+
+def test_two_policies_of_one_name_are_told_of(tmp_path):
+    policy = {"player": "r/seed_1@9", "run": "r", "run_seed": 1, "num_updates": 9}
+    (tmp_path / "mine.jsonl").write_text(line(**policy, params="abc") + line(**policy, params="def"))
+    _, (problem,) = collect_evaluations([tmp_path])
+    assert problem.startswith(f"{tmp_path}: r/seed_1@9 has episodes of 2 policies (`params`)")
+
+
 def test_records_of_training_and_discarded_ones_are_left_alone(tmp_path):
     (tmp_path / "discarded").mkdir()
     for name in ("episodes.jsonl", "starts.jsonl", "metrics.jsonl.gz", "faults.jsonl", "discarded/evaluation.jsonl"):

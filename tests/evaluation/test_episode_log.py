@@ -113,6 +113,12 @@ def test_a_device_is_no_record_file(tmp_path):
             RecordFile(path)
 
 
+def test_rows_can_be_thrown_away():
+    file = RecordFile(Path(os.devnull))
+    assert file.rows == []
+    file.close()
+
+
 @pytest.mark.parametrize("line", ["nonsense", json.dumps({"schema": 99})])
 def test_a_file_of_something_else_is_refused_and_left_alone(tmp_path, line):
     path = tmp_path / "evaluation.jsonl"

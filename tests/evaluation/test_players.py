@@ -93,3 +93,14 @@ def test_a_function_of_frames_is_given_the_newest_frames_oldest_first():
             np.testing.assert_array_equal(seen[-1], np.concatenate(frames[-3:], axis=-1))
             frames.append(frame)
     env.close()
+
+
+@pytest.mark.engine
+def test_a_function_of_frames_may_choose_several_buttons():
+    env = DoomEnv("defend_the_center/default", action_set="multi_discrete_v1")
+    pressed = np.zeros_like(env.action_space.sample())
+    try:
+        row = play_episode(env, FramePlayer(lambda _stack: pressed), 0)
+    finally:
+        env.close()
+    assert row["length_steps"] > 5

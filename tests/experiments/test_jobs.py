@@ -30,7 +30,7 @@ def test_the_trainer_understands_every_experiment_at_every_scale(name, scale):
     if run.max_processor_s is None:
         assert config.checkpoint.period_updates == run.checkpoint_period_updates
     assert config.name == run.agent
-    assert config.env.grayscale == (scale < 0.01 or run.run_config.env.grayscale)
+    assert config.env.grayscale == run.run_config.env.grayscale
     assert config_to_dict(config)["resolved"]["tasks"] == list(run.tasks)
 
 

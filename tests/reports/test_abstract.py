@@ -7,6 +7,7 @@ from gvz.experiments.plan import Plan
 from gvz.reports.abstract import caveats, what_was_run, who_has_more
 from gvz.reports.results import read_results
 from gvz.tasks import named_tasks
+from tests.reports.conftest import evaluation_row, write_rows
 
 OFFSETS = {1111: 0.0, 2222: 1.0, 3333: 2.0}
 
@@ -28,6 +29,22 @@ def test_trained_agents_first_then_the_best_beside_players(tmp_path, experiments
     assert scale == "Scale 0.2: budgets and episodes are shrunk; not comparable with published numbers."
     assert few_seeds.startswith("Fewer than 10 training seeds of dqn_quick, rainbow_quick: intervals over so few are ")
     assert "6 training runs of 2 agents (dqn_quick, rainbow_quick), 3 training seeds" in " ".join(what_was_run(results))
+
+
+def test_an_agent_whose_seeds_played_other_tasks_each_is_left_out(tmp_path):
+    gore, wall = "defend_the_center/gore", "defend_the_center/stone_wall"
+    trained = [("r", 1, gore), ("r", 2, wall)]
+    rows = [
+        evaluation_row(f"{run}/{seed}", task, 0, 50.0, run=run, run_seed=seed, num_updates=9)
+        for run, seed, task in trained
+    ]
+    rows += [evaluation_row("random", task, 0, 20.0) for task in (gore, wall)]
+    write_rows(tmp_path / "rows.jsonl", rows)
+    assert who_has_more(read_results([tmp_path])) == []
+    write_rows(tmp_path / "more.jsonl", [evaluation_row("idle", task, 0, 10.0) for task in (gore, wall)])
+    (sentence,) = who_has_more(read_results([tmp_path]))
+    assert "random has 10.0" in sentence
+    assert " r " not in sentence
 
 
 def test_what_cannot_be_told_apart_is_said(tmp_path):

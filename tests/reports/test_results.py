@@ -77,6 +77,8 @@ def test_an_agent_that_played_by_several_rules_is_several(tmp_path):
     rows = [evaluation_row(who, task, 0, 50.0, profile=rules) for who in ("a", "b") for rules in ("thesis", "levdoom")]
     write_rows(tmp_path / "rows.jsonl", rows[:3])
     assert set(read_results([tmp_path]).episodes["agent"]) == {"a (thesis)", "a (levdoom)", "b"}
+    write_rows(tmp_path / "rows.jsonl", [{**rows[2], "frame_skip": skip} for skip in (4, 8)])
+    assert set(read_results([tmp_path]).episodes["agent"]) == {"b (frame_skip 4)", "b (frame_skip 8)"}
 
 
 def test_agents_of_different_maps_that_played_the_same_are_not_one(tmp_path, experiments_writer):

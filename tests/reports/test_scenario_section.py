@@ -6,6 +6,7 @@ from gvz.experiments.plan import Plan
 from gvz.reports.results import read_results
 from gvz.reports.scenario_section import scenario_sections
 from gvz.tasks import named_tasks
+from tests.reports.conftest import evaluation_row, write_rows
 
 DEFAULT, BLUE, RED = named_tasks("seek_and_kill")[:3]
 
@@ -29,6 +30,20 @@ def test_own_kills_stand_below_the_scores_by_task_and_by_level(tmp_path):
         ["red", "1", "0.0 [0.0, 0.0]", "9.0 [9.0, 9.0]"],
         ["mean of 2 tasks", "1", "0.0 [0.0, 0.0]", "7.5 [7.5, 7.5]"],
     ]
+
+
+def test_levels_are_means_of_named_tasks_alone(tmp_path):
+    """Drawn and graded tasks have a level, too. An agent's further tasks change nothing of another's levels."""
+    named = [task.id for task in named_tasks("dodge_projectiles")]
+    rows = [evaluation_row(player, task, 0, 40.0) for player in ("mine", "theirs") for task in named]
+    further = ("dodge_projectiles/varied-10", "dodge_projectiles/barons=0.5")
+    rows += [evaluation_row("mine", task, 0, 100.0) for task in further]
+    write_rows(tmp_path / "rows.jsonl", rows)
+    (section,) = scenario_sections(read_results([tmp_path]), tmp_path)
+    levels, tasks, *_ = section.blocks[0].tables
+    assert levels.columns[1:3] == ("level 0 (1 task)", "level 1 (7 tasks)")
+    assert {cell.text.split()[0] for row in levels.rows for cell in row[1:]} == {"40.0"}
+    assert [row[1].text for row in tasks.rows[-2:]] == ["1", "0"]
 
 
 def test_the_gap_of_an_agent_is_shown_in_each_of_its_scenarios(tmp_path, experiments_writer):
