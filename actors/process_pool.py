@@ -16,9 +16,11 @@ from actors.pool import STOP_TIMEOUT_S, Pool, PoolConfig, PoolStatistics, lanes_
 from actors.preprocess import ObservationBatch
 from actors.supervisor import SupervisedActor
 from gvz.core import janitor
+from gvz.core.errors import ResourceError
 from gvz.core.watchdog import AwakeClock
 from gvz.transport.broadcast import BroadcastWriter
-from gvz.transport.messages import Message, ParamsHeader, StepBlock, Stop
+from gvz.transport.child import end_all
+from gvz.transport.messages import Message, ParamsHeader, StepBlock
 from gvz.transport.ring import WriterStatus
 
 _WAIT_SLEEP_S = 0.001
@@ -72,7 +74,12 @@ class ProcessPool(Pool):
                 batch = ObservationBatch.of(config, config.num_lanes).arrays
                 self._inference = InferenceServer(policy, requests, batch)
             for actor in self._actors:
-                actor.start()
+                try:
+                    actor.start()
+                except OSError as error:
+                    raise ResourceError(
+                        f"an actor cannot be started: {error}; use fewer actors, or raise `ulimit -u` and `ulimit -n`"
+                    ) from error
         except BaseException:
             self.close()
             raise
@@ -143,17 +150,9 @@ class ProcessPool(Pool):
         return [actor.ring.writer_status() for actor in self._actors]
 
     def close(self, *, grace_s: float = STOP_TIMEOUT_S) -> None:
-        processes = [actor.process for actor in self._actors if actor.process is not None]
         try:
-            for process in processes:
-                process.channel.send(Stop())
-            deadline = time.monotonic() + grace_s
-            for process in processes:
-                process.wait(max(0.0, deadline - time.monotonic()))
-        finally:  # also when a second Ctrl-C ends the wait
-            deadline = time.monotonic() + grace_s
-            for process in processes:
-                process.end(grace_s=max(0.0, deadline - time.monotonic()))
+            end_all([actor.process for actor in self._actors if actor.process is not None], grace_s)
+        finally:
             try:
                 if self._inference is not None:
                     self._inference.close(abandon=grace_s == 0.0)

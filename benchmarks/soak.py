@@ -29,13 +29,12 @@ from rich.console import Console
 
 from benchmarks import record
 from benchmarks.whole import end_run, tree_bytes
-from gvz.core import records
+from gvz.core import janitor, records
 from gvz.run import machine
 
 SCHEMA = 1
 """of all records in DIRECTORY, also those of the fuzzing"""
 DIRECTORY = record.ROOT / "results" / "reliability"
-SHARED_MEMORY = Path("/dev/shm")
 _START_TIMEOUT_S, _STOP_TIMEOUT_S, _CLEARED_S = 900.0, 120.0, 60.0
 
 
@@ -115,7 +114,7 @@ class Watched:
         sizes = []
         for name in self.shared_memory():
             with contextlib.suppress(FileNotFoundError):
-                sizes.append((SHARED_MEMORY / name).stat().st_size)
+                sizes.append((janitor.SHM_DIR / name).stat().st_size)
         return {
             "learner_bytes": self._root.memory_info().rss,
             "all_bytes": tree_bytes(self.process.pid),
@@ -215,7 +214,7 @@ def kill_ratios(made: dict[str, Any]) -> list[float]:
 
 def _shared(prefix: str) -> set[str]:
     """Names of files in /dev/shm."""
-    return {file.name for file in SHARED_MEMORY.iterdir() if file.name.startswith(prefix)}
+    return {file.name for file in janitor.SHM_DIR.iterdir() if file.name.startswith(prefix)}
 
 
 def _unmapped(names: set[str]) -> list[str]:

@@ -153,8 +153,10 @@ def keep_segmenters(scenarios: Iterable[str], config: EnvConfig, directory: Path
 
 
 def with_kept_segmenters(config: EnvConfig, directory: Path) -> EnvConfig:
-    """The configuration with the networks that `keep_segmenters` has put into a directory, if it has any."""
-    return dataclasses.replace(config, segmenter=str(directory)) if directory.is_dir() else config
+    """The configuration with the networks that `keep_segmenters` has put into a directory, if it has any. The path is
+    absolute: actors run in a directory of their own.
+    """
+    return dataclasses.replace(config, segmenter=str(directory.absolute())) if directory.is_dir() else config
 
 
 @cache

@@ -27,7 +27,7 @@ import msgpack
 import numpy as np
 import orbax.checkpoint as ocp
 
-from gvz.core.durable import fsync, fsync_tree
+from gvz.core.durable import fsync, fsync_tree, saved_steps
 from gvz.core.errors import CheckpointError, WaitTimeoutError
 from learner.memory import release_freed_memory
 
@@ -203,11 +203,6 @@ def read(directory: Path, template: Any) -> tuple[Any, dict[str, Any]]:
     return jax.tree.map(lambda t, x: jax.random.wrap_key_data(x) if _is_key(t) else x, template, arrays), host
 
 
-def checkpoint_steps(directory: Path) -> list[int]:
-    """Gradient steps of the checkpoints in `directory`, ascending, valid or not."""
-    return sorted(int(p.name) for p in directory.glob("*") if p.is_dir() and p.name.isdecimal())
-
-
 def restore_newest(directory: Path, template: Any, newest: int | None = None) -> Restored | None:
     """Reads the newest valid checkpoint, of at most `newest` updates; None if there is no checkpoint at all.
 
@@ -215,7 +210,7 @@ def restore_newest(directory: Path, template: Any, newest: int | None = None) ->
         CheckpointError: there are checkpoints but none is valid; names the damage of each.
     """
     damage: list[str] = []
-    for step in reversed(checkpoint_steps(directory)):
+    for step in reversed(saved_steps(directory)):
         if newest is not None and step > newest:
             continue
         try:
@@ -272,7 +267,7 @@ class Checkpointer:
                 write(self._policies / str(num_updates), copies.pop(0), {"num_updates": num_updates})
                 write(self._checkpoints / str(num_updates), copies.pop(0), host)
                 # what is newer was damaged when the run went on from an older one: it takes no place among the kept
-                steps = [step for step in checkpoint_steps(self._checkpoints) if step <= num_updates]
+                steps = [step for step in saved_steps(self._checkpoints) if step <= num_updates]
                 for step in steps[: -self._keep]:
                     if keep_from is not None and step >= keep_from:
                         break

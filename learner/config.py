@@ -150,6 +150,14 @@ class ValueConfig(EpsilonConfig):
     hidden_input_share: Share = 0.0
     """share of a batch whose game variables and past actions are hidden from the online network in training"""
 
+    def __post_init__(self) -> None:
+        EpsilonConfig.__post_init__(self)  # super() knows no class with slots
+        if self.hidden_input_share and not (self.game_variables or self.past_actions):
+            raise ConfigError(
+                f"agent.hidden_input_share: got {self.hidden_input_share:g} with nothing to hide; set "
+                "agent.game_variables or agent.past_actions"
+            )
+
 
 def agent_config_class(name: str) -> type[AgentConfig]:
     """The configuration class of an agent: `CONFIG` of a module in learner/agents/configs, or of the agent's own file.

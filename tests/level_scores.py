@@ -11,7 +11,7 @@ from gvz.reports.document import Cell
 from gvz.reports.draw import draw_levels
 from gvz.reports.scores import agent_scores, estimate_groups
 from gvz.tasks import LEVELS, named_tasks, scenarios
-from tests.test_results import ROOT, results_of
+from tests.score_tables import ROOT, results_of
 
 PLAYERS = {
     "`rainbow_segmented`, 8 tasks and compositions": ("general_compositions_long", "rainbow_segmented"),

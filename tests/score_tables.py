@@ -1,8 +1,9 @@
-"""The columns that tables of the findings have for an agent, and the runs that they compare."""
+"""The text of the findings, the records that it is of, and the columns that its tables have for an agent."""
 
 import gzip
 import json
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,24 @@ import numpy as np
 import polars
 
 from gvz.evaluation.statistics import mean_over_scenarios
+from gvz.reports.results import Results, read_results
 from gvz.reports.scores import Scores, estimate, estimate_groups
 from gvz.tasks import TaskSet, named_tasks
+
+ROOT = Path(__file__).parent.parent
+PAGE = (ROOT / "docs" / "FINDINGS.md").read_text()
+WORDS = " ".join(PAGE.split())
+"""the page with one space between words"""
+
+
+@cache
+def results_of(folder: str) -> Results:
+    return read_results([ROOT / "results" / folder])
+
+
+def rows_of(file: Path) -> list[dict[str, Any]]:
+    """The rows of a compressed record file."""
+    return [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
 
 
 def task_sets(scenario: str, training: TaskSet = "train8") -> list[list[str]]:
@@ -43,16 +60,12 @@ def of_first_seed(episodes: polars.DataFrame) -> polars.DataFrame:
 
 def metrics_of(run: Path) -> list[dict[str, Any]]:
     """The rows of a run's metrics."""
-    return _rows(run / "metrics.jsonl.gz")
+    return rows_of(run / "metrics.jsonl.gz")
 
 
 def training_episodes(run: Path, low_s: float, high_s: float) -> list[dict[str, Any]]:
     """Rows of the training episodes that ended within these seconds of the run's processor time."""
-    metrics, episodes = metrics_of(run), _rows(run / "episodes.jsonl.gz")
+    metrics, episodes = metrics_of(run), rows_of(run / "episodes.jsonl.gz")
     updates, spent_s = ([row[key] for row in metrics] for key in ("num_updates", "run/processor_s"))
     ended_s = np.interp([row["num_updates"] for row in episodes], updates, spent_s)
     return [row for row, second in zip(episodes, ended_s, strict=True) if low_s <= second < high_s]
-
-
-def _rows(file: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]

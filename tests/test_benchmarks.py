@@ -15,6 +15,7 @@ import pytest
 from benchmarks import plots, record, remote, report, rounds, runner
 from gvz.core.errors import ConfigError
 from tests.processes import arguments
+from tests.waiting import wait_until
 
 ROOT = Path(__file__).parent.parent
 NO_PEERS = Path("no-peers/bin/python")
@@ -108,9 +109,10 @@ def test_ctrl_c_ends_all_processes(tmp_path):
     def children() -> list[psutil.Process]:
         return psutil.Process(process.pid).children(recursive=True)
 
-    while not any("ring_writer.py" in " ".join(arguments(child)) for child in children()):
-        assert process.poll() is None
-        time.sleep(0.05)
+    def measures() -> bool:
+        return any("ring_writer.py" in " ".join(arguments(child)) for child in children())
+
+    wait_until(measures, "the writer of the ring", 240, process=process)
     started = children()
     process.send_signal(signal.SIGINT)
     assert process.wait(90) == 130

@@ -1,7 +1,5 @@
 """What the findings say of training on compositions of attributes is what its records give."""
 
-import gzip
-import json
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +9,10 @@ from gvz.evaluation.statistics import difference
 from gvz.evaluation.zoo import run_directory
 from gvz.reports.scores import agent_scores, estimate, estimate_groups
 from gvz.tasks import parse_task, scenario_named, scenarios
-from tests.score_tables import means, of_first_seed, score_cells, task_sets
-from tests.test_results import ROOT, results_of
+from tests.score_tables import ROOT, WORDS, means, of_first_seed, results_of, rows_of, score_cells, task_sets
 
 
 def test_the_findings_say_what_compositions_of_attributes_gave():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     folders = {"8 tasks": "general_short", "compositions": "general_compositions"}
     scores = {
         (name, called): agent_scores(results_of(folder).episodes.filter(scenario=name), "rainbow_segmented")
@@ -24,11 +20,11 @@ def test_the_findings_say_what_compositions_of_attributes_gave():
         for called, folder in folders.items()
     }
     for (name, called), of_agent in scores.items():
-        assert f"| {scenario_named(name).title} | {called} | {score_cells(of_agent, name)} |" in page
+        assert f"| {scenario_named(name).title} | {called} | {score_cells(of_agent, name)} |" in WORDS
     for called in folders:
         *cells, on_level_4 = means({name: scores[name, called] for name in scenarios()})
-        assert f"| mean | {called} | {' | '.join(cells)} | {on_level_4} |" in page
-    assert f"has {on_level_4} there after the same time" in page
+        assert f"| mean | {called} | {' | '.join(cells)} | {on_level_4} |" in WORDS
+    assert f"has {on_level_4} there after the same time" in WORDS
 
     def gains(column: int) -> list[str]:
         pairs = [
@@ -38,19 +34,18 @@ def test_the_findings_say_what_compositions_of_attributes_gave():
 
     gate, hardest = gains(1), gains(3)
     where = "no; level 4 gains with time: `--training-set compositions`"
-    assert f"as tasks, too, beside segmented frames | {' | '.join(gate)} | {where} |" in page
-    assert f"level 4 gains {hardest[0]} points**, though the run" in page
-    assert f"The gate tasks show {gate[0]}." in page
-    assert f"the gate tasks lose**: {gate[2]} and {gate[3]}. On level 4 no gain is shown: {hardest[2]} and" in page
-    assert f"is shown: {hardest[2]} and {hardest[3]}." in page
+    assert f"as tasks, too, beside segmented frames | {' | '.join(gate)} | {where} |" in WORDS
+    assert f"level 4 gains {hardest[0]} points**, though the run" in WORDS
+    assert f"The gate tasks show {gate[0]}." in WORDS
+    assert f"the gate tasks lose**: {gate[2]} and {gate[3]}. On level 4 no gain is shown: {hardest[2]} and" in WORDS
+    assert f"is shown: {hardest[2]} and {hardest[3]}." in WORDS
     hard = results_of("general_compositions").episodes.filter(task="seek_and_kill/complete")
     found = [hard.filter(run_seed=seed)["normalized_score"].mean() for seed in (1111, 2222)]
-    assert "have {:.1f} and {:.1f} on `complete`.".format(*found) in page
+    assert "have {:.1f} and {:.1f} on `complete`.".format(*found) in WORDS
 
 
 def test_the_findings_say_what_compositions_gave_with_more_time():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
-    short, longer, eight = rows = (
+    short, longer, _ = rows = (
         ("compositions", "900 s", "general_compositions"),
         ("compositions", "2,700 s", "general_compositions_long"),
         ("8 tasks", "5,400 s", "general"),
@@ -62,56 +57,71 @@ def test_the_findings_say_what_compositions_gave_with_more_time():
     }
     for (name, (called, seconds, _)), of_agent in of_seed.items():
         cells = score_cells(of_agent, name)
-        assert f"| {scenario_named(name).title} | {called} | {seconds} | {cells} |" in page
+        assert f"| {scenario_named(name).title} | {called} | {seconds} | {cells} |" in WORDS
     for row in rows:
         *cells, on_level_4 = means({name: of_seed[name, row] for name in scenarios()})
-        assert f"| mean | {row[0]} | {row[1]} | {' | '.join(cells)} | {on_level_4} |" in page
+        assert f"| mean | {row[0]} | {row[1]} | {' | '.join(cells)} | {on_level_4} |" in WORDS
         if row == longer:
-            assert f"mean of the scenarios level 4 has {on_level_4}.**" in page
+            assert f"mean of the scenarios level 4 has {on_level_4}.**" in WORDS
 
-    def gains(column: int, of: tuple[str, str, str]) -> str:
+    def gains(column: int) -> str:
         def mean(name: str, row: tuple[str, str, str]) -> float:
             return float(estimate(of_seed[name, row], task_sets(name)[column]).text.split()[0])
 
-        *most, last = (f"{mean(name, longer) - mean(name, of):.1f}" for name in scenarios())
-        return f"{', '.join(most)} and {last}"
+        return in_words([f"{mean(name, longer) - mean(name, short):.1f}" for name in scenarios()])
 
-    assert f"the test tasks gain {gains(2, short)} points" in page
-    assert f"and level 4 gains {gains(3, short)}." in page
-    assert f"had twice the time**: by {gains(2, eight)} points." in page
-    assert f"above them by {gains(3, eight)} points." in page
-    assert f"the differences are {gains(0, eight)} points. On the gate tasks they are {gains(1, eight)}." in page
-    in_short = gains(1, eight).replace(" and ", ", ").replace(", ", " | ")
-    assert f"not eight tasks for 5,400 s | {in_short} |" in page
+    assert f"the test tasks gain {gains(2)} points" in WORDS
+    assert f"and level 4 gains {gains(3)}." in WORDS
+
+
+def in_words(numbers: list[str]) -> str:
+    """Of the scenarios, as a sentence lists them."""
+    return f"{', '.join(numbers[:-1])} and {numbers[-1]}"
+
+
+def test_the_findings_say_what_three_seeds_of_compositions_have_beside_eight_tasks_with_twice_the_time():
+    episodes = [results_of(folder).episodes for folder in ("general_compositions_long", "general")]
+
+    def gains(column: int) -> list[str]:
+        found = []
+        for name in scenarios():
+            both = [agent_scores(rows.filter(scenario=name), "rainbow_segmented") for rows in episodes]
+            assert {len(scores.runs) for scores in both} == {3}
+            found.append(estimate_groups([(scores, task_sets(name)[column]) for scores in both], difference).text)
+        return found
+
+    trained, gate, test, hardest = map(gains, range(4))
+    assert f"with half the time**: by {in_words(test)} points. On level 4 by {in_words(hardest)}." in WORDS
+    assert f"no difference is shown**: {in_words(trained)} points. On the gate tasks the" in WORDS
+    assert f"the differences are {in_words(gate)}." in WORDS
+    assert f"not eight tasks for 5,400 s | {' | '.join(gate)} |" in WORDS
 
 
 def test_the_findings_say_what_further_seeds_of_compositions_gave_with_more_time():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     episodes = results_of("general_compositions_long").episodes
     further = episodes.filter(episodes["run_seed"] != 1111)
     runs = further.select("scenario", "run_seed").unique().rows()
-    assert page.count("| 2222 |") + page.count("| 3333 |") == len(runs) > 0
+    assert WORDS.count("| 2222 |") + WORDS.count("| 3333 |") == len(runs) > 0
     for name, seed in runs:
         of_agent = agent_scores(further.filter(scenario=name, run_seed=seed), "rainbow_segmented")
-        assert f"| {scenario_named(name).title} | {seed} | {score_cells(of_agent, name)} |" in page
+        assert f"| {scenario_named(name).title} | {seed} | {score_cells(of_agent, name)} |" in WORDS
     *_, on_test, on_level_4 = means(
         {name: agent_scores(episodes.filter(scenario=name), "rainbow_segmented") for name in scenarios()}
     )
-    assert f"With all seeds the mean is {on_level_4} on level 4 and {on_test} on the test tasks." in page
+    assert f"With all seeds the mean is {on_level_4} on level 4 and {on_test} on the test tasks." in WORDS
     assert episodes.select("scenario", "run_seed").unique().height == 3 * len(scenarios())
-    assert f"and {on_level_4} after three times the time, with three seeds." in page
+    assert f"and {on_level_4} after three times the time, with three seeds." in WORDS
     percent, interval = on_test.split(" ", 1)
     readme = " ".join((ROOT / "README.md").read_text().split())
     assert f"for 45 minutes, they have {percent}% {interval} (three seeds)." in readme
 
 
 def test_the_findings_say_how_long_agents_of_compositions_learned():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
 
     def last_steps(folder: str, *runs: str) -> list[int]:
         root = ROOT / "results" / folder / "runs" / "rainbow_segmented"
         files = [file for run in runs for file in root.glob(f"{run}/metrics.jsonl.gz")]
-        rows = [json.loads(gzip.decompress(file.read_bytes()).splitlines()[-1]) for file in files]
+        rows = [rows_of(file)[-1] for file in files]
         return sorted(row["num_updates"] for row in rows)
 
     for folder, runs, words in (
@@ -129,14 +139,12 @@ def test_the_findings_say_how_long_agents_of_compositions_learned():
         ("general_compositions_long", ("*/*/seed_[23]*",), "2,700 seconds, with {:,} to {:,} gradient steps:"),
     ):
         steps = last_steps(folder, *runs)
-        assert words.format(steps[0], steps[-1]) in page
+        assert words.format(steps[0], steps[-1]) in WORDS
 
 
 def test_the_findings_say_what_trained_agents_have_on_level_4_without_one_attribute():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
-    lines = gzip.decompress((ROOT / "results" / "zoo" / "without_one_attribute.jsonl.gz").read_bytes()).splitlines()
     played: dict[str, list[float]] = {}
-    for row in map(json.loads, lines):
+    for row in rows_of(ROOT / "results" / "zoo" / "without_one_attribute.jsonl.gz"):
         played.setdefault(row["task"], []).append(row["normalized_score"])
     assert {len(found) for found in played.values()} == {15}
     for name, scenario in scenarios().items():
@@ -150,5 +158,5 @@ def test_the_findings_say_what_trained_agents_have_on_level_4_without_one_attrib
         of_zoo = read_rows(run_directory(Path(f"zoo:{name}")) / "evaluation.jsonl")
         whole = [row["normalized_score"] for row in of_zoo if row["task"] == f"{name}/complete"]
         assert len(whole) == 100
-        assert f"| {scenario.title} | {np.mean(whole):.0f} | {cells} |" in page
+        assert f"| {scenario.title} | {np.mean(whole):.0f} | {cells} |" in WORDS
     assert not played

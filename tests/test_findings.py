@@ -1,6 +1,5 @@
 """What the findings say is what the records of gates and of general agents give."""
 
-import gzip
 import itertools
 import json
 import re
@@ -13,8 +12,7 @@ from gvz.reports.experiment_section import comparison_table, result_table
 from gvz.reports.results import read_results
 from gvz.reports.scores import agent_scores, estimate, estimate_groups
 from gvz.tasks import named_tasks, scenario_named, scenarios
-from tests.score_tables import metrics_of, score_cells, training_episodes
-from tests.test_results import ROOT, results_of
+from tests.score_tables import PAGE, ROOT, WORDS, metrics_of, results_of, rows_of, score_cells, training_episodes
 
 
 @pytest.mark.parametrize(
@@ -27,7 +25,6 @@ from tests.test_results import ROOT, results_of
     ],
 )
 def test_the_findings_compare_the_general_agents_as_their_records_do(words, other, words_of_other):
-    page = (ROOT / "docs" / "FINDINGS.md").read_text()
     episodes = results_of("general_short").episodes
     names = episodes.filter(agent=other)["scenario"].unique(maintain_order=True)
     assert len(names) > 1
@@ -36,11 +33,10 @@ def test_the_findings_compare_the_general_agents_as_their_records_do(words, othe
         scores = agent_scores(episodes.filter(scenario=name), agent)
         sets = [[task.id for task in named_tasks(name, split=split)] for split in ("train8", "gate", "test")]
         cells = " | ".join(estimate(scores, tasks).text for tasks in sets)
-        assert f"| {scenario_named(name).title} | {called} | {cells} |" in page
+        assert f"| {scenario_named(name).title} | {called} | {cells} |" in PAGE
 
 
 def test_the_findings_say_what_anyone_reaches_on_level_4():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     agents = results_of("general_short").episodes
     script = read_results([ROOT / "results" / "reference" / "scripted.jsonl.gz"]).episodes
     found = []
@@ -50,38 +46,38 @@ def test_the_findings_say_what_anyone_reaches_on_level_4():
         (script, "scripted", 1),
     ):
         rows = [episodes.filter(agent=agent, task=task.id) for task in named_tasks(level=4)]
-        assert all(rows_of["run_seed"].n_unique() == num_seeds for rows_of in rows)
-        found.append([rows_of["normalized_score"].mean() for rows_of in rows])
+        assert all(of_task["run_seed"].n_unique() == num_seeds for of_task in rows)
+        found.append([of_task["normalized_score"].mean() for of_task in rows])
     words = ["{:.0f}, {:.0f}, {:.0f} and {:.0f}".format(*scores) for scores in found]
     means = [f"{np.mean(scores):.1f}" for scores in found]
-    assert f"{words[0]} on the four tasks `complete`, {means[0]} in the mean." in page
-    assert f"or a reward for moving, have {words[1]}, which is {means[1]}." in page
+    assert f"{words[0]} on the four tasks `complete`, {means[0]} in the mean." in WORDS
+    assert f"or a reward for moving, have {words[1]}, which is {means[1]}." in WORDS
     assert [classes > segmented + 1 for segmented, classes, _ in zip(*found, strict=True)] == [False, False, True, True]
-    assert f"places of things, has {words[2]}, which is {means[2]}. The best of the three" in page
-    assert f"on each task would be {np.max(found, axis=0).mean():.1f}." in page
+    assert f"places of things, has {words[2]}, which is {means[2]}. The best of the three" in WORDS
+    assert f"on each task would be {np.max(found, axis=0).mean():.1f}." in WORDS
 
 
 def test_the_findings_say_what_more_decisions_for_each_gradient_step_take():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     said = []
     for number in (4, 16, 64):
         folder = ROOT / "results" / "gates" / "runs" / f"rainbow_4task+decisions_{number}" / "defend_the_center"
         files = sorted(folder.glob("**/metrics.jsonl.gz"))
         assert len(files) == 2
-        runs = [[json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()] for file in files]
+        runs = [rows_of(file) for file in files]
         waits = [row["actors/wait_share"] for rows in runs for row in rows if "actors/wait_share" in row]
         updates = np.mean([rows[-1]["num_updates"] for rows in runs])
         decisions = np.mean([rows[-1]["actors/env_steps"] for rows in runs])
         said.append((f"{updates:,.0f}", f"{round(decisions, -3):,.0f}", f"{100 * np.mean(waits):.0f}"))
     (updates, decisions, wait), (updates_16, decisions_16, wait_16), (updates_64, *_) = said
-    assert f"Center took {updates_16} gradient steps with 16 decisions and {updates} with 4, but {decisions_16}" in page
-    assert f"points against 4. The runs took {updates_64} gradient steps." in page
-    assert f"decisions instead of {decisions}. With 4, the actors wait" in page
-    assert f"{wait} percent of their time, with 16 still {wait_16}." in page
+    assert (
+        f"Center took {updates_16} gradient steps with 16 decisions and {updates} with 4, but {decisions_16}" in WORDS
+    )
+    assert f"points against 4. The runs took {updates_64} gradient steps." in WORDS
+    assert f"decisions instead of {decisions}. With 4, the actors wait" in WORDS
+    assert f"{wait} percent of their time, with 16 still {wait_16}." in WORDS
 
 
 def test_the_findings_say_how_training_went_with_more_gradient_steps_beside_segmented_frames():
-    page = (ROOT / "docs" / "FINDINGS.md").read_text()
     periods_s, columns, variants = ((100, 300), (300, 600), (600, 900)), [], ("4", "8", "16", "batch_64")
     for variant in variants:
         agent = f"rainbow_segmented+{variant if variant == 'batch_64' else f'decisions_{variant}'}"
@@ -89,14 +85,14 @@ def test_the_findings_say_how_training_went_with_more_gradient_steps_beside_segm
         metrics = metrics_of(run)
         if variant == "16":
             wait = 100 * np.mean([row["learner/wait_share"] for row in metrics if "learner/wait_share" in row])
-            assert f"with 16, the learner waits {wait:.0f} percent of its time." in " ".join(page.split())
+            assert f"with 16, the learner waits {wait:.0f} percent of its time." in WORDS
         scores = [[row["normalized_score"] for row in training_episodes(run, *period)] for period in periods_s]
         last = metrics[-1]
         counts = (f"{last['num_updates']:,}", f"{round(last['actors/env_steps'], -3):,}")
         columns.append((*counts, *(f"{np.mean(found):.1f}" for found in scores)))
     titles = ("gradient steps", "decisions", *(f"training episodes, {low} to {high} s" for low, high in periods_s))
     for title, cells in zip(titles, zip(*columns, strict=True), strict=True):
-        assert f"| {title} | {' | '.join(cells)} |" in page
+        assert f"| {title} | {' | '.join(cells)} |" in PAGE
     for row in (2, 3):
         assert max(columns, key=lambda column: float(column[row])) == columns[0], (
             "4 decisions are ahead for 600 seconds"
@@ -104,7 +100,6 @@ def test_the_findings_say_how_training_went_with_more_gradient_steps_beside_segm
 
 
 def test_the_findings_say_what_seven_minutes_of_a_gpu_gave():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     folder, short = ROOT / "results" / "general_gpu", results_of("general_short").episodes
     episodes = {
         "rainbow_general (8 tasks)": ("`rainbow_general`, 2 cores", short),
@@ -115,17 +110,17 @@ def test_the_findings_say_what_seven_minutes_of_a_gpu_gave():
     shadows = {}
     for agent, (called, found) in episodes.items():
         scores = agent_scores(found.filter(scenario=name), agent)
-        assert f"| {called} | {score_cells(scores, name)} |" in page
+        assert f"| {called} | {score_cells(scores, name)} |" in WORDS
         rows = found.filter(agent=agent, task=f"{name}/blue+shadows")["normalized_score"]
         shadows[agent] = f"{rows.mean():.0f}"
     said = f"`blue+shadows` has {shadows['rainbow_general_gpu']} (segmented frames: {shadows['rainbow_segmented']})."
-    assert said in page
+    assert said in WORDS
     (file,) = folder.glob("runs/**/metrics.jsonl.gz")
-    rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+    rows = rows_of(file)
     readme, last = " ".join((folder / "README.md").read_text().split()), rows[-1]
     counts = f"{last['num_updates']:,} gradient steps", f"{last['actors/env_steps']:,} decisions"
     assert f"{counts[0]}, {counts[1]}, training seed 1111" in readme
-    assert f"{counts[0]} and {counts[1]}; one seed" in page
+    assert f"{counts[0]} and {counts[1]}; one seed" in WORDS
     updates, decisions, learner_waits, actors_wait = (
         np.median([row[key] for row in rows])
         for key in ("learner/updates_per_s", "actors/decisions_per_s", "learner/wait_share", "actors/wait_share")
@@ -138,7 +133,6 @@ def test_the_findings_say_what_seven_minutes_of_a_gpu_gave():
 
 
 def test_the_findings_say_what_the_first_loss_of_sight_gave():
-    page = (ROOT / "docs" / "FINDINGS.md").read_text()
     episodes = results_of("gates").episodes
     agents = {"rainbow_general+plain": "none", "rainbow_general+sight_loss": "first form"}
     for name, (agent, called) in itertools.product(("defend_the_center", "seek_and_kill"), agents.items()):
@@ -146,13 +140,12 @@ def test_the_findings_say_what_the_first_loss_of_sight_gave():
         sets = [[task.id for task in named_tasks(name, split=split)] for split in ("train8", "gate")]
         cells = " | ".join(estimate(scores, tasks).text for tasks in sets)
         (line,) = [
-            line for line in page.splitlines() if line.startswith(f"| {scenario_named(name).title} | {called} |")
+            line for line in PAGE.splitlines() if line.startswith(f"| {scenario_named(name).title} | {called} |")
         ]
         assert line.endswith(f" | {cells} |")
 
 
 def test_the_findings_say_what_the_gates_records_give():
-    page = (ROOT / "docs" / "FINDINGS.md").read_text()
     results = results_of("gates")
     world, reward, sight, ammo, defend, colour, augmented, *later = results.asked
     titles = {scenario_named(name).title for name in scenarios()}
@@ -165,29 +158,28 @@ def test_the_findings_say_what_the_gates_records_give():
             ]
             for scenario, _, *cells in with_records:
                 words = title if len(with_records) == 1 else scenario.text
-                assert f"| {words} | {' | '.join(cell.text for cell in cells)} |" in page
+                assert f"| {words} | {' | '.join(cell.text for cell in cells)} |" in PAGE
         _, _, *cells = result_table(results, augmented, trained=trained).rows[1]
         assert [cell.text for cell in cells[:1]] == ["-"], "its run is that of general_sight_loss"
-        assert f" | {' | '.join(cell.text for cell in cells[1:])} |" in page
+        assert f" | {' | '.join(cell.text for cell in cells[1:])} |" in PAGE
     for _, compared, gain, _ in comparison_table(results, world).rows[:2]:
         value, _, interval = gain.text.partition(" ")
         assert compared.text == "8 tasks against 4 tasks"
-        assert value in page
-        assert interval in page
+        assert value in PAGE
+        assert interval in PAGE
     pooled = {row[0].text: row[2].text for row in comparison_table(results, sight).rows[:3]}
     assert list(pooled) == ["Dodge Projectiles", "Health Gathering", "Defend the Center"]
-    assert all(gain in page for gain in pooled.values())
+    assert all(gain in PAGE for gain in pooled.values())
 
 
 def test_the_findings_say_how_training_went_on_in_the_gates_of_the_replay_and_the_horizon():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
 
     def scores_of_training(variant: str) -> np.ndarray:
         """Of each run: the mean score of episodes at 6,000 to 8,000 gradient steps, and in the last 2,000."""
         runs = (ROOT / "results" / "gates" / "runs" / f"rainbow_segmented+{variant}").glob("**/episodes.jsonl.gz")
         found = []
         for file in runs:
-            rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+            rows = rows_of(file)
             last = max(row["num_updates"] for row in rows) - 2_000
             early = [row["normalized_score"] for row in rows if 6_000 <= row["num_updates"] < 8_000]
             late = [row["normalized_score"] for row in rows if row["num_updates"] >= last]
@@ -198,36 +190,37 @@ def test_the_findings_say_how_training_went_on_in_the_gates_of_the_replay_and_th
     assert len(small) == len(large) == 2
     (early, late), (early_of_large, late_of_large) = small.mean(axis=0), large.mean(axis=0)
     falls = [*(small[:, 0] - small[:, 1]), *(large[:, 0] - large[:, 1])]
-    assert f"had {early:.0f} points with a replay of 100,000" in page
-    assert f"those of the last 2,000 steps had {late:.0f}." in page
-    assert f"they had {early_of_large:.0f} and {late_of_large:.0f} (means over both seeds)" in page
-    assert f"by {min(falls):.0f} to {max(falls):.0f} points a run" in page
-    assert f"had {early:.0f} points at 6,000 to 8,000 gradient steps and {late:.0f} in the last 2,000" in page
+    assert f"had {early:.0f} points with a replay of 100,000" in WORDS
+    assert f"those of the last 2,000 steps had {late:.0f}." in WORDS
+    assert f"they had {early_of_large:.0f} and {late_of_large:.0f} (means over both seeds)" in WORDS
+    assert f"by {min(falls):.0f} to {max(falls):.0f} points a run" in WORDS
+    assert f"had {early:.0f} points at 6,000 to 8,000 gradient steps and {late:.0f} in the last 2,000" in WORDS
     means = [scores_of_training(variant).mean(axis=0) for variant in ("discount_95", "game_variables", "both")]
     words = (
         f"{early:.0f} and {late:.0f} ({name})"
         for (early, late), name in zip(means, ("discount", "game variables", "both"), strict=True)
     )
-    assert f"Now they have {', '.join(words)}" in page
+    assert f"Now they have {', '.join(words)}" in WORDS
 
 
 def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
-    page = (ROOT / "docs" / "FINDINGS.md").read_text()
-    summary = page.partition("## In short")[2].partition("\n## ")[0]
+    summary = PAGE.partition("## In short")[2].partition("\n## ")[0]
     named = set(re.findall(r"-?\d+\.\d \[-?\d+\.\d, -?\d+\.\d\]", summary))
     results, episodes = results_of("gates"), results_of("general_short").episodes
-    folders = ("general_compositions", "general_train4", "general")
-    composed, four, long = (results_of(folder).episodes for folder in folders)
+    folders = ("general_compositions", "general_compositions_long", "general_train4", "general")
+    composed, composed_long, four, long = (results_of(folder).episodes for folder in folders)
     gains = {row[2].text for gate in results.asked for row in comparison_table(results, gate).rows}
     of_segmented, of_training_sets = [], set[str]()
     for name in scenarios():
         tasks, mine = [task.id for task in named_tasks(name, split="gate")], episodes.filter(scenario=name)
         agents = [agent_scores(mine, agent) for agent in ("rainbow_segmented", "rainbow_general (8 tasks)")]
         of_segmented.append(estimate_groups([(scores, tasks) for scores in agents], difference).text)
-        others = agent_scores(composed.filter(scenario=name), "rainbow_segmented")
+        others, others_longer = (
+            agent_scores(rows.filter(scenario=name), "rainbow_segmented") for rows in (composed, composed_long)
+        )
         fewer = agent_scores(four.filter(scenario=name), "rainbow_segmented+train4_network")
         longer = agent_scores(long.filter(scenario=name), "rainbow_segmented")
-        for pair in ((others, agents[0]), (agents[0], fewer), (longer, agents[0])):
+        for pair in ((others, agents[0]), (agents[0], fewer), (longer, agents[0]), (others_longer, longer)):
             of_training_sets.add(estimate_groups([(scores, tasks) for scores in pair], difference).text)
     tasks, mine = (
         [task.id for task in named_tasks("seek_and_kill", split="gate")],
@@ -241,18 +234,17 @@ def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
 
 
 def test_the_findings_say_how_many_games_ran_at_once():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
 
     def games(runs: str) -> set[int]:
         files = list((ROOT / "results").glob(f"{runs}/**/episodes.jsonl.gz"))
         assert files
-        rows = ([json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()] for file in files)
+        rows = (rows_of(file) for file in files)
         return {len({row["lane"] for row in episodes if "lane" in row}) for episodes in rows}
 
     assert games("general_short/runs/rainbow_segmented/*/train8") == {16}
-    assert "(16,900 to 19,700 gradient steps, 16 games at once)" in page
+    assert "(16,900 to 19,700 gradient steps, 16 games at once)" in WORDS
     assert games("general_short/runs/rainbow_general+sight_loss") == {8}
-    assert "with a weight of 0.1. One seed with 8 games at once" in page
+    assert "with a weight of 0.1. One seed with 8 games at once" in WORDS
     readme = (ROOT / "results" / "general" / "README.md").read_text()
     assert games("general/runs/rainbow_general+sight_loss") == {8}
     assert games("general/runs/rainbow_segmented") == {16}
@@ -261,15 +253,14 @@ def test_the_findings_say_how_many_games_ran_at_once():
     on_policy = [games(f"gates/runs/{name}_quick+plain/*_*") for name in ("ppo", "pqn")]
     rainbow = [games(f"gates/runs/rainbow_quick+plain/{name}") for name in ("dodge_projectiles", "health_gathering")]
     assert [*on_policy, *rainbow] == [{8}] * 4
-    assert "8 games at once; Rainbow on 2026-11-23, the others on 2026-11-26)" in page
+    assert "8 games at once; Rainbow on 2026-11-23, the others on 2026-11-26)" in WORDS
 
 
 def test_the_findings_say_how_many_decisions_replay_and_on_policy_agents_took():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
 
     def decisions(agent: str, scenario: str) -> str:
         files = list((ROOT / "results" / "gates" / "runs" / f"{agent}+plain" / scenario).rglob("metrics.jsonl.gz"))
-        taken = [json.loads(gzip.decompress(file.read_bytes()).splitlines()[-1])["actors/env_steps"] for file in files]
+        taken = [rows_of(file)[-1]["actors/env_steps"] for file in files]
         assert len(taken) == 2
         return f"{round(sum(taken) / 2, -3):,.0f}"
 
@@ -277,8 +268,8 @@ def test_the_findings_say_how_many_decisions_replay_and_on_policy_agents_took():
         [decisions(f"{name}_quick", scenario) for scenario in ("dodge_projectiles", "health_gathering")]
         for name in ("pqn", "ppo", "rainbow")
     )
-    assert f"PQN took {pqn[0]} of them in Dodge Projectiles and {pqn[1]} in Health Gathering" in page
-    assert f"PPO {ppo[0]} and {ppo[1]}, Rainbow {rainbow[0]} and {rainbow[1]}." in page
+    assert f"PQN took {pqn[0]} of them in Dodge Projectiles and {pqn[1]} in Health Gathering" in WORDS
+    assert f"PPO {ppo[0]} and {ppo[1]}, Rainbow {rainbow[0]} and {rainbow[1]}." in WORDS
 
 
 @pytest.mark.parametrize("name", scenarios())

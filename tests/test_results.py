@@ -1,10 +1,8 @@
 """What the README says of committed results is what their records give."""
 
-import gzip
 import json
 import re
 from collections import Counter
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,23 +11,17 @@ import pytest
 from gvz.evaluation.statistics import bootstrap, bootstrap_runs
 from gvz.reports.experiment_section import result_table
 from gvz.reports.joint_section import joint_sections
-from gvz.reports.results import Results, read_results
+from gvz.reports.results import read_results
 from gvz.reports.scores import agent_scores, estimate
 from gvz.tasks import TaskSet, named_tasks, scenarios
-
-ROOT = Path(__file__).parent.parent
-
-
-@cache
-def results_of(folder: str) -> Results:
-    return read_results([ROOT / "results" / folder])
+from tests.score_tables import PAGE, ROOT, metrics_of, results_of, rows_of
 
 
 def test_the_quick_runs_are_better_than_chance_on_the_same_episodes():
     folder = ROOT / "results" / "rainbow_quick"
 
     def episodes(file: Path) -> tuple[np.ndarray, list[int]]:
-        rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+        rows = rows_of(file)
         return np.array([row["score"] for row in rows]), sorted(row["seed"] for row in rows)
 
     chance, seeds = episodes(folder / "evaluation_random.jsonl.gz")
@@ -53,7 +45,7 @@ def test_the_quick_comparison_says_what_its_records_give():
     for config in ("rainbow_quick", "dqn_quick"):
         files = sorted(folder.glob(f"runs/{config}/*/*/*/evaluation.jsonl.gz"))
         assert len(files) == 3
-        rows = [json.loads(line) for file in files for line in gzip.decompress(file.read_bytes()).splitlines()]
+        rows = [row for file in files for row in rows_of(file)]
         assert len(rows) == 3 * 2 * 18 * 25
         final = [row for row in rows if row["num_updates"] == 20_000]
         (line,) = (line for line in readme.splitlines() if line.startswith(f"| {config} |"))
@@ -70,7 +62,7 @@ def test_the_gap_of_procedural_maps_is_what_its_records_give():
     for title, maps in (("10 maps", "-10"), ("100 maps", "-100"), ("1,000 maps", "-1000"), ("unlimited", "")):
         training = f"procedural-train{maps}"
         file = folder / "runs" / "rainbow_quick" / "health_gathering" / training / "seed_1111" / "evaluation.jsonl.gz"
-        rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+        rows = rows_of(file)
         scores = [
             np.array([row["normalized_score"] for row in rows if row["task"] == f"health_gathering/{task}"])
             for task in (training, "procedural-test")
@@ -87,8 +79,7 @@ def test_the_gap_of_procedural_maps_is_what_its_records_give():
 
 def test_the_joint_run_says_what_its_records_give():
     folder = ROOT / "results" / "rainbow_all"
-    lines = gzip.decompress((folder / "evaluation.jsonl.gz").read_bytes()).splitlines()
-    rows, readme = [json.loads(line) for line in lines], (folder / "README.md").read_text()
+    rows, readme = rows_of(folder / "evaluation.jsonl.gz"), (folder / "README.md").read_text()
     for split, episodes, title in (("train4", 20, "4 training tasks"), ("test", 50, "7 test tasks")):
         means = []
         for scenario in scenarios():
@@ -106,8 +97,7 @@ def test_the_joint_run_says_what_its_records_give():
 def test_the_hour_of_the_main_job_says_what_its_records_give():
     folder = ROOT / "results" / "rainbow_4task"
     page, guide = (" ".join(file.read_text().split()) for file in (folder / "README.md", ROOT / "docs/how-to/train.md"))
-    lines = gzip.decompress((folder / "seed_1111" / "metrics.jsonl.gz").read_bytes()).splitlines()
-    last = json.loads(lines[-1])
+    last = metrics_of(folder / "seed_1111")[-1]
     updates, decisions = f"{last['num_updates']:,} gradient steps", f"{round(last['actors/env_steps'], -3):,} decisions"
     assert f"{updates}, {decisions} and {last['run/processor_s']:,.0f} seconds of processor time" in page
     random = read_results([ROOT / "results" / "reference" / "random.jsonl.gz"]).episodes
@@ -120,8 +110,7 @@ def test_the_hour_of_the_main_job_says_what_its_records_give():
     (trained, _), (unseen, chance) = said
     assert f"after {updates}, it has {trained} on its four training tasks and {unseen} on the" in guide
     assert f"(random: {chance.split()[0]};" in guide
-    lines = gzip.decompress((folder / "seed_1111" / "episodes.jsonl.gz").read_bytes()).splitlines()
-    rows, learning = [json.loads(line) for line in lines], []
+    rows, learning = rows_of(folder / "seed_1111" / "episodes.jsonl.gz"), []
     for low, high in ((0, 5_000), (15_000, 20_000), (40_000, 44_091)):
         scores = [row["normalized_score"] for row in rows if low <= row["num_updates"] < high]
         learning.append(f"{np.mean(scores):.0f}")
@@ -155,7 +144,7 @@ def test_every_run_has_all_episodes_of_its_evaluation(folder: str, split: TaskSe
         assert config["run_dir"] is None, f"{file}: a path of the machine that trained it"
         trained = config["tasks"]
         wanted = {task.id for task in named_tasks(trained[0].partition("/")[0], split=split)}
-        rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+        rows = rows_of(file)
         wanted |= set(trained) if split == "gate" else set()
         assert Counter(row["task"] for row in rows) == dict.fromkeys(wanted, num_episodes), file
 
@@ -176,9 +165,9 @@ def test_the_page_of_the_general_agents_says_what_their_records_give(tmp_path):
         assert len(rows_of_ours) == 6
         assert all(f"| {' | '.join(cell.text for cell in row)} |" in report for row in rows_of_ours)
     means = {agent.text: mean.text for agent, *_, mean in section.blocks[0].tables[0].rows}
-    for of_segmented in (ROOT / "README.md", ROOT / "docs" / "FINDINGS.md"):
+    for text in ((ROOT / "README.md").read_text(), PAGE):
         value, _, interval = means["rainbow_segmented"].partition(" ")
-        assert re.search(rf"{re.escape(value)}%? {re.escape(interval)}", of_segmented.read_text())
+        assert re.search(rf"{re.escape(value)}%? {re.escape(interval)}", text)
     assert means["rainbow_general (8 tasks)"] == ours[2].text
     assert ours[2].estimate is not None
     assert ours[2].estimate.low > 41.84, "the thesis's best mean over the scenarios"

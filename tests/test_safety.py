@@ -31,6 +31,7 @@ from gvz.run.telemetry import Telemetry
 from gvz.wad.acs import compile_acs
 from gvz.wad.lumps import Lump, read_wad, write_wad
 from learner import checkpoint
+from tests.waiting import wait_until
 
 ROOT = Path(__file__).parent.parent
 MODULES = sorted(file for package in ("gvz", "actors", "learner", "configs") for file in (ROOT / package).rglob("*.py"))
@@ -310,7 +311,4 @@ def test_a_map_that_keeps_the_processor_busy_is_held_by_limits_and_ended(tmp_pat
         assert by_name["Max cpu time"] == ["9", "9"]
         assert by_name["Max address space"] == [str(4 * 2**30)] * 2
         assert by_name["Max core file size"] == ["0", "0"]
-    deadline = time.monotonic() + 60
-    while engines_on(wad) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert not engines_on(wad), "the engine outlived its probe"
+    wait_until(lambda: not engines_on(wad), "the end of the probe's engine")

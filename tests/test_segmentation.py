@@ -173,3 +173,5 @@ def test_what_is_no_network_is_refused_by_name(tmp_path: Path):
         EnvConfig(segmenter_temperature=2.0)
     with pytest.raises(ConfigError, match=r"env\.grayscale: got True with env\.frames segmented"):
         EnvConfig(frames="segmented", grayscale=True)
+    with pytest.raises(ConfigError, match=r"env\.interpolation: got area with env\.frames segmented"):
+        EnvConfig(frames="segmented", interpolation="area")

@@ -1,8 +1,6 @@
 """What the findings say of agents on segmented frames is what their records give."""
 
-import gzip
 import itertools
-import json
 
 import numpy as np
 
@@ -10,12 +8,10 @@ from gvz.evaluation.statistics import difference
 from gvz.reports.experiment_section import comparison_table
 from gvz.reports.scores import agent_scores, estimate, estimate_groups
 from gvz.tasks import named_tasks, scenario_named, scenarios
-from tests.score_tables import of_first_seed, score_cells, task_sets
-from tests.test_results import ROOT, results_of
+from tests.score_tables import PAGE, ROOT, WORDS, of_first_seed, results_of, rows_of, score_cells, task_sets
 
 
 def test_the_findings_say_what_segmented_agents_have_on_single_tasks():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     episodes = results_of("general_short").episodes
 
     def score(task: str, agent: str = "rainbow_segmented") -> str:
@@ -24,103 +20,96 @@ def test_the_findings_say_what_segmented_agents_have_on_single_tasks():
         return f"{scores.mean():.0f}"
 
     center, gathering, dodging = "defend_the_center", "health_gathering", "dodge_projectiles"
-    assert f"`gore+mossy_bricks` {score(f'{center}/gore+mossy_bricks')} instead of 81" in page
+    assert f"`gore+mossy_bricks` {score(f'{center}/gore+mossy_bricks')} instead of 81" in WORDS
     assert (
-        f"`fuzzy_enemies+gore+stone_wall` has {score(f'{center}/fuzzy_enemies+gore+stone_wall')} instead of 54" in page
+        f"`fuzzy_enemies+gore+stone_wall` has {score(f'{center}/fuzzy_enemies+gore+stone_wall')} instead of 54" in WORDS
     )
-    assert f"`complete` {score(f'{center}/complete')} instead of 47" in page
-    assert f"on `short_agent+water`, where agents have {score(f'{gathering}/short_agent+water')} instead of" in page
+    assert f"`complete` {score(f'{center}/complete')} instead of 47" in WORDS
+    assert f"on `short_agent+water`, where agents have {score(f'{gathering}/short_agent+water')} instead of" in WORDS
     water, classes = f"{gathering}/short_agent+water", "rainbow_general+classes"
-    assert f"frames of classes have {score(water, classes)} there, segmented ones {score(water)}." in page
-    assert f"`poison+stimpacks` has {score(f'{gathering}/poison+stimpacks')} instead of 73." in page
+    assert f"frames of classes have {score(water, classes)} there, segmented ones {score(water)}." in WORDS
+    assert f"`poison+stimpacks` has {score(f'{gathering}/poison+stimpacks')} instead of 73." in WORDS
     gate_tasks = [task.id for task in named_tasks(gathering, split="gate")]
     of_gate = estimate(agent_scores(episodes.filter(scenario=gathering), "rainbow_segmented"), gate_tasks).text
-    assert f"**Health Gathering has {of_gate} instead of 80.2" in page
+    assert f"**Health Gathering has {of_gate} instead of 80.2" in WORDS
     trained = [score(f"{gathering}/{name}") for name in ("supreme", "poison")]
-    assert f"`supreme` and `poison`, training tasks, stand at {' and '.join(trained)}, and" in page
+    assert f"`supreme` and `poison`, training tasks, stand at {' and '.join(trained)}, and" in WORDS
     both = f"{gathering}/poison+supreme"
-    assert f"`poison+supreme` at {score(both)} (classes: {score(both, classes)})" in page
+    assert f"`poison+supreme` at {score(both)} (classes: {score(both, classes)})" in WORDS
     at_random = score(f"{gathering}/complete", "random")
-    assert f"`complete` has {score(f'{gathering}/complete')}; a random player has {at_random}." in page
+    assert f"`complete` has {score(f'{gathering}/complete')}; a random player has {at_random}." in WORDS
     arachnotron, complete = (score(f"{dodging}/{name}") for name in ("arachnotron+city", "complete"))
-    assert f"`arachnotron+city` has {arachnotron} and `complete` {complete}, where the sweep" in page
-    assert f"`revenants`, whose missiles turn, has {score(f'{dodging}/revenants')}." in page
+    assert f"`arachnotron+city` has {arachnotron} and `complete` {complete}, where the sweep" in WORDS
+    assert f"`revenants`, whose missiles turn, has {score(f'{dodging}/revenants')}." in WORDS
     shadows, hard, *of_classes = (
         score(f"seek_and_kill/{name}", agent)
         for agent in ("rainbow_segmented", "rainbow_general+classes")
         for name in ("blue+shadows", "complete")
     )
-    assert f"`blue+shadows` has {shadows} instead of 14, `complete` {hard} instead of 18." in page
-    assert f"Frames of classes have {' and '.join(of_classes)}." in page
+    assert f"`blue+shadows` has {shadows} instead of 14, `complete` {hard} instead of 18." in WORDS
+    assert f"Frames of classes have {' and '.join(of_classes)}." in WORDS
     learning = []
     for file in (ROOT / "results" / "general_short" / "runs" / "rainbow_segmented" / "seek_and_kill").glob(
         "**/episodes.jsonl.gz"
     ):
-        rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+        rows = rows_of(file)
         learning += [row["normalized_score"] for row in rows if 8_000 <= row["num_updates"] < 10_000]
-    assert f"training episodes had {np.mean(learning):.0f} points at 8,000 to 10,000 gradient steps" in page
+    assert f"training episodes had {np.mean(learning):.0f} points at 8,000 to 10,000 gradient steps" in WORDS
     level_4 = [score(f"{name}/complete") for name in scenarios()]
-    assert f"{', '.join(level_4[:3])} and {level_4[3]} on the four tasks `complete`" in page
+    assert f"{', '.join(level_4[:3])} and {level_4[3]} on the four tasks `complete`" in WORDS
 
 
 def test_the_findings_say_how_much_agents_of_the_gate_moved_and_what_it_gave_by_task():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     moved, by_task = [], {"arachnotron": [], "mancubus+resized_agent": []}
     for variant in ("plain", "moved", "moved_more", "moved_most"):
         folder = ROOT / "results" / "gates" / "runs" / f"rainbow_segmented+{variant}" / "dodge_projectiles"
-        played = [gzip.decompress(file.read_bytes()) for file in sorted(folder.glob("**/evaluation.jsonl.gz"))]
-        rows = [json.loads(line) for lines in played for line in lines.splitlines()]
+        rows = [row for file in sorted(folder.glob("**/evaluation.jsonl.gz")) for row in rows_of(file)]
         for name, means in by_task.items():
             scores = [row["normalized_score"] for row in rows if row["task"] == f"dodge_projectiles/{name}"]
             assert len(scores) == 40
             means.append(f"{np.mean(scores):.0f}")
-        trained = [
-            gzip.decompress(file.read_bytes()).splitlines()[-60:] for file in folder.glob("**/episodes.jsonl.gz")
-        ]
-        last = [json.loads(line) for lines in trained for line in lines]
+        last = [row for file in folder.glob("**/episodes.jsonl.gz") for row in rows_of(file)[-60:]]
         assert len(last) == 120
         moved.append(np.mean([row["reward_components"].get("moved", 0.0) / row["length_steps"] for row in last]))
-    assert f"agents got {moved[0]:.0f}, {moved[1]:.3f}, {moved[2]:.3f} or {moved[3]:.3f} a decision for it" in page
-    assert f"with both, {moved[2] / 0.0005:.0f} and {moved[3] / 0.002:.0f} map units in five decisions" in page
-    assert "`arachnotron` has {}, {}, {} and {} by weight".format(*by_task["arachnotron"]) in page
-    assert "`mancubus+resized_agent` has {}, {}, {} and {}".format(*by_task["mancubus+resized_agent"]) in page
+    assert f"agents got {moved[0]:.0f}, {moved[1]:.3f}, {moved[2]:.3f} or {moved[3]:.3f} a decision for it" in WORDS
+    assert f"with both, {moved[2] / 0.0005:.0f} and {moved[3] / 0.002:.0f} map units in five decisions" in WORDS
+    assert "`arachnotron` has {}, {}, {} and {} by weight".format(*by_task["arachnotron"]) in WORDS
+    assert "`mancubus+resized_agent` has {}, {}, {} and {}".format(*by_task["mancubus+resized_agent"]) in WORDS
 
 
 def test_the_findings_say_what_shifted_frames_gave():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     episodes, said = results_of("gates").episodes, []
     for task in ("arachnotron", "mancubus+resized_agent"):
         for variant in ("shift", "moved_most"):
             rows = episodes.filter(agent=f"rainbow_segmented+{variant}", task=f"dodge_projectiles/{task}")
             assert len(rows) == 40
             said.append(f"{rows['normalized_score'].mean():.0f}")
-    assert "`arachnotron` has {} instead of {}, `mancubus+resized_agent` {} instead of {}.".format(*said) in page
+    assert "`arachnotron` has {} instead of {}, `mancubus+resized_agent` {} instead of {}.".format(*said) in WORDS
     gate_tasks = [task.id for task in named_tasks("dodge_projectiles", split="gate")]
     in_zoo = episodes.filter(episodes["task"].is_in(gate_tasks), agent="rainbow_segmented+shift", run_seed=2222)
-    assert f"is in the zoo, rounded: seed 2222, which has {in_zoo['normalized_score'].mean():.1f} there." in page
+    assert f"is in the zoo, rounded: seed 2222, which has {in_zoo['normalized_score'].mean():.1f} there." in WORDS
     sets = [[task.id for task in named_tasks("dodge_projectiles", split=split)] for split in ("gate", "train8")]
     on_gate, trained, on_gate_more, trained_more = (
         episodes.filter(episodes["task"].is_in(tasks), agent=f"rainbow_segmented+{variant}")["normalized_score"].mean()
         for variant in ("shift", "shift_moved")
         for tasks in sets
     )
-    assert f"0.002 has {on_gate:.1f} on the gate tasks and {trained:.1f} on the training tasks." in page
-    assert f"0.005 has {on_gate_more:.1f} and {trained_more:.1f}. It has one seed" in page
+    assert f"0.002 has {on_gate:.1f} on the gate tasks and {trained:.1f} on the training tasks." in WORDS
+    assert f"0.005 has {on_gate_more:.1f} and {trained_more:.1f}. It has one seed" in WORDS
     tasks = [task.id for task in named_tasks("defend_the_center", split="train8")]
     of_tasks = episodes.filter(episodes["task"].is_in(tasks))
     plain, everywhere, vertical = (
         of_tasks.filter(agent=f"rainbow_segmented+{name}")["normalized_score"].mean()
         for name in ("moved_most", "shift", "vertical")
     )
-    assert f"[-3.9, -0.4] on the gate tasks and {plain - everywhere:.0f} on the training tasks. The thought" in page
-    assert f"the training tasks lose {plain - vertical:.0f} point, but the gate tasks lose no less" in page
+    assert f"[-3.9, -0.4] on the gate tasks and {plain - everywhere:.0f} on the training tasks. The thought" in WORDS
+    assert f"the training tasks lose {plain - vertical:.0f} point, but the gate tasks lose no less" in WORDS
     (gate,) = [asked for asked in results_of("gates").asked if asked.experiment.name == "gate_shift"]
     gains = [row[2].text for row in comparison_table(results_of("gates"), gate).rows]
-    assert all(gain in page for gain in gains[:5])
+    assert all(gain in WORDS for gain in gains[:5])
 
 
 def test_the_findings_say_what_pairs_gave_beside_segmented_frames():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     episodes = results_of("gates").episodes
 
     def means(task: str) -> list[float]:
@@ -136,25 +125,24 @@ def test_the_findings_say_what_pairs_gave_beside_segmented_frames():
     for task in ("dodge_projectiles/arachnotron", "health_gathering/short_agent+water"):
         pairs, *eight = means(task)
         said += [f"{pairs:.0f}", f"{np.mean(eight):.0f}"]
-    assert "`arachnotron` has {} instead of {}, and `short_agent+water` {} instead of {}.".format(*said) in page
+    assert "`arachnotron` has {} instead of {}, and `short_agent+water` {} instead of {}.".format(*said) in WORDS
     said = [f"{score:.0f}" for task in ("supreme", "poison") for score in means(f"health_gathering/{task}")]
     assert (
         "`supreme` has {}, where the two agents of eight tasks have {} and {}, and `poison` has {}, where they have {} "
         "and {}."
-    ).format(*said) in page
+    ).format(*said) in WORDS
     pairs, eight = ([task.id for task in named_tasks("health_gathering", split=s)] for s in ("pairs", "train8"))
     rare = [sum("poison" in task or "supreme" in task for task in tasks) for tasks in (pairs, eight)]
     assert (rare, len(pairs)) == ([11, 2], 24)
     (gate,) = [asked for asked in results_of("gates").asked if asked.experiment.name == "gate_pairs"]
     gains = [row[2].text for row in comparison_table(results_of("gates"), gate).rows]
-    assert all(gain in page for gain in gains[1:3])
+    assert all(gain in WORDS for gain in gains[1:3])
 
 
 def test_the_findings_say_what_six_times_the_time_gave():
-    page = (ROOT / "docs" / "FINDINGS.md").read_text()
     files = (ROOT / "results" / "general" / "runs" / "rainbow_segmented").glob("**/metrics.jsonl.gz")
-    steps = [json.loads(gzip.decompress(file.read_bytes()).splitlines()[-1])["num_updates"] for file in files]
-    assert f"of [segmented frames](#segmented-frames-yes), {min(steps):,} to {max(steps):,} gradient steps." in page
+    steps = [rows_of(file)[-1]["num_updates"] for file in files]
+    assert f"of [segmented frames](#segmented-frames-yes), {min(steps):,} to {max(steps):,} gradient steps." in PAGE
     agents = {"rainbow_general+sight_loss": "loss of sight", "rainbow_segmented": "segmented"}
     long = results_of("general").episodes
     runs = sorted(long.filter(long["agent"].is_in(agents)).select("scenario", "agent", "run_seed").unique().rows())
@@ -162,108 +150,110 @@ def test_the_findings_say_what_six_times_the_time_gave():
     for name, agent, seed in runs:
         scores = agent_scores(long.filter(scenario=name, run_seed=seed), agent)
         called = agents[agent] if seed == 1111 else f"{agents[agent]}, seed {seed}"
-        assert f"| {scenario_named(name).title} | {called} | 5,400 s | {score_cells(scores, name)} |" in page
+        assert f"| {scenario_named(name).title} | {called} | 5,400 s | {score_cells(scores, name)} |" in PAGE
     short = results_of("general_short").episodes
     for name, agent in {(name, agent) for name, agent, _ in runs}:
         scores = agent_scores(short.filter(scenario=name), agent)
-        assert f"| {scenario_named(name).title} | {agents[agent]} | 900 s | {score_cells(scores, name)} |" in page
+        assert f"| {scenario_named(name).title} | {agents[agent]} | 900 s | {score_cells(scores, name)} |" in PAGE
 
 
-def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
-    short, all_long = (
-        results_of(name).episodes.filter(agent="rainbow_segmented") for name in ("general_short", "general")
-    )
-    long = of_first_seed(all_long)
+def means_by_seed(episodes, name: str, tasks: list[str]) -> list[float]:
+    """Mean over the tasks, of each training seed."""
+    mine = episodes.filter(scenario=name)
+    rows = [[mine.filter(run_seed=seed, task=task) for task in tasks] for seed in sorted(mine["run_seed"].unique())]
+    return [float(np.mean([found["normalized_score"].mean() for found in of_seed])) for of_seed in rows]
 
-    def means(episodes, name: str, tasks: list[str]) -> list[float]:
-        """Mean over the tasks, of each training seed."""
-        mine = episodes.filter(scenario=name)
-        rows = [[mine.filter(run_seed=seed, task=task) for task in tasks] for seed in sorted(mine["run_seed"].unique())]
-        return [float(np.mean([found["normalized_score"].mean() for found in of_seed])) for of_seed in rows]
 
-    gains, of_short = {}, {}
+def test_the_findings_say_what_the_first_seeds_of_segmented_agents_gained_in_six_times_the_time():
+    short, long = (results_of(f).episodes.filter(agent="rainbow_segmented") for f in ("general_short", "general"))
+    long, gains = of_first_seed(long), {}
     compared = ("defend_the_center", "dodge_projectiles", "health_gathering", "seek_and_kill")
     for name, split in itertools.product(compared, ("train8", "gate", "test")):
         tasks = [task.id for task in named_tasks(name, split=split)]
-        before, (after,) = means(short, name, tasks), means(long, name, tasks)
+        before, (after,) = means_by_seed(short, name, tasks), means_by_seed(long, name, tasks)
         assert len(before) == 3
         shown = (name, split) not in (*((one, "gate") for one in compared[1:3]), ("seek_and_kill", "test"))
         assert (after > max(before)) == shown
-        of_short[name, split] = np.mean(before)
-        gains[name, split] = f"{after - of_short[name, split]:.1f}"
+        gains[name, split] = f"{after - np.mean(before):.1f}"
     seeds_below = {}
     for name in compared:
-        before, (after,) = (means(episodes, name, [f"{name}/complete"]) for episodes in (short, long))
+        before, (after,) = (means_by_seed(episodes, name, [f"{name}/complete"]) for episodes in (short, long))
         seeds_below[name] = sum(of_seed < after for of_seed in before)
     outside = {name: count for name, count in seeds_below.items() if count in (0, 3)}
     assert outside == {"health_gathering": 0}, "level 4: the other three are within the ranges"
     center, dodging, _, kill = ([gains[name, split] for split in ("train8", "gate", "test")] for name in compared)
     assert (
         f"In Defend the Center they gain {' and '.join(center[:2])} points, in Seek and Kill {' and '.join(kill[:2])}."
-        in page
+        in WORDS
     )
-    assert f"test tasks gain {center[2]} points in Defend the Center and {dodging[2]} in Dodge" in page
+    assert f"test tasks gain {center[2]} points in Defend the Center and {dodging[2]} in Dodge" in WORDS
+
+
+def test_the_findings_say_what_all_segmented_agents_gained_in_six_times_the_time():
+    short, long = (results_of(f).episodes.filter(agent="rainbow_segmented") for f in ("general_short", "general"))
     of_both = []
     for name in ("defend_the_center", "seek_and_kill", "dodge_projectiles", "health_gathering"):
-        both = [
-            agent_scores(results_of(folder).episodes.filter(scenario=name), "rainbow_segmented")
-            for folder in ("general", "general_short")
-        ]
+        both = [agent_scores(episodes.filter(scenario=name), "rainbow_segmented") for episodes in (long, short)]
         of_both += [estimate_groups([(scores, tasks) for scores in both], difference).text for tasks in task_sets(name)]
-    assert f"beside segmented frames | {of_both[1]} | {of_both[9]} | {of_both[13]} | {of_both[5]} | as you like" in page
+    assert (
+        f"beside segmented frames | {of_both[1]} | {of_both[9]} | {of_both[13]} | {of_both[5]} | as you like" in WORDS
+    )
     together = {
-        name: {2: "both", 3: "all three"}[all_long.filter(scenario=name)["run_seed"].n_unique()] for name in compared
+        name: {2: "both", 3: "all three"}[long.filter(scenario=name)["run_seed"].n_unique()] for name in scenarios()
     }
     assert (
         "{} together have {} points more than 900 seconds on the training tasks, {} on the gate tasks and {} on the "
         "test tasks; on level 4 {}."
-    ).format(together["defend_the_center"], *of_both[:4]) in page
+    ).format(together["defend_the_center"], *of_both[:4]) in WORDS
     assert (
         "{} together have {}, {} and {} points more, and on level 4 {}.".format(
             together["seek_and_kill"], *of_both[4:8]
         )
-        in page
+        in WORDS
     )
-    assert f"no gain is shown on the gate tasks**: all three seeds together have {of_both[9]} points." in page
-    before = of_short["dodge_projectiles", "train8"]
-    assert f"The training tasks had {before:.1f} before, and gain {of_both[8]} points; the test" in page
-    assert f"points; the test tasks gain {of_both[10]}." in page
-    assert f"All three seeds of Dodge Projectiles together have {of_both[11]} points more." in page
-    assert f"gate tasks lose**: all three seeds together have {of_both[13]} points, and each is below all three" in page
-    assert f"On training and test tasks no gain is shown: {of_both[12]} and {of_both[14]}." in page
-    assert f"those of Health Gathering below ({of_both[15]} points)" in page
+    assert f"no gain is shown on the gate tasks**: all three seeds together have {of_both[9]} points." in WORDS
+    before = np.mean(means_by_seed(short, "dodge_projectiles", task_sets("dodge_projectiles")[0]))
+    assert f"The training tasks had {before:.1f} before, and gain {of_both[8]} points; the test" in WORDS
+    assert f"points; the test tasks gain {of_both[10]}." in WORDS
+    assert f"All three seeds of Dodge Projectiles together have {of_both[11]} points more." in WORDS
+    assert (
+        f"gate tasks lose**: all three seeds together have {of_both[13]} points, and each is below all three" in WORDS
+    )
+    assert f"On training and test tasks no gain is shown: {of_both[12]} and {of_both[14]}." in WORDS
+    assert f"those of Health Gathering below ({of_both[15]} points)" in WORDS
     for tasks in task_sets("health_gathering")[1::2]:
-        before, after = (means(episodes, "health_gathering", tasks) for episodes in (short, all_long))
+        before, after = (means_by_seed(episodes, "health_gathering", tasks) for episodes in (short, long))
         assert max(after) < min(before)
-    said = []
-    for task in ("short_agent", "short_agent+water"):
-        assert f"health_gathering/{task}" not in task_sets("health_gathering")[0]
-        of_task = [one.filter(task=f"health_gathering/{task}") for one in (all_long, short)]
+
+
+def test_the_findings_say_what_single_tasks_gained_in_six_times_the_time():
+    short, long = (results_of(f).episodes.filter(agent="rainbow_segmented") for f in ("general_short", "general"))
+    said, gathering, dodging = [], "health_gathering", "dodge_projectiles"
+    tasks = [f"{gathering}/short_agent", f"{gathering}/short_agent+water"]
+    assert not {*tasks} & {*task_sets(gathering)[0]}
+    for task in (*tasks, f"{dodging}/arachnotron", f"{dodging}/mancubus+resized_agent"):
+        of_task = [one.filter(task=task) for one in (long, short)]
         seeds = [of_task[0].filter(run_seed=seed)["normalized_score"].mean() for seed in (1111, 2222, 3333)]
         said += [f"{score:.0f}" for score in (*seeds, of_task[1]["normalized_score"].mean())]
     words = "`short_agent` has {}, {} and {} instead of {}, and `short_agent+water` {}, {} and {} instead of {}."
-    assert words.format(*said) in page
-    said = []
-    for task in ("arachnotron", "mancubus+resized_agent"):
-        of_task = [one.filter(task=f"dodge_projectiles/{task}") for one in (all_long, short)]
-        seeds = [of_task[0].filter(run_seed=seed)["normalized_score"].mean() for seed in (1111, 2222, 3333)]
-        said += [f"{score:.0f}" for score in (*seeds, of_task[1]["normalized_score"].mean())]
+    assert words.format(*said[:8]) in WORDS
     words = "`arachnotron` has {}, {} and {} instead of {}, `mancubus+resized_agent` {}, {} and {} instead of {}."
-    assert words.format(*said) in page
-
+    assert words.format(*said[8:]) in WORDS
     said = []
     for task in ("seek_and_kill/blue+shadows", "seek_and_kill/blue+mixed_enemies+resized_enemies"):
-        said += [f"{episodes.filter(task=task)['normalized_score'].mean():.0f}" for episodes in (long, short)]
+        of_task = [one.filter(task=task)["normalized_score"].mean() for one in (of_first_seed(long), short)]
+        said += [f"{score:.0f}" for score in of_task]
     assert (
         "`blue+shadows` has {} instead of {}, and `blue+mixed_enemies+resized_enemies` {} instead of {}.".format(*said)
-        in page
+        in WORDS
     )
 
+
+def test_the_findings_say_how_segmented_agents_learned_in_six_times_the_time():
     learning = []
     for name in ("defend_the_center", "seek_and_kill", "dodge_projectiles", "health_gathering"):
         file, *_ = sorted((ROOT / f"results/general/runs/rainbow_segmented/{name}").glob("**/episodes.jsonl.gz"))
-        rows = [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+        rows = rows_of(file)
         last = rows[-1]["num_updates"]
         for low, high in ((30_000, 40_000), (60_000, 70_000), (last - 10_000, last + 1)):
             scores = [row["normalized_score"] for row in rows if low <= row["num_updates"] < high]
@@ -271,11 +261,10 @@ def test_the_findings_say_what_segmented_agents_gained_in_six_times_the_time():
     assert (
         "{} points at 30,000 to 40,000 gradient steps, {} at 60,000 to 70,000, and {} in the last 10,000. "
         "Seek and Kill had {}, {} and {}, Dodge Projectiles {}, {} and {}, and Health Gathering {}, {} and {}."
-    ).format(*learning) in page
+    ).format(*learning) in WORDS
 
 
 def test_the_findings_say_what_agents_have_whose_network_learned_longer():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     name = "seek_and_kill"
     used, longer = (
         agent_scores(results_of(folder).episodes.filter(scenario=name), agent)
@@ -285,15 +274,14 @@ def test_the_findings_say_what_agents_have_whose_network_learned_longer():
         )
     )
     for called, scores in (("the network that is used", used), ("the one that learned longer", longer)):
-        assert f"| {called} | {score_cells(scores, name)} |" in page
+        assert f"| {called} | {score_cells(scores, name)} |" in WORDS
     _, gate_tasks, *_ = task_sets(name)
     gain = estimate_groups([(scores, gate_tasks) for scores in (longer, used)], difference).text
-    assert f"The difference on the gate tasks is {gain} points." in page
-    assert f"beside segmented frames | | | | {gain} | no |" in page
+    assert f"The difference on the gate tasks is {gain} points." in WORDS
+    assert f"beside segmented frames | | | | {gain} | no |" in WORDS
 
 
 def test_the_findings_say_what_a_longer_horizon_gave_in_health_gathering():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     episodes = results_of("gates").episodes
 
     def score(variant: str, name: str) -> str:
@@ -301,7 +289,7 @@ def test_the_findings_say_what_a_longer_horizon_gave_in_health_gathering():
         assert len(rows) == 40
         return f"{rows['normalized_score'].mean():.0f}"
 
-    assert f"`poison+stimpacks` has {score('far', 'poison+stimpacks')} instead of" in page
-    assert f"instead of {score('near', 'poison+stimpacks')}, and `poison` {score('far', 'poison')} instead of" in page
-    assert f"instead of {score('near', 'poison')}. `supreme` has {score('far', 'supreme')} instead of" in page
-    assert f"instead of {score('near', 'supreme')}." in page
+    assert f"`poison+stimpacks` has {score('far', 'poison+stimpacks')} instead of" in WORDS
+    assert f"instead of {score('near', 'poison+stimpacks')}, and `poison` {score('far', 'poison')} instead of" in WORDS
+    assert f"instead of {score('near', 'poison')}. `supreme` has {score('far', 'supreme')} instead of" in WORDS
+    assert f"instead of {score('near', 'supreme')}." in WORDS

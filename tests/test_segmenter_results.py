@@ -1,15 +1,12 @@
 """What the findings say of the segmentation networks is what their records give."""
 
 import json
-from pathlib import Path
 
 from gvz.tasks import named_tasks, scenarios
-
-ROOT = Path(__file__).parent.parent
+from tests.score_tables import PAGE, ROOT, WORDS
 
 
 def test_the_findings_say_how_well_segmentation_networks_find_things():
-    page = (ROOT / "docs" / "FINDINGS.md").read_text()
     for name in scenarios():
         record = json.loads((ROOT / "gvz" / "segmenters" / f"{name}.json").read_text())
         assert record["tasks"] == [task.id for task in named_tasks(name, split="train8")], "no gate or test task"
@@ -18,11 +15,10 @@ def test_the_findings_say_how_well_segmentation_networks_find_things():
             cells = (
                 f"{found[kind]:.2f}" if kind in found else "-" for kind in ("enemy", "projectile", "kit", "poison")
             )
-            assert f"| `{task}` | {' | '.join(cells)} |" in page
+            assert f"| `{task}` | {' | '.join(cells)} |" in PAGE
 
 
 def test_the_findings_say_what_putting_frames_together_gave():
-    page = (ROOT / "docs" / "FINDINGS.md").read_text()
     record = json.loads((ROOT / "results" / "gates" / "segmenters" / "compositions.json").read_text())
 
     def row(title: str, task: str, measure: str) -> str:
@@ -50,7 +46,7 @@ def test_the_findings_say_what_putting_frames_together_gave():
         ("mixed enemies before blue walls: average precision", "seek_and_kill/blue+mixed_enemies", "enemy"),
         ("invulnerable enemies before red walls: average precision", "seek_and_kill/invulnerable+red", "enemy"),
     ):
-        assert row(title, task, measure) in page
+        assert row(title, task, measure) in PAGE
         assert task in {pair.id for pair in named_tasks(task.partition("/")[0], split="pairs")}
     gate_tasks = [task.id for task in named_tasks("seek_and_kill", split="gate")]
     more = ("three_frames", "three_frames_more", "three_frames_longer", "tints_patches")
@@ -58,26 +54,25 @@ def test_the_findings_say_what_putting_frames_together_gave():
         found = record["networks"][form]["tasks"]
         tasks = ["seek_and_kill/red+shadows", *gate_tasks]
         cells = " | ".join(f"{found[task]['average_precision']['enemy']:.2f}" for task in tasks)
-        assert f" s | {cells} |" in page
+        assert f" s | {cells} |" in PAGE
     found = record["networks"]["three_frames_more"]["tasks"]
     for name in ("defend_the_center", "seek_and_kill"):  # which have networks of this form
         used = json.loads((ROOT / "gvz" / "segmenters" / f"{name}.json").read_text())["average_precision"]
         assert used == {task: found[task]["average_precision"] for task in used}
     count = record["put_together"]["enemies_per_frame"]
-    assert f"too few enemies**: {count['one_frame']:.1f} a frame before red walls" in page
-    assert f"have {count['real']:.1f}. Near walls hide far things. With things of three frames they hold" in page
-    assert f"they hold {count['three_frames']:.1f}." in page
+    assert f"too few enemies**: {count['one_frame']:.1f} a frame before red walls" in PAGE
+    assert f"have {count['real']:.1f}. Near walls hide far things. With things of three frames they hold" in PAGE
+    assert f"they hold {count['three_frames']:.1f}." in PAGE
     numbers = record["put_together"]["seek_and_kill/red+shadows"]
-    assert f"average precision of {numbers['put_together']:.2f}, and with {numbers['real']:.2f}" in page
+    assert f"average precision of {numbers['put_together']:.2f}, and with {numbers['real']:.2f}" in PAGE
     trials = record["put_together"]["of_trials"]
     last, second = (trials[form].values() for form in ("direct", "few_own_things"))
     last, second = (" and ".join(f"{x:.2f}" for x in one) for one in (last, second))
     said = f"{last} for the fifth network, {second} for the second"
-    assert said in " ".join(page.split())
+    assert said in WORDS
 
 
 def test_the_findings_say_what_the_trials_of_health_gathering_found():
-    page = (ROOT / "docs" / "FINDINGS.md").read_text()
     trials = json.loads((ROOT / "results" / "gates" / "segmenters" / "health_gathering_trials.json").read_text())
     used = json.loads((ROOT / "gvz" / "segmenters" / "health_gathering.json").read_text())
     forms = {
@@ -100,4 +95,4 @@ def test_the_findings_say_what_the_trials_of_health_gathering_found():
         assert list(found) == [task.id for task in named_tasks("health_gathering", split="gate")]
         cells = [f"{scores['kit']:.2f}" for scores in found.values()]
         poison = found["health_gathering/poison+stimpacks"]["poison"]
-        assert f"| {title} | {network['processor_s']:,.0f} s | {' | '.join(cells)} | {poison:.2f} |" in page
+        assert f"| {title} | {network['processor_s']:,.0f} s | {' | '.join(cells)} | {poison:.2f} |" in PAGE

@@ -1,6 +1,5 @@
 """What the findings say of four training tasks is what the records of these agents and their networks give."""
 
-import gzip
 import json
 
 import pytest
@@ -8,18 +7,12 @@ import pytest
 from gvz.evaluation.statistics import difference, mean_over_scenarios
 from gvz.reports.scores import Scores, agent_scores, estimate_groups
 from gvz.tasks import scenario_named, scenarios
-from tests.score_tables import score_cells, task_sets
-from tests.test_results import ROOT, results_of
+from tests.score_tables import ROOT, WORDS, results_of, rows_of, score_cells, task_sets
 
 AGENTS = {
     "4 tasks": ("general_train4", "rainbow_segmented+train4_network"),
     "8 tasks": ("general_short", "rainbow_segmented"),
 }
-
-
-@pytest.fixture(scope="module")
-def page() -> str:
-    return " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
 
 
 @pytest.fixture(scope="module")
@@ -31,18 +24,18 @@ def scores() -> dict[tuple[str, str], Scores]:
     }
 
 
-def test_the_findings_say_what_agents_of_four_training_tasks_have(page: str, scores: dict[tuple[str, str], Scores]):
+def test_the_findings_say_what_agents_of_four_training_tasks_have(scores: dict[tuple[str, str], Scores]):
     for (name, called), of_agent in scores.items():
-        assert f"| {scenario_named(name).title} | {called} | {score_cells(of_agent, name, 'train4')} |" in page
+        assert f"| {scenario_named(name).title} | {called} | {score_cells(of_agent, name, 'train4')} |" in WORDS
     trained = []
     for called in AGENTS:
         groups = [
             [(scores[name, called], task_sets(name, "train4")[column]) for name in scenarios()] for column in range(4)
         ]
         means = [estimate_groups(group, mean_over_scenarios).text for group in groups]
-        assert f"| mean | {called} | {' | '.join(means)} |" in page
+        assert f"| mean | {called} | {' | '.join(means)} |" in WORDS
         trained.append(means[0].split()[0])
-    assert "agents have {} on the four, those of eight tasks {}.".format(*trained) in page
+    assert "agents have {} on the four, those of eight tasks {}.".format(*trained) in WORDS
 
     def gains(column: int) -> list[str]:
         """Of eight tasks, by scenario."""
@@ -54,12 +47,12 @@ def test_the_findings_say_what_agents_of_four_training_tasks_have(page: str, sco
     def rounded(column: int) -> str:
         return "{:.0f}, {:.0f}, {:.0f} and {:.0f}".format(*(float(gain.split()[0]) for gain in gains(column)))
 
-    assert f"not four, beside segmented frames | {' | '.join(gains(1))} | yes |" in page
-    assert f"they have {rounded(2)} points less**" in page
-    assert f"on the gate tasks {rounded(1)}." in page
+    assert f"not four, beside segmented frames | {' | '.join(gains(1))} | yes |" in WORDS
+    assert f"they have {rounded(2)} points less**" in WORDS
+    assert f"on the gate tasks {rounded(1)}." in WORDS
 
 
-def test_the_findings_say_what_networks_of_four_training_tasks_find(page: str):
+def test_the_findings_say_what_networks_of_four_training_tasks_find():
     for name in scenarios():
         four, eight = (
             json.loads((ROOT / "gvz" / "segmenters" / folder / f"{name}.json").read_text())["average_precision"]
@@ -68,10 +61,10 @@ def test_the_findings_say_what_networks_of_four_training_tasks_find(page: str):
         assert list(four) == list(eight)
         for task, found in four.items():
             for kind, value in found.items():
-                assert f"| `{task}` | {kind} | {value:.2f} | {eight[task][kind]:.2f} |" in page
+                assert f"| `{task}` | {kind} | {value:.2f} | {eight[task][kind]:.2f} |" in WORDS
 
 
-def test_the_findings_say_how_long_agents_of_four_training_tasks_learned(page: str):
+def test_the_findings_say_how_long_agents_of_four_training_tasks_learned():
     files = (ROOT / "results" / "general_train4").glob("runs/**/metrics.jsonl.gz")
-    steps = sorted(json.loads(gzip.decompress(file.read_bytes()).splitlines()[-1])["num_updates"] for file in files)
-    assert f"{steps[0]:,} to {steps[-1]:,} gradient steps on four tasks" in page
+    steps = sorted(rows_of(file)[-1]["num_updates"] for file in files)
+    assert f"{steps[0]:,} to {steps[-1]:,} gradient steps on four tasks" in WORDS

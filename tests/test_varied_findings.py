@@ -1,28 +1,19 @@
 """What the findings say of agents that trained on varied maps beside segmented frames is what the records give."""
 
-import gzip
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from gvz.evaluation.statistics import bootstrap, difference
 from gvz.reports.scores import agent_scores, estimate, estimate_groups
 from gvz.tasks import named_tasks, scenario_named, scenarios
-from tests.score_tables import score_cells, task_sets
-from tests.test_results import ROOT, results_of
+from tests.score_tables import PAGE, ROOT, WORDS, results_of, rows_of, score_cells, task_sets
 
 AGENTS = {"varied maps": "general_varied", "8 tasks": "general_short"}
 SCENARIOS = ("defend_the_center", "seek_and_kill")
 
 
-def rows_of(file: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
-
-
 def test_the_findings_say_what_agents_of_varied_maps_have():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     scores = {
         (name, called): agent_scores(results_of(folder).episodes.filter(scenario=name), "rainbow_segmented")
         for name in SCENARIOS
@@ -51,28 +42,27 @@ def test_the_findings_say_what_agents_of_varied_maps_have():
         steps.append(rows_of(file)[-1]["num_updates"])
         for called in AGENTS:
             cells = score_cells(scores[name, called], name)
-            assert f"| {scenario_named(name).title} | {called} | {cells} |" in page
-    assert "{:,} gradient steps in Defend the Center and {:,} in Seek and Kill".format(*steps) in page
+            assert f"| {scenario_named(name).title} | {called} | {cells} |" in WORDS
+    assert "{:,} gradient steps in Defend the Center and {:,} in Seek and Kill".format(*steps) in WORDS
     center, seek = SCENARIOS
-    assert f"not eight tasks, beside segmented frames | -{lower(center, 1)} | | | -{lower(seek, 1)} | no |" in page
+    assert f"not eight tasks, beside segmented frames | -{lower(center, 1)} | | | -{lower(seek, 1)} | no |" in WORDS
     said = "the test tasks are only {} points lower, but the gate tasks {} and level 4 {}."
-    assert said.format(lower(center, 2), lower(center, 1), lower(center, 3)) in page
-    assert f"The test tasks are {lower(seek, 2)} points lower." in page
+    assert said.format(lower(center, 2), lower(center, 1), lower(center, 3)) in WORDS
+    assert f"The test tasks are {lower(seek, 2)} points lower." in WORDS
     bricks, wall = on(f"{center}/mossy_bricks"), on(f"{center}/fuzzy_enemies+gore+stone_wall")
-    assert f"`mossy_bricks` has {bricks[0]:.0f} and `fuzzy_enemies+gore+stone_wall` {wall[0]:.0f}, with eight" in page
-    assert f"with eight tasks {bricks[1]:.0f} and {wall[1]:.0f}." in page
+    assert f"`mossy_bricks` has {bricks[0]:.0f} and `fuzzy_enemies+gore+stone_wall` {wall[0]:.0f}, with eight" in WORDS
+    assert f"with eight tasks {bricks[1]:.0f} and {wall[1]:.0f}." in WORDS
     of_looks = {"gore", "mossy_bricks", "stone_wall", "fuzzy_enemies"}
     tasks = [task for task in named_tasks(center) if set(task.attributes) <= of_looks]
     assert len(tasks) > 5
     for task in tasks:
         varied, eight = on(task.id)
         assert varied >= eight, task.id
-    assert "no varied map has, have {:.0f}, not {:.0f}.".format(*on(f"{center}/flying_enemies")) in page
-    assert "`default` has {:.0f}, not {:.0f}.".format(*on(f"{seek}/default")) in page
+    assert "no varied map has, have {:.0f}, not {:.0f}.".format(*on(f"{center}/flying_enemies")) in WORDS
+    assert "`default` has {:.0f}, not {:.0f}.".format(*on(f"{seek}/default")) in WORDS
 
 
 def test_the_findings_say_what_six_times_the_time_on_varied_maps_gave():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     readme = (ROOT / "results" / "general_varied_long" / "README.md").read_text()
     runs = {"8 tasks": "general/runs/rainbow_segmented/{}/train8"}
     runs["varied maps"] = "general_varied_long/runs/rainbow_segmented/{}/varied"
@@ -86,7 +76,7 @@ def test_the_findings_say_what_six_times_the_time_on_varied_maps_gave():
                 found = [row["normalized_score"] for row in episodes if first <= row["num_updates"] < first + 10_000]
                 means[name, called, first] = float(np.mean(found))
             cells = " | ".join(f"{means[name, called, first]:.1f}" for first in (10_000, 40_000, 80_000))
-            assert f"| {title} | {called} | {cells} |" in page
+            assert f"| {title} | {called} | {cells} |" in WORDS
         run = ROOT / "results" / runs["varied maps"].format(name) / "seed_1111"
         first, *_, last = rows = rows_of(run / "metrics.jsonl.gz")
         waits.append(np.median([row["learner/wait_share"] for row in rows]))
@@ -96,10 +86,10 @@ def test_the_findings_say_what_six_times_the_time_on_varied_maps_gave():
         rate = (steps[-1] - first["num_updates"]) / (last["time_s"] - first["time_s"])
         counts = f"{steps[-1]:,} | {last['actors/env_steps']:,} | {last['run/processor_s']:,.0f} s | {rate:.1f}"
         assert f"| {title} | {counts} |" in readme
-    assert f"({min(steps):,} to {max(steps):,} gradient steps)" in page
+    assert f"({min(steps):,} to {max(steps):,} gradient steps)" in WORDS
     assert "four cores and 16 games each" in " ".join(readme.split())
     assert f"Ctrl-C ended these {np.mean(minutes):.0f} minutes after they had" in readme
-    assert f"ended {np.mean(minutes):.0f} minutes after it had begun" in page
+    assert f"ended {np.mean(minutes):.0f} minutes after it had begun" in WORDS
     assert f"waited for decisions for {100 * np.mean(waits):.0f} percent" in readme
 
     def lower(name: str) -> float:
@@ -111,32 +101,30 @@ def test_the_findings_say_what_six_times_the_time_on_varied_maps_gave():
     said = (
         f"stand {lower(center):.0f} and {lower(seek):.0f} points lower, and Seek and Kill gains only {gain:.0f} points"
     )
-    assert said in page
+    assert said in WORDS
 
 
 def test_the_findings_say_what_networks_of_eight_tasks_find_on_varied_maps():
-    page = (ROOT / "docs" / "FINDINGS.md").read_text()
     file = ROOT / "results" / "gates" / "segmenters" / "varied_maps.json"
     found = json.loads(file.read_text())["average_precision"]
     for task in ("default", "varied"):
         cells = (", ".join(f"{value:.2f}" for value in found[f"{name}/{task}"].values()) for name in scenarios())
-        assert f"| `{task}` | {' | '.join(cells)} |" in page
+        assert f"| `{task}` | {' | '.join(cells)} |" in PAGE
 
 
 def test_the_findings_say_what_a_network_gave_that_has_seen_varied_maps():
-    page = " ".join((ROOT / "docs" / "FINDINGS.md").read_text().split())
     folder, name = ROOT / "results" / "gates" / "segmenters" / "seek_and_kill_varied", "seek_and_kill"
     network = json.loads((folder / "network.json").read_text())
     of_eight = json.loads((ROOT / "gvz" / "segmenters" / f"{name}.json").read_text())["average_precision"]
     gate = [found[task]["enemy"] for found in (network["average_precision"], of_eight) for task in task_sets(name)[1]]
     of_unseen = network["average_precision_on_unseen_maps"]
     unseen, shadows = (of_unseen[f"{name}/{task}"]["enemy"] for task in ("varied", "varied+shadows"))
-    assert "with {:.2f}, {:.2f} and {:.2f} on the gate tasks, not {:.2f}, {:.2f} and {:.2f}.".format(*gate) in page
+    assert "with {:.2f}, {:.2f} and {:.2f} on the gate tasks, not {:.2f}, {:.2f} and {:.2f}.".format(*gate) in WORDS
     assert (
         f"finds enemies with {unseen:.2f} on varied maps that it has not seen (shadows there with {shadows:.2f})"
-        in page
+        in WORDS
     )
-    assert f"({network['gradient_steps']:,} gradient steps)" in page
+    assert f"({network['gradient_steps']:,} gradient steps)" in WORDS
 
     scores: dict[str, list[float]] = {}
     for row in rows_of(folder / "evaluation.jsonl.gz"):
@@ -144,14 +132,14 @@ def test_the_findings_say_what_a_network_gave_that_has_seen_varied_maps():
     assert {len(of_task) for of_task in scores.values()} == {20}
     sets = task_sets(name)[:2]
     cells = [str(bootstrap([np.array(scores[task]) for task in tasks])) for tasks in sets]
-    assert f"| varied maps | varied maps | {' | '.join(cells)} |" in page
+    assert f"| varied maps | varied maps | {' | '.join(cells)} |" in WORDS
     of_others = {
         "varied maps | eight tasks": results_of("general_varied").episodes,
         "8 tasks | eight tasks": results_of("general_short").episodes,
     }
     for called, episodes in of_others.items():
         found = agent_scores(episodes.filter(scenario=name), "rainbow_segmented")
-        assert f"| {called} | {' | '.join(estimate(found, tasks).text for tasks in sets)} |" in page
+        assert f"| {called} | {' | '.join(estimate(found, tasks).text for tasks in sets)} |" in WORDS
 
     def with_eight_tasks(task: str) -> str:
         found = results_of("general_short").episodes.filter(agent="rainbow_segmented", task=task)
@@ -160,7 +148,7 @@ def test_the_findings_say_what_a_network_gave_that_has_seen_varied_maps():
     red, sized, default = (f"{name}/{task}" for task in ("red", "red+resized_enemies", "default"))
     of_red, of_sized, of_default = (f"{np.mean(scores[task]):.0f}" for task in (red, sized, default))
     said = f"`red` has {of_red}, not {with_eight_tasks(red)}, and `red+resized_enemies` {of_sized}, not"
-    assert f"{said} {with_eight_tasks(sized)}, as agents of eight tasks have." in page
+    assert f"{said} {with_eight_tasks(sized)}, as agents of eight tasks have." in WORDS
     assert sorted(scores, key=lambda task: np.mean(scores[task]))[:2] == [sized, red]
     blind = ROOT / "results" / "general_varied" / "runs" / "rainbow_segmented" / name / "varied" / "seed_1111"
     trained = [
@@ -170,6 +158,6 @@ def test_the_findings_say_what_a_network_gave_that_has_seen_varied_maps():
     said = "have {:.0f} points from 10,000 gradient steps on, where the agent that hardly saw had {:.0f}, and".format(
         *trained
     )
-    assert f"{said} `default` has {of_default} instead of" in page
+    assert f"{said} `default` has {of_default} instead of" in WORDS
     last = rows_of(folder / "metrics.jsonl.gz")[-1]
-    assert f"with {last['num_updates']:,} gradient steps and 20 episodes a task" in page
+    assert f"with {last['num_updates']:,} gradient steps and 20 episodes a task" in WORDS

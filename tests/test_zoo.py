@@ -11,9 +11,7 @@ from gvz.evaluation.episode_log import read_rows
 from gvz.evaluation.trained import find_checkpoints, read_run_config, trained_player
 from gvz.evaluation.zoo import MAX_BYTES, ZOO_DIRECTORY, run_directory, zoo_names
 from gvz.tasks import named_tasks, scenarios
-from tests.test_results import results_of
-
-PAGE = Path(__file__).parent.parent / "docs" / "FINDINGS.md"
+from tests.score_tables import PAGE, ROOT, WORDS, results_of
 
 
 def test_every_scenario_of_the_thesis_has_a_policy():
@@ -42,7 +40,7 @@ def test_a_policy_is_small_readable_and_has_its_score_card(name, tmp_path, monke
     rows = [row for row in read_rows(directory / "evaluation.jsonl") if player.identity.items() <= row.items()]
     means = scores_of(rows, config.table.scenarios[0].id)
     title = config.table.scenarios[0].title
-    (line,) = [line for line in PAGE.read_text().splitlines() if line.startswith(f"| {title} | {num_updates:,} | ")]
+    (line,) = [line for line in PAGE.splitlines() if line.startswith(f"| {title} | {num_updates:,} | ")]
     assert f"{np.mean(means):.1f} [" in line
 
 
@@ -89,7 +87,7 @@ def test_the_findings_say_what_the_agent_with_shifted_frames_has(tmp_path, monke
     assert read_run_config(directory).agent.augmentations == ("shift",)
     means = scores_of(read_rows(directory / "evaluation.jsonl"), "dodge_projectiles")
     said = f"It has {np.mean(means):.1f} on the test tasks, and {means[-1]:.0f} on `complete`."
-    assert said in " ".join(PAGE.read_text().split())
+    assert said in WORDS
 
 
 @pytest.mark.parametrize(
@@ -106,8 +104,8 @@ def test_the_mean_over_scenarios_is_that_of_the_score_cards(suffix, said, tmp_pa
         np.mean(scores_of(read_rows(run_directory(Path(f"zoo:{name}{suffix}")) / "evaluation.jsonl"), name))
         for name in scenarios()
     ]
-    assert f"| P_norm: mean over scenarios | | {np.mean(means):.1f} [" in PAGE.read_text()
-    assert said.format(f"{np.mean(means):.1f}") in " ".join((PAGE.parents[1] / "README.md").read_text().split())
+    assert f"| P_norm: mean over scenarios | | {np.mean(means):.1f} [" in PAGE
+    assert said.format(f"{np.mean(means):.1f}") in " ".join((ROOT / "README.md").read_text().split())
 
 
 @pytest.mark.parametrize(

@@ -34,9 +34,8 @@ def findings(address: str, shared: Path | None, *, public: bool = False) -> Gene
     with connect(address, public=public, alike=False) as session:
         nodes = session.nodes
         cores, gpus = (sum(getattr(node, what) for node in nodes) for what in ("cores", "gpus"))
-        yield Finding(
-            "nodes", "ok", f"{len(nodes)} with {cores:g} cores and {gpus:g} GPUs; {', '.join(map(_name, nodes))}"
-        )
+        names = ", ".join(node.name for node in nodes)
+        yield Finding("nodes", "ok", f"{len(nodes)} with {cores:g} cores and {gpus:g} GPUs; {names}")
         for node in nodes:
             yield _versions(node)
         for node in nodes:
@@ -46,10 +45,6 @@ def findings(address: str, shared: Path | None, *, public: bool = False) -> Gene
         yield from _security()
         if shared is not None:
             yield from _directory(shared)
-
-
-def _name(node: Node) -> str:
-    return node.name
 
 
 def _versions(node: Node) -> Finding:

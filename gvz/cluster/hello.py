@@ -13,6 +13,7 @@ from gvz.run import machine
 from gvz.run.footprint import Footprint
 from gvz.run.footprint import check as check_footprint
 from gvz.scenarios.compiler import compile_task
+from gvz.segmentation import segmenter_file
 from gvz.tasks import parse_task
 from gvz.transport.messages import SCHEMA_VERSION, Count
 
@@ -48,7 +49,7 @@ def hello(config: PoolConfig) -> Hello:
 def differences(ours: Hello, theirs: Hello) -> list[str]:
     """How a host differs from the learner's machine: a line `what: got, want` for each thing."""
     found: list[str] = []
-    for kind, want, got in (("", ours.versions, theirs.versions), ("maps of ", ours.maps, theirs.maps)):
+    for kind, want, got in (("", ours.versions, theirs.versions), ("maps or networks of ", ours.maps, theirs.maps)):
         found += _differing(kind, want, got)
     if theirs.schemas != ours.schemas:
         found.append(f"schemas of messages and batches: got {theirs.schemas}, want {ours.schemas}")
@@ -58,15 +59,19 @@ def differences(ours: Hello, theirs: Hello) -> list[str]:
 
 
 def map_digests(config: PoolConfig) -> dict[str, str]:
-    """Task -> digest of the file that the engine loads, and of the map of one episode, which may be drawn."""
+    """Task -> digest of the file that the engine loads, of the map of one episode, which may be drawn, and of the
+    network of segmented frames.
+    """
     if config.env_entry_point != REAL_GAMES:
         return {}
     fields = {field: value for field, value in config.env_config.items() if field in EnvConfig.__dataclass_fields__}
-    profile, digests = EnvConfig(**fields).profile, {}
+    env, digests = EnvConfig(**fields), {}
     for name in config.tasks:
-        compiled = compile_task(parse_task(name), profile)
+        task = parse_task(name)
+        compiled = compile_task(task, env.profile)
         drawn, magic = compiled.map_of(config.seed)
-        digests[name] = _digest(compiled.wad_path.read_bytes(), drawn or b"", str(magic).encode())
+        network = segmenter_file(task.scenario.id, env).read_bytes() if env.frames == "segmented" else b""
+        digests[name] = _digest(compiled.wad_path.read_bytes(), drawn or b"", str(magic).encode(), network)
     return digests
 
 

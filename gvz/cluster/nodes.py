@@ -4,7 +4,6 @@ import hashlib
 import platform
 import shutil
 import socket
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +12,10 @@ from typing import Any
 import gvz
 from gvz.core import janitor
 from gvz.core.errors import ConfigError, ResourceError
+from gvz.run.machine import MEASURED
 
 SURVEY_TIMEOUT_S = 120.0
 """for the first worker process of each node; some seconds on an idle machine"""
-PACKAGES = ("gvz", "actors", "learner", "configs")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -36,8 +35,6 @@ class Node:
     """version, and a digest of the source: versions stay the same between two commits"""
     shm_free_bytes: int
     """in /dev/shm"""
-    clock_s: float
-    """Unix time when it answered"""
 
     @property
     def name(self) -> str:
@@ -55,7 +52,6 @@ def describe() -> dict[str, Any]:
         "ray": ray.__version__,
         "gvizdoom": f"{gvz.__version__}, source {source_digest()}",
         "shm_free_bytes": shutil.disk_usage(janitor.SHM_DIR).free,
-        "clock_s": time.time(),
     }
 
 
@@ -63,12 +59,12 @@ def source_digest() -> str:
     """Of all Python files of our packages: the beginning of a SHA-256, hexadecimal."""
     found = hashlib.sha256()
     root = Path(gvz.__file__).parent.parent
-    for file in sorted(file for package in PACKAGES for file in (root / package).rglob("*.py")):
+    for file in sorted(file for package in MEASURED for file in (root / package).rglob("*.py")):
         found.update(f"{file.relative_to(root)}\0".encode() + file.read_bytes())
     return found.hexdigest()[:8]
 
 
-def on_nodes(function: Any, *arguments: Any, timeout_s: float = SURVEY_TIMEOUT_S) -> list[tuple[dict[str, Any], Any]]:
+def on_nodes(function: Any, *arguments: Any) -> list[tuple[dict[str, Any], Any]]:
     """Calls a function of ours on every node that is alive, on no core: pairs of Ray's description and the answer.
 
     Raises:
@@ -89,7 +85,7 @@ def on_nodes(function: Any, *arguments: Any, timeout_s: float = SURVEY_TIMEOUT_S
     answers = []
     for node, call in zip(alive, calls, strict=True):
         try:
-            answers.append((node, ray.get(call, timeout=timeout_s)))
+            answers.append((node, ray.get(call, timeout=SURVEY_TIMEOUT_S)))
         except Exception as error:  # Ray's, or what the function raised there
             where = f"node {node['NodeName']} ({node['NodeManagerAddress']})"
             if "No module named" in str(error):
@@ -97,7 +93,7 @@ def on_nodes(function: Any, *arguments: Any, timeout_s: float = SURVEY_TIMEOUT_S
                     f"{where}: it cannot import our packages; install the same gvizdoom on every node"
                 ) from error
             raise ConfigError(
-                f"{where}: {type(error).__name__} instead of an answer within {timeout_s:.0f} s"
+                f"{where}: {type(error).__name__} instead of an answer within {SURVEY_TIMEOUT_S:.0f} s"
             ) from error
     return answers
 

@@ -38,7 +38,7 @@ class Record:
     """file to write: .mp4, .webp or .gif"""
     choice: Annotated[EpisodeChoice, tyro.conf.arg(name="")] = ANY_EPISODE
     seconds: float | None = None
-    """of game time, from the episode's start; default all of it (.gif, .webp: at most 20)"""
+    """of game time, from the episode's start; default: the whole episode, of a .gif or .webp its first 20 seconds"""
     tensorboard: bool = False
     """show the .gif in TensorBoard, too, among the run's images"""
 

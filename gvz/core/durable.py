@@ -17,6 +17,11 @@ def fsync(path: Path) -> None:
         os.close(descriptor)
 
 
+def saved_steps(directory: Path) -> list[int]:
+    """Gradient steps of the checkpoints or policies in `directory`, ascending, valid or not."""
+    return sorted(int(p.name) for p in directory.glob("*") if p.is_dir() and p.name.isdecimal())
+
+
 def fsync_tree(directory: Path) -> None:
     """`fsync` of everything in `directory`, each file before the directory that names it, and `directory` last.
 

@@ -97,6 +97,8 @@ class EnvConfig:
             )
         if self.grayscale and self.frames == "segmented":
             raise ConfigError("env.grayscale: got True with env.frames segmented, whose three channels are classes")
+        if self.interpolation != "linear" and self.frames == "segmented":
+            raise ConfigError(f"env.interpolation: got {self.interpolation} with env.frames segmented, want linear")
         for name, low, high in (
             ("frame_height", 8, 1080),
             ("frame_width", 8, 1920),

@@ -28,12 +28,13 @@ _FAULTS = re.compile(
 """ZDoom prints such a line, and goes on"""
 _SCRIPT_ERROR = "Script error"
 _ALONE_S = 20.0
+_TIMEOUT_S = 60.0
 _MEMORY_BYTES = 4 * 2**30
 _TICS = 70
 _NUM_PLACES = 8
 
 
-def probe_wad(wad: Path, map_name: str = "MAP01", timeout_s: float = 60.0) -> str:
+def probe_wad(wad: Path, map_name: str = "MAP01", timeout_s: float = _TIMEOUT_S) -> str:
     """Starts an engine on a scenario file, plays two seconds of its map and returns the engine's log.
 
     Raises:
@@ -85,7 +86,7 @@ def _output_of_engine_alone(command: list[str]) -> str:
     return ""
 
 
-def ensure_loads(wad: Path, map_name: str = "MAP01", timeout_s: float = 60.0) -> None:
+def ensure_loads(wad: Path) -> None:
     """`probe_wad`, once for each content-addressed file and version of ViZDoom: success leaves a marker beside it.
 
     Raises:
@@ -95,9 +96,9 @@ def ensure_loads(wad: Path, map_name: str = "MAP01", timeout_s: float = 60.0) ->
     if marker.exists():
         return
     place = zlib.crc32(wad.stem.encode()) % _NUM_PLACES  # one file is probed by one process at a time
-    with one_of([f"probe-{place}"], time.monotonic() + timeout_s):
+    with one_of([f"probe-{place}"], time.monotonic() + _TIMEOUT_S):
         if not marker.exists():
-            probe_wad(wad, map_name, timeout_s)
+            probe_wad(wad)
             with contextlib.suppress(OSError):  # a directory we cannot write: probed again the next time
                 marker.touch()
 

@@ -50,8 +50,8 @@ def task_frame(task: Task) -> np.ndarray:
     return task_sight(task)[0]
 
 
-def task_sight(task: Task, moment: Moment | None = None, number: int = 0) -> tuple[np.ndarray, dict[str, int]]:
-    """What the agent sees in a task, or on this map of a set of drawn ones, at a moment, by default that of its map.
+def task_sight(task: Task) -> tuple[np.ndarray, dict[str, int]]:
+    """What the agent sees in a task at its map's moment.
 
     Returns: the screen, uint8[FRAME_HEIGHT, FRAME_WIDTH, 3]; and the pixels that each class of things takes of it.
 
@@ -59,7 +59,7 @@ def task_sight(task: Task, moment: Moment | None = None, number: int = 0) -> tup
         EngineError: the engine failed.
     """
     with closing(_engine(compiled := compile_task(task))) as engine:
-        return _sight(engine, _moment(task) if moment is None else moment, compiled.map_of(number)[0])
+        return _sight(engine, _moment(task), compiled.map_of(0)[0])
 
 
 def _moment(task: Task) -> Moment:

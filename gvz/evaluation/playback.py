@@ -20,6 +20,8 @@ from gvz.evaluation.trained import TrainedPlayer, Values
 
 SCREEN_WIDTH, SCREEN_HEIGHT = 800, 450
 """of the large game's screen, pixels; a resolution of ViZDoom's"""
+END_S = 1.5
+"""for how long the last picture stays, seconds"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

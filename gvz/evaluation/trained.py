@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from actors.preprocess import ObservationBatch
+from gvz.core.durable import saved_steps
 from gvz.core.errors import CheckpointError, ConfigError
 from gvz.core.registry import NO_OWN_FILES, OwnFiles
 from gvz.evaluation.episode_log import row_identity
@@ -95,7 +96,7 @@ def find_checkpoints(run_dir: Path, wanted: Sequence[str]) -> list[int]:
         ConfigError: none of those, or there is no such policy; lists those there are.
     """
     directory = run_dir / "policies"
-    known = sorted(int(p.name) for p in directory.glob("*") if p.is_dir() and p.name.isdecimal())
+    known = saved_steps(directory)
     if not known:
         raise ConfigError(
             f"{directory} holds no policy: a run's first one comes with its first checkpoint, and published results "

@@ -12,10 +12,9 @@ import numpy as np
 from PIL import Image
 
 from gvz.core.errors import ConfigError
+from gvz.evaluation.playback import END_S
 
 SUFFIXES = (".mp4", ".gif", ".webp")
-END_S = 1.5
-"""for how long the last picture stays, seconds"""
 
 
 def check_video_file(file: Path) -> None:

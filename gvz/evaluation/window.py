@@ -9,11 +9,9 @@ from PIL.Image import Image
 from gvz.core.errors import ResourceError
 from gvz.env import TICS_PER_SECOND
 from gvz.evaluation.panel import HEIGHT, WIDTH, Panel
-from gvz.evaluation.playback import Moment
+from gvz.evaluation.playback import END_S, Moment
 from gvz.viewer import Window
 
-END_S = 1.5
-"""for how long the last picture stays, seconds"""
 _MOST_LATE_S = 0.2
 """what a slow machine catches up with; if it is later than this, the game waits for it"""
 

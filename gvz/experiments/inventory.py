@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 from gvz.core import records
+from gvz.core.durable import saved_steps
 from gvz.experiments.base import TrainingRun
 from gvz.experiments.plan import Evaluation
 
@@ -58,7 +59,7 @@ def run_progress(results: Path, run: TrainingRun, evaluation: Evaluation) -> Run
     """Reads how far a run is, from its policies and records alone."""
     directory = run_directory(results, run)
     held = _held_episodes(directory / "evaluation.jsonl")
-    saved = sorted({*policies(directory), *held})  # the policies of a finished run may have been removed
+    saved = sorted({*saved_steps(directory / "policies"), *held})  # policies of a finished run may have been removed
     num_updates, processor_s = last_update(directory), last_processor_s(directory)
     if run.max_processor_s is not None and num_updates:  # a later one is of what was discarded: its checkpoint failed
         saved = [checkpoint for checkpoint in saved if checkpoint <= num_updates]
@@ -80,12 +81,6 @@ def missing_player_episodes(file: Path, evaluation: Evaluation) -> int:
     """Episodes that a player's record file does not hold yet."""
     held = set().union(*_held_episodes(file).values())
     return sum((task, n) not in held for task in evaluation.tasks for n in range(evaluation.episodes))
-
-
-def policies(directory: Path) -> list[int]:
-    """Gradient steps of the policies a run has saved, rising."""
-    folder = directory / "policies"
-    return sorted(int(p.name) for p in folder.iterdir() if p.name.isdecimal()) if folder.is_dir() else []
 
 
 def standing_checkpoints(run: TrainingRun, saved: Sequence[int]) -> tuple[int, ...]:
@@ -164,9 +159,9 @@ def seconds_of(log: Path, step: str) -> float:
     return found
 
 
-def last_words(log: Path, num_lines: int = 3) -> list[str]:
+def last_words(log: Path) -> list[str]:
     """The last lines that a failed job wrote itself."""
-    return [line for line in records.last_lines(log) if not line.startswith("#")][-num_lines:]
+    return [line for line in records.last_lines(log) if not line.startswith("#")][-3:]
 
 
 def _held_episodes(file: Path) -> dict[int, set[tuple[str, int]]]:

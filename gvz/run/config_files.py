@@ -122,6 +122,8 @@ def config_to_dict(config: RunConfig) -> dict[str, Any]:
             return [plain(v) for v in value]
         return str(value) if isinstance(value, Path) else value
 
+    if config.group.num_processes > 1:  # who reads it may be elsewhere, without Slurm's variables
+        config = dataclasses.replace(config, group=dataclasses.replace(config.group, process_id=config.group.own_id))
     return {
         "schema": CONFIG_SCHEMA,
         "config": plain(config),

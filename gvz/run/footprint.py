@@ -2,13 +2,12 @@
 
 import shutil
 from dataclasses import dataclass
-from pathlib import Path
 
 import psutil
 
+from gvz.core import janitor
 from gvz.core.errors import ResourceError
 
-SHARED_MEMORY = Path("/dev/shm")
 ENGINE_SHM_BYTES = 11_000_000
 """the engine's own shared files; measured 10.8 MB at every render size (vizdoom 1.3.2)"""
 ENGINE_MEMORY_BYTES = 20_000_000
@@ -112,7 +111,7 @@ def check(
     Raises:
         ResourceError: says what is too small, by how much, and how to get it.
     """
-    shm_free = shutil.disk_usage(SHARED_MEMORY).free if shm_free is None else shm_free
+    shm_free = shutil.disk_usage(janitor.SHM_DIR).free if shm_free is None else shm_free
     memory_free = int(psutil.virtual_memory().available) if memory_free is None else memory_free
     if footprint.shm_bytes > shm_free:
         need = -(-footprint.shm_bytes // 2**20)

@@ -5,11 +5,12 @@ import time
 from collections.abc import Callable, Generator
 from typing import Any
 
+from gvz.core.durable import saved_steps
 from gvz.core.errors import CheckpointError, GvzError
 from gvz.run import machine
 from gvz.run.group import Group
 from gvz.run.rundir import START_RECORDS, RunDir
-from learner.checkpoint import Restored, checkpoint_steps, restore_newest
+from learner.checkpoint import Restored, restore_newest
 
 
 def restore(run: RunDir, template: Any, group: Group, say: Callable[[str], None]) -> Restored | None:
@@ -20,14 +21,14 @@ def restore(run: RunDir, template: Any, group: Group, say: Callable[[str], None]
     """
     restored = group.restored(lambda newest: restore_newest(run.checkpoints, template, newest))
     if restored is None:
-        if len(steps := checkpoint_steps(run.checkpoints)) > 1:
+        if len(steps := saved_steps(run.checkpoints)) > 1:
             raise CheckpointError(
                 f"{run.checkpoints}: there are checkpoints of updates {steps}, but another learner process has none of "
                 "these; bring its run directory back, or give all another --run-dir"
             )
         say(f"new run in {run.path}")
         run.truncate_records(dict.fromkeys(run.record_lengths(), 0))
-        run.discard_policies(0)
+        run.discard_after(0)
         return None
     for damage in restored.damage:
         say(f"damaged checkpoint passed over: {damage}")
@@ -43,7 +44,7 @@ def note_start(run: RunDir, restored: Restored | None) -> None:
 
 @contextlib.contextmanager
 def state_checked(run: RunDir, restored: Restored | None) -> Generator[None]:
-    """Cuts the records and the policies back; within it, a host state that no run can go on from is named.
+    """Cuts records, policies and checkpoints back; within it, a host state that no run can go on from is named.
 
     Raises:
         CheckpointError: the checkpoint's host state is not one of a run.
@@ -51,7 +52,7 @@ def state_checked(run: RunDir, restored: Restored | None) -> Generator[None]:
     try:
         if restored is not None:
             run.truncate_records(restored.host["records"])
-            run.discard_policies(restored.num_updates)
+            run.discard_after(restored.num_updates)
         yield
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         if restored is None or isinstance(error, GvzError):

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from gvz.core import records
-from gvz.core.durable import fsync
+from gvz.core.durable import fsync, saved_steps
 from gvz.core.errors import ConfigError, GvzError, ResumeError
 from gvz.core.registry import NO_OWN_FILES, OwnFiles
 from gvz.run.config import RunConfig
@@ -143,19 +143,21 @@ class RunDir:
                 records.cut(self.path / name, length, self.path / "discarded" / name) for name, length in known.items()
             )
 
-    def discard_policies(self, num_updates: int) -> None:
-        """Moves policies of more gradient steps to `discarded/`: the run that goes on from there never had them.
+    def discard_after(self, num_updates: int) -> None:
+        """Moves policies and checkpoints of more gradient steps to `discarded/`: the run that goes on from there never
+        had them. A checkpoint that could not be read today might be read tomorrow, and is of another history then.
 
         Raises:
             ResumeError: they cannot be moved.
         """
-        moved = self.path / "discarded" / "policies"
         with disk_checked(self.path):
-            for policy in (self.path / "policies").glob("*"):
-                if policy.is_dir() and policy.name.isdecimal() and int(policy.name) > num_updates:
-                    moved.mkdir(parents=True, exist_ok=True)
-                    shutil.rmtree(moved / policy.name, ignore_errors=True)
-                    policy.rename(moved / policy.name)
+            for folder in (self.path / "policies", self.checkpoints):
+                moved = self.path / "discarded" / folder.name
+                for steps in saved_steps(folder):
+                    if steps > num_updates:
+                        moved.mkdir(parents=True, exist_ok=True)
+                        shutil.rmtree(moved / str(steps), ignore_errors=True)
+                        (folder / str(steps)).rename(moved / str(steps))
 
     def close(self) -> None:
         """Closes the record files and releases the lock. Can be repeated.

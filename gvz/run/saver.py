@@ -4,12 +4,13 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from gvz.core.durable import saved_steps
 from gvz.core.errors import CheckpointError
 from gvz.run.config import CheckpointConfig
 from gvz.run.group import Group
 from gvz.run.monitor import Counts
 from gvz.run.rundir import RunDir
-from learner.checkpoint import Checkpointer, checkpoint_steps
+from learner.checkpoint import Checkpointer
 
 SAVE_RETRY_S, LONGEST_SAVE_RETRY_S = 60.0, 3600.0
 """a failed checkpoint is tried again after this time, doubled each time, or at the next period"""
@@ -94,7 +95,7 @@ class Saver:
             failure = self.wait()
         begun()
         if self._num_failed:
-            newest = max(checkpoint_steps(self._checkpoints), default=0)
+            newest = max(saved_steps(self._checkpoints), default=0)
             raise CheckpointError(
                 f"the last checkpoint, at update {self._counts.updates}, could not be written: {failure}. The newest "
                 f"one is of update {newest}; mend this and give the same command to go on from there"

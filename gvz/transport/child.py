@@ -15,6 +15,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import FrameType, MappingProxyType
@@ -22,7 +23,7 @@ from typing import IO
 
 from gvz.core import janitor
 from gvz.transport.channel import Channel
-from gvz.transport.messages import Message
+from gvz.transport.messages import Message, Stop
 
 
 def one_core() -> dict[str, str]:
@@ -39,6 +40,21 @@ def one_core() -> dict[str, str]:
         "MKL_NUM_THREADS": "1",
         "OPENCV_FOR_THREADS_NUM": "1",
     }
+
+
+def end_all(processes: "Sequence[ChildProcess]", grace_s: float) -> None:
+    """Asks them to stop, and ends those that have not within `grace_s`, also when a second Ctrl-C ends the wait."""
+    try:
+        for process in processes:
+            if not process.channel.closed:
+                process.channel.send(Stop())
+        deadline = time.monotonic() + grace_s
+        for process in processes:
+            process.wait(max(0.0, deadline - time.monotonic()))
+    finally:
+        deadline = time.monotonic() + grace_s
+        for process in processes:
+            process.end(grace_s=max(0.0, deadline - time.monotonic()))
 
 
 class ChildProcess:

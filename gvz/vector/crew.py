@@ -3,7 +3,6 @@
 import os
 import select
 import tempfile
-import time
 from collections import deque
 from collections.abc import Sequence
 from typing import IO, Any
@@ -13,7 +12,7 @@ import msgspec
 from gvz.core import errors, janitor
 from gvz.core.errors import GvzError, TransportError, WorkerError
 from gvz.core.watchdog import AwakeClock
-from gvz.transport.child import ChildProcess
+from gvz.transport.child import ChildProcess, end_all
 from gvz.transport.messages import (
     Decision,
     Decisions,
@@ -23,7 +22,6 @@ from gvz.transport.messages import (
     Outcomes,
     Render,
     Screen,
-    Stop,
     VectorSpec,
 )
 from gvz.vector.frames import Frames
@@ -171,16 +169,9 @@ class Crew:
             return
         workers, self._workers = self._workers, []
         try:
+            end_all([worker.process for worker in workers], _STOP_TIMEOUT_S)
+        finally:
             for worker in workers:
-                if not worker.process.channel.closed:
-                    worker.process.channel.send(Stop())
-            deadline = time.monotonic() + _STOP_TIMEOUT_S
-            for worker in workers:
-                worker.process.wait(max(0.0, deadline - time.monotonic()))
-        finally:  # also when a Ctrl-C ends the wait
-            deadline = time.monotonic() + _STOP_TIMEOUT_S
-            for worker in workers:
-                worker.process.end(grace_s=max(0.0, deadline - time.monotonic()))
                 worker.close()
             self._frames.close()
             if workers:

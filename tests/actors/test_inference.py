@@ -2,9 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
-import textwrap
 import threading
 import time
 from collections.abc import Mapping
@@ -178,32 +175,3 @@ def test_a_pool_needs_a_policy_exactly_if_its_actors_ask(tmp_path: Path):
         ProcessPool(config(tmp_path, {}), None, FramePolicy)
     with pytest.raises(ValueError, match=r"actors\.inference: got 'device', want 'actors'"):
         InlinePool(asking(tmp_path, num_actors=1))
-
-
-_PARENT = """
-import sys, time
-sys.path.append({tests!r})
-from pathlib import Path
-import test_inference as t
-pool = t.ProcessPool(t.asking(Path({work!r})), None, t.FramePolicy)
-t.publish(pool)
-while pool.statistics().env_steps < 100 or pool.statistics().actors_ready < 2:
-    pool.drain(100)
-    pool.poll()
-print(*[status.pid for status in pool.writer_statuses()], flush=True)
-time.sleep(600)
-"""
-
-
-def test_a_killed_learner_takes_its_actors_along(tmp_path: Path):
-    code = textwrap.dedent(_PARENT).format(tests=str(Path(__file__).parent), work=str(tmp_path))
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
-        assert parent.stdout is not None
-        pids = [int(word) for word in parent.stdout.readline().split()]
-        assert len(pids) == 2
-        assert all(alive(pid) for pid in pids)
-        parent.kill()
-    deadline = time.monotonic() + 60.0
-    while any(alive(pid) for pid in pids):
-        assert time.monotonic() < deadline, "actors outlive their learner"
-        time.sleep(0.05)

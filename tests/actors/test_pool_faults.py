@@ -21,6 +21,7 @@ from actors.process_pool import ProcessPool
 from gvz.core.errors import WorkerError
 from gvz.transport.channel import Channel
 from gvz.transport.messages import EpisodeStats, Message, Ready
+from tests.waiting import wait_until
 
 
 @pytest.mark.parametrize("fault", ["kill", "raise", "segfault"])
@@ -212,8 +213,5 @@ def test_a_killed_learner_takes_its_actors_along_and_leaves_nothing(tmp_path: Pa
         assert segments
         assert all(alive(pid) for pid in pids)
         parent.kill()
-    deadline = time.monotonic() + 60.0
-    while any(alive(pid) for pid in pids):
-        assert time.monotonic() < deadline, "actors outlive their learner"
-        time.sleep(0.05)
+    wait_until(lambda: not any(alive(pid) for pid in pids), "the actors' end")
     assert not segments & open_segments()

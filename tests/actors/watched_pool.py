@@ -12,6 +12,7 @@ from actors.process_pool import ProcessPool
 from gvz.core import janitor
 from gvz.transport.messages import EpisodeStats, Fault, Message
 from gvz.transport.ring import WriterState
+from tests.waiting import wait_until
 
 DEADLINE_S = 240.0
 
@@ -49,10 +50,8 @@ class Run:
 
     def until_all_full(self) -> None:
         """Until every actor waits for space in its ring; nothing is drained."""
-        deadline = time.monotonic() + DEADLINE_S
-        while any(status.state != WriterState.WAITING_FOR_SPACE for status in self.pool.writer_statuses()):
-            assert time.monotonic() < deadline, self.pool.writer_statuses()
-            time.sleep(0.01)
+        full = WriterState.WAITING_FOR_SPACE
+        wait_until(lambda: {s.state for s in self.pool.writer_statuses()} == {full}, "full rings", DEADLINE_S)
 
 
 def segments() -> dict[int, int]:

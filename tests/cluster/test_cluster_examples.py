@@ -5,12 +5,13 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 import yaml
+
+from tests.waiting import wait_until
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "cluster"
 BIN = Path(sys.executable).parent
@@ -51,11 +52,7 @@ def test_an_array_task_that_is_out_of_time_saves_its_run_and_goes_back_into_the_
     task = subprocess.Popen(command, env=environment, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
     directory = tmp_path / "results" / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111"
     try:
-        deadline_s = time.monotonic() + 150
-        while not (directory / "metrics.jsonl").exists():
-            assert task.poll() is None, task.communicate()[1]
-            assert time.monotonic() < deadline_s
-            time.sleep(0.05)
+        wait_until((directory / "metrics.jsonl").exists, "the first updates", 150, process=task)
         task.send_signal(signal.SIGTERM)
         said = task.communicate(timeout=120)[1]
     finally:

@@ -17,6 +17,7 @@ from gvz.cluster.hello import Hello, differences, hello
 from gvz.cluster.host import Host, HostSpec
 from gvz.core import janitor
 from gvz.transport.messages import EpisodeStats, Message, ParamsHeader, Ready
+from tests.test_segmentation import write_network
 
 DEADLINE_S = 120.0
 
@@ -145,7 +146,7 @@ def test_a_host_that_nobody_asks_ends(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.engine
-def test_a_machine_says_what_it_would_play():
+def test_a_machine_says_what_it_would_play(tmp_path: Path):
     pool = PoolConfig(
         tasks=("defend_the_center/default", "seek_and_kill/procedural-train-10"),
         num_actors=1,
@@ -168,6 +169,10 @@ def test_a_machine_says_what_it_would_play():
     assert theirs == ours
     assert set(ours.maps) == set(pool.tasks)
     assert hello(msgspec.structs.replace(pool, seed=2)).maps != ours.maps, "the map of an episode is drawn by the seed"
+    segmented = msgspec.structs.replace(pool, env_config={"frames": "segmented"})
+    network = str(write_network(tmp_path / "other.onnx"))
+    other = msgspec.structs.replace(pool, env_config={"frames": "segmented", "segmenter": network})
+    assert set(hello(segmented).maps.values()).isdisjoint(hello(other).maps.values())
 
 
 def test_differences_are_named():
@@ -175,7 +180,7 @@ def test_differences_are_named():
     for change, text in (
         ({"versions": {"python": "3.11.8", "jax": "1"}}, "python: got 3.11.8, want 3.11.7"),
         ({"versions": {"python": "3.11.7"}}, "jax: got none, want 1"),
-        ({"maps": {"t": "n"}}, "maps of t: got n, want m"),
+        ({"maps": {"t": "n"}}, "maps or networks of t: got n, want m"),
         ({"schemas": (3, 1)}, "schemas of messages and batches: got (3, 1), want (4, 1)"),
         ({"code": "b"}, "source files of GViZDoom: got digest b, want a"),
     ):

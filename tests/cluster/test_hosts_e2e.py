@@ -6,8 +6,7 @@ import re
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,16 @@ from rich.console import Console
 
 from benchmarks import hosts_soak
 from gvz.core import janitor, records
-from learner.checkpoint import checkpoint_steps
+from gvz.core.durable import saved_steps
 from tests.cluster.conftest import RayCluster
+from tests.waiting import wait_until
 
 pytestmark = [
     pytest.mark.e2e,
     pytest.mark.engine,
     pytest.mark.timeout(900),
 ]
+TIMEOUT_S = 240.0
 METRICS_PAGE = Path(__file__).parents[2] / "docs" / "reference" / "metrics.md"
 SMALL = (
     "--actors.num-actors 1 --actors.games-per-actor 2 --actors.placement free "
@@ -69,15 +70,8 @@ class Command:
 @pytest.fixture
 def command(cluster: RayCluster, tmp_path: Path) -> Iterator[Command]:
     yield Command(cluster, tmp_path / "run")
-    until(lambda: not played_by_hosts(), "hosts, actors and engines to end", 60.0)
-    until(lambda: not janitor.dead_instances(), f"{janitor.dead_instances()} to be removed", 10.0)
-
-
-def until(done: Callable[[], bool], what: str, timeout_s: float = 240.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not done():
-        assert time.monotonic() < deadline, f"waited {timeout_s:.0f} s for {what}"
-        time.sleep(0.1)
+    wait_until(lambda: not played_by_hosts(), "hosts, actors and engines to end", 60)
+    wait_until(lambda: not janitor.dead_instances(), f"{janitor.dead_instances()} to be removed", 10)
 
 
 def played_by_hosts() -> list[psutil.Process]:
@@ -100,17 +94,17 @@ def played_by_hosts() -> list[psutil.Process]:
 def test_a_run_survives_a_killed_host_a_stop_and_a_killed_learner(command: Command):
     learner = command.start("--learner.total-updates", "10000")
     try:
-        until(lambda: command.num_updates() >= 40, "the first updates")
+        wait_until(lambda: command.num_updates() >= 40, "the first updates", TIMEOUT_S)
         victim = played_by_hosts()[0]
         victim.kill()
-        until(lambda: any(f["kind"] == "host_died" for f in command.rows("faults.jsonl")), "the fault to be named")
-        until(lambda: command.rows("metrics.jsonl")[-1]["cluster/hosts"] == 2, "the host to be replaced")
+        wait_until(lambda: any(f["kind"] == "host_died" for f in command.rows("faults.jsonl")), "the fault", TIMEOUT_S)
+        wait_until(lambda: command.rows("metrics.jsonl")[-1]["cluster/hosts"] == 2, "a host in its place", TIMEOUT_S)
         replaced_at = command.num_updates()
-        until(lambda: command.num_updates() >= replaced_at + 40, "training to go on")
+        wait_until(lambda: command.num_updates() >= replaced_at + 40, "training to go on", TIMEOUT_S)
         learner.send_signal(signal.SIGTERM)
         _, err = learner.communicate(timeout=120)
         assert learner.returncode == 143, err
-        stopped_at = checkpoint_steps(command.run / "checkpoints")[-1]
+        stopped_at = saved_steps(command.run / "checkpoints")[-1]
         assert stopped_at >= replaced_at + 40
         row = command.rows("metrics.jsonl")[-1]
         assert row["cluster/host_restarts"] == 1
@@ -120,15 +114,15 @@ def test_a_run_survives_a_killed_host_a_stop_and_a_killed_learner(command: Comma
         assert sorted(documented) == sorted(name for name in row if name.startswith("cluster/"))
 
         learner = command.start("--learner.total-updates", "10000")
-        until(lambda: command.num_updates() >= stopped_at + 40, "the resumed run")
+        wait_until(lambda: command.num_updates() >= stopped_at + 40, "the resumed run", TIMEOUT_S)
         learner.kill()
         learner.communicate(timeout=60)
-        until(lambda: not played_by_hosts(), "the hosts to end by themselves")
+        wait_until(lambda: not played_by_hosts(), "the hosts to end by themselves", TIMEOUT_S)
 
         learner = command.start("--learner.total-updates", "10000")
-        until(lambda: len(command.rows("starts.jsonl")) == 3, "the second resume")
+        wait_until(lambda: len(command.rows("starts.jsonl")) == 3, "the second resume", TIMEOUT_S)
         resumed_at = command.rows("starts.jsonl")[-1]["num_updates"]
-        until(lambda: command.num_updates() >= resumed_at + 40, "training to go on again")
+        wait_until(lambda: command.num_updates() >= resumed_at + 40, "training to go on again", TIMEOUT_S)
         learner.send_signal(signal.SIGINT)
         _, err = learner.communicate(timeout=120)
         assert learner.returncode == 130, err

@@ -7,7 +7,6 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import psutil
@@ -21,7 +20,9 @@ from gvz.core.errors import ConfigError, GvzError
 from gvz.experiments import inventory
 from gvz.experiments.plan import read_plan
 from tests.processes import arguments
+from tests.waiting import wait_until
 
+TIMEOUT_S = 150.0
 RUN = "rainbow_4task/defend_the_center/train4/seed_1111"
 DRIVER = """
 import sys
@@ -71,18 +72,10 @@ def begin(cluster, results: Path, code: str, count: int) -> subprocess.Popen[str
     return subprocess.Popen(command, env=cluster.environment, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 
-def wait_until(true: Callable[[], bool], driver: subprocess.Popen[str]) -> None:
-    deadline_s = time.monotonic() + 150
-    while not true():
-        assert driver.poll() is None, driver.communicate()[1]
-        assert time.monotonic() < deadline_s
-        time.sleep(0.05)
-
-
 def all_done(driver: subprocess.Popen[str]) -> str:
     """What it has said; kills it where it is stuck."""
     try:
-        return driver.communicate(timeout=150)[1]
+        return driver.communicate(timeout=TIMEOUT_S)[1]
     finally:
         driver.kill()
 
@@ -108,7 +101,7 @@ def test_jobs_spread_over_the_nodes_each_on_a_core_of_its_own_and_know_nothing_o
 def test_a_signal_reaches_the_jobs_which_save_and_none_is_left(cluster, tmp_path, number, code, job_sees):
     driver = begin(cluster, tmp_path, SAVE, 3)
     try:
-        wait_until(lambda: len(list(tmp_path.glob("*.begun"))) == 2, driver)
+        wait_until(lambda: len(list(tmp_path.glob("*.begun"))) == 2, "two jobs", TIMEOUT_S, process=driver)
         jobs = [psutil.Process(int(file.stem)) for file in tmp_path.glob("*.begun")]
         os.killpg(driver.pid, number)
         said = driver.communicate(timeout=100)[1]
@@ -124,7 +117,7 @@ def test_a_job_whose_node_loses_its_power_goes_on_elsewhere(cluster, tmp_path):
     driver = begin(cluster, tmp_path, LONG, 1)
     begun = tmp_path / "begun"
     try:
-        wait_until(lambda: begun.exists() and begun.read_text() != "", driver)
+        wait_until(lambda: begun.exists() and begun.read_text(), "the job's start", TIMEOUT_S, process=driver)
         cluster.kill_node_of(psutil.Process(int(begun.read_text())))
         cluster.tell("add")
     finally:
@@ -145,11 +138,13 @@ def test_a_run_whose_node_loses_its_power_goes_on_elsewhere_from_its_checkpoint(
     driver = subprocess.Popen(command, env=cluster.environment, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
     log, directory = inventory.log_file(results, RUN), results / "runs" / RUN
     try:
-        wait_until((directory / "checkpoints" / "100").exists, driver)
+        checkpoint = directory / "checkpoints" / "100"
+        wait_until(checkpoint.exists, "the first checkpoint", TIMEOUT_S, process=driver)
         at_work = [p for p in psutil.process_iter() if str(directory) in arguments(p) and "gvz.launch" in arguments(p)]
         cluster.kill_node_of(at_work[0])
         cluster.tell("add")
-        wait_until(lambda: "goes on from update 100" in log.read_text(), driver)
+        resumed = "goes on from update 100"
+        wait_until(lambda: resumed in log.read_text(), "the resumed run", TIMEOUT_S, process=driver)
         said = driver.communicate(timeout=400)[1]
     finally:
         driver.kill()

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -14,6 +13,7 @@ from gvz.core.errors import ConfigError
 from gvz.evaluation.episode_log import RecordFile, read_rows
 from gvz.evaluation.selection import TaskSelection
 from gvz.tasks import named_tasks, scenarios
+from tests.waiting import wait_until
 
 
 @pytest.mark.parametrize(
@@ -131,10 +131,7 @@ def test_an_interrupted_evaluation_goes_on_and_ends_with_a_table(tmp_path):
         process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, start_new_session=True
         )
-        deadline = time.monotonic() + 120
-        while not out.exists() or out.read_text().count("\n") == num_rows:
-            assert time.monotonic() < deadline, "waited 120 s for a row"
-            time.sleep(0.02)
+        wait_until(lambda n=num_rows: out.exists() and out.read_text().count("\n") > n, "a row", 120, process=process)
         os.killpg(process.pid, signal_number)  # the whole group, as a shell and a batch system do
         _, err = process.communicate(timeout=120)
         assert process.returncode == 128 + signal_number, err

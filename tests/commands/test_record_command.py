@@ -3,7 +3,6 @@
 import signal
 import subprocess
 import sys
-import time
 
 import av
 import pytest
@@ -12,6 +11,7 @@ from PIL import Image
 from gvz import cli
 from gvz.evaluation.episode_log import read_rows
 from tests.tensorboard_events import read_events
+from tests.waiting import wait_until
 
 
 @pytest.mark.parametrize(
@@ -95,10 +95,7 @@ def test_an_interrupted_recording_leaves_nothing(tmp_path):
         *("--out", str(tmp_path / "video.mp4")),
     ]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
-    deadline = time.monotonic() + 120
-    while not list(tmp_path.glob(".writing-*")):
-        assert time.monotonic() < deadline, "waited 120 s for the first picture"
-        time.sleep(0.02)
+    wait_until(lambda: list(tmp_path.glob(".writing-*")), "the first picture", 120, process=process)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     assert (process.returncode, out) == (130, "")

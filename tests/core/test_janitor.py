@@ -18,6 +18,7 @@ import vizdoom
 from gvz.core import janitor
 from gvz.core.errors import ResourceError
 from gvz.engine import process
+from tests.waiting import wait_until
 
 WRAPPER = Path(process.__file__).with_name("wrapper.py")
 STOCK_WAD = Path(vizdoom.scenarios_path) / "defend_the_center.wad"
@@ -53,13 +54,6 @@ def run_until_killed(code: str) -> str:
 def give_up(directory: Path) -> None:
     """Unlocks the record of a directory, as the end of its owner does."""
     os.close(janitor._held.pop(directory))
-
-
-def wait_until_gone(pid: int) -> bool:
-    deadline = time.monotonic() + 5
-    while janitor.process_start(pid) is not None and time.monotonic() < deadline:
-        time.sleep(0.01)
-    return janitor.process_start(pid) is None
 
 
 def test_records_are_private(registry: Path):
@@ -240,7 +234,7 @@ def test_a_killed_client_takes_its_engine_along_and_the_janitor_the_rest(registr
         "print(e.pid, e.instance_id, e.log.parent, flush=True); input()"
     )
     pid, instance_id, directory = line.split()
-    assert wait_until_gone(int(pid)), "the engine outlived its client"
+    wait_until(lambda: janitor.process_start(int(pid)) is None, "the engine's end")
     left = {path.name for path in janitor.SHM_DIR.glob(f"*{instance_id}")}
     assert left == {f"ViZDoom{part}{instance_id}" for part in ("SM", "MQCtr", "MQDoom")}
     removed = janitor.clean_dead_instances()
@@ -320,17 +314,14 @@ def test_an_engine_that_outlived_its_owner_is_ended():
     engine = Engine(EngineConfig(wad=STOCK_WAD, buttons=(), variables=()))
     give_up(engine.log.parent)
     assert f"engine {engine.instance_id} (pid {engine.pid})" in janitor.clean_dead_instances()
-    assert wait_until_gone(engine.pid)
+    wait_until(lambda: janitor.process_start(engine.pid) is None, "the engine's end")
     engine.close()
 
 
 def test_a_zombie_is_dead():
     process = subprocess.Popen(["true"])
-    deadline = time.monotonic() + 5
-    while janitor.process_start(process.pid) is not None and time.monotonic() < deadline:
-        time.sleep(0.01)
+    wait_until(lambda: janitor.process_start(process.pid) is None, "the end of the process")
     assert Path(f"/proc/{process.pid}").exists(), "not reaped yet"
-    assert janitor.process_start(process.pid) is None
     process.wait()
 
 

@@ -4,8 +4,7 @@ import json
 import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,8 @@ SMALL = (
 ).split()
 
 
+TIMEOUT_S = 600.0
+"""how long a test waits for something that a run does"""
 STARTED: list[subprocess.Popen[str]] = []
 """the runs of a test"""
 
@@ -71,13 +72,6 @@ def faults(run: Path) -> list[dict[str, Any]]:
     """The rows of faults.jsonl while a run goes on, without one that is being written."""
     file = run / "faults.jsonl"
     return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
-
-
-def wait_until(condition: Callable[[], bool], what: str, timeout_s: float = 600) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, f"waited {timeout_s} s for {what}"
-        time.sleep(0.05)
 
 
 def num_updates(run: Path) -> int:

@@ -6,10 +6,11 @@ from pathlib import Path
 import pytest
 
 from gvz.core import janitor
+from tests.waiting import wait_until
 
 sys.path.append(str(Path(__file__).parent))
 
-from command import STARTED, left_behind, wait_until
+from command import STARTED, left_behind
 
 
 @pytest.fixture
@@ -22,6 +23,6 @@ def nothing_left():
             process.kill()
             process.communicate()
             janitor.clean_dead_instances()
-    wait_until(lambda: not left_behind(), "engines and shared memory to be removed", 60)
+    wait_until(lambda: not left_behind(), "engines and shared memory to be removed")
     STARTED.clear()
     assert set(Path.cwd().glob("_vizdoom*")) <= files

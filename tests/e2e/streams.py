@@ -11,7 +11,8 @@ import msgpack
 import numpy as np
 from command import arrays_of, rows
 
-from learner.checkpoint import checkpoint_steps, verify
+from gvz.core.durable import saved_steps
+from learner.checkpoint import verify
 
 _FIELDS = ("reward", "task", "first", "last", "terminated")
 
@@ -35,7 +36,7 @@ class Streams:
 
 def check_streams(run: Path, num_lanes: int, num_tasks: int) -> Streams:
     """Checks every record in the replay of a run's last checkpoint, which must hold all the records of the run."""
-    checkpoint = run / "checkpoints" / str(checkpoint_steps(run / "checkpoints")[-1])
+    checkpoint = run / "checkpoints" / str(saved_steps(run / "checkpoints")[-1])
     verify(checkpoint)
     counts = msgpack.unpackb((checkpoint / "host.msgpack").read_bytes())["counts"]
     arrays = arrays_of(checkpoint)

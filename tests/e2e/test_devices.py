@@ -3,7 +3,7 @@
 import pytest
 from command import finish, launch, rows
 
-from learner.checkpoint import checkpoint_steps
+from gvz.core.durable import saved_steps
 
 pytestmark = [pytest.mark.e2e, pytest.mark.engine, pytest.mark.timeout(900), pytest.mark.usefixtures("nothing_left")]
 
@@ -21,7 +21,7 @@ def test_a_run_on_two_devices_trains_and_goes_on_with_one(tmp_path):
     code, err = finish(launch(run, "--learner.total-updates", "60"))
     assert code == 0, err
     assert "goes on from update 40" in err
-    assert checkpoint_steps(run / "checkpoints") == [40, 60]
+    assert saved_steps(run / "checkpoints") == [40, 60]
     assert [row["num_updates"] for row in rows(run, "metrics.jsonl")] == [20, 40, 60]
     assert all(row["learner/loss"] > 0 for row in rows(run, "metrics.jsonl"))
     code, err = finish(launch(run, "--learner.total-updates", "80", "--learner.devices", "4"))

@@ -5,17 +5,17 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
 from pathlib import Path
 
 import psutil
 import pytest
-from command import STARTED, alive
+from command import STARTED, TIMEOUT_S, alive
 
 from gvz.experiments import inventory as progress
 from gvz.experiments.plan import read_plan
 from tests.processes import arguments
+from tests.waiting import wait_until
 
 pytestmark = [
     pytest.mark.e2e,
@@ -45,18 +45,11 @@ def training_process(runner: subprocess.Popen[str], run: str) -> psutil.Process:
     return found
 
 
-def wait_for(path: Path, runner: subprocess.Popen[str]) -> None:
-    deadline = time.monotonic() + 600
-    while not path.exists():
-        assert runner.poll() is None, runner.communicate()[1]
-        assert time.monotonic() < deadline, f"waited 600 s for {path}"
-        time.sleep(0.02)
-
-
 def test_a_killed_job_sinks_no_other_goes_on_when_run_again_and_every_episode_is_there_once(tmp_path):
     results = tmp_path / "results"
     runner = begin(results)
-    wait_for(results / "runs" / RAINBOW / "checkpoints" / "100", runner)
+    checkpoint = results / "runs" / RAINBOW / "checkpoints" / "100"
+    wait_until(checkpoint.exists, "the first checkpoint", TIMEOUT_S, process=runner)
     training_process(runner, RAINBOW).kill()
     _, err = runner.communicate(timeout=900)
     assert runner.returncode == 1, err
@@ -127,7 +120,8 @@ def test_a_gate_s_runs_end_by_their_processor_time_and_its_report_has_both_table
 def test_ctrl_c_saves_what_is_being_trained_and_leaves_nothing_running(tmp_path):
     runner = begin(tmp_path)
     try:
-        wait_for(tmp_path / "runs" / DQN / "metrics.jsonl", runner)
+        metrics = tmp_path / "runs" / DQN / "metrics.jsonl"
+        wait_until(metrics.exists, "the first updates", TIMEOUT_S, process=runner)
         children = psutil.Process(runner.pid).children(recursive=True)
         os.killpg(runner.pid, signal.SIGINT)
         _, err = runner.communicate(timeout=300)

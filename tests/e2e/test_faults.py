@@ -13,6 +13,7 @@ import psutil
 import pytest
 from command import (
     ENV_STEPS_PER_UPDATE,
+    TIMEOUT_S,
     alive,
     arguments,
     arrays_of,
@@ -23,17 +24,18 @@ from command import (
     launch,
     num_updates,
     rows,
-    wait_until,
 )
 from streams import check_streams
 
 from gvz import cli
 from gvz.core import janitor
+from gvz.core.durable import saved_steps
 from gvz.run import doctor
 from gvz.transport import ring
 from gvz.transport.ring import WriterState
 from gvz.transport.segment import HEADER_BYTES
-from learner.checkpoint import checkpoint_steps, verify
+from learner.checkpoint import verify
+from tests.waiting import wait_until
 
 pytestmark = [pytest.mark.e2e, pytest.mark.engine, pytest.mark.timeout(1800), pytest.mark.usefixtures("nothing_left")]
 
@@ -71,8 +73,8 @@ def actor(run: subprocess.Popen[str], number: int) -> psutil.Process:
             return False
         return len(engines(psutil.Process(pid))) == 2  # else it has attached to the ring but not begun to say its own
 
-    wait_until(lambda: rings(run, number) != [], "the rings")
-    wait_until(plays, f"actor {number} to play")
+    wait_until(lambda: rings(run, number), "the rings", TIMEOUT_S)
+    wait_until(plays, f"actor {number} to play", TIMEOUT_S)
     return psutil.Process(writer(run, number)[0])
 
 
@@ -93,10 +95,9 @@ def await_fault(run_dir: Path, since: int, kind: str, number: int) -> dict:
         return [row for row in faults(run_dir)[since:] if (row["kind"], row["actor"]) == (kind, number)]
 
     try:
-        wait_until(lambda: bool(found()), f"a fault {kind} of actor {number}")
+        return wait_until(found, f"a fault {kind} of actor {number}", TIMEOUT_S)[0]
     except AssertionError as error:
         raise AssertionError(f"{error}; there are {faults(run_dir)}") from None
-    return found()[0]
 
 
 def test_a_run_goes_through_every_fault_of_its_actors_and_engines_and_loses_nothing(tmp_path):
@@ -128,7 +129,7 @@ def test_a_run_goes_through_every_fault_of_its_actors_and_engines_and_loses_noth
     seconds["engine killed"] = time.monotonic() - start
 
     stopped_engine = engines(actor(process, 0))[0]
-    wait_until(lambda: num_updates(run) >= 20, "training")
+    wait_until(lambda: num_updates(run) >= 20, "training", TIMEOUT_S)
     before, start = len(faults(run)), time.monotonic()
     stopped_actor = suspend_acting(process, 1)
     stopped_engine.suspend()
@@ -186,7 +187,7 @@ def test_a_spent_budget_ends_the_run_with_a_checkpoint_and_the_stack_of_the_stuc
     assert not alive(children)
     assert [row["kind"] for row in rows(run, "faults.jsonl")] == ["stuck", "gave_up"]
     assert all("sitecustomize.py" in row["traceback"] for row in rows(run, "faults.jsonl"))
-    saved = checkpoint_steps(run / "checkpoints")[-1]
+    saved = saved_steps(run / "checkpoints")[-1]
     assert saved > 0
     verify(run / "checkpoints" / str(saved))
 
@@ -195,9 +196,9 @@ def test_a_killed_launcher_takes_everything_along_and_the_doctor_cleans_up_after
     tmp_path, monkeypatch, capsys
 ):
     dead = launch(tmp_path / "dead", "--learner.total-updates", "1000000")
-    wait_until(lambda: num_updates(tmp_path / "dead") >= 20, "training")
+    wait_until(lambda: num_updates(tmp_path / "dead") >= 20, "training", TIMEOUT_S)
     living = launch(tmp_path / "living", "--learner.total-updates", "1000000")
-    wait_until(lambda: len(engines(living)) == 4, "the engines of the second run")
+    wait_until(lambda: len(engines(living)) == 4, "the engines of the second run", TIMEOUT_S)
     for engine in engines(dead)[:2]:
         engine.suspend()
     children = descendants(dead)
@@ -214,7 +215,7 @@ def test_a_killed_launcher_takes_everything_along_and_the_doctor_cleans_up_after
     assert left
     assert {record["owner_pid"] for record in left} <= {living.pid, *(p.pid for p in descendants(living))}
     assert len(before) > len(left)
-    wait_until(lambda: num_updates(tmp_path / "living") >= 20, "the second run to train on")
+    wait_until(lambda: num_updates(tmp_path / "living") >= 20, "the second run to train on", TIMEOUT_S)
     kill_and_wait(living, descendants(living))
     janitor.clean_dead_instances()
 
@@ -231,7 +232,7 @@ def kill_and_wait(process: subprocess.Popen[str], children: list[psutil.Process]
 def test_a_launcher_killed_while_it_starts_leaves_nothing(tmp_path, moment):
     cache = {"GVZ_CACHE_DIR": str(tmp_path / "cache")} if moment == "gvz.engine.probe" else {}
     process = launch(tmp_path / "run", environment=cache)
-    wait_until(lambda: any(moment in arguments(p) for p in descendants(process)), moment)
+    wait_until(lambda: any(moment in arguments(p) for p in descendants(process)), moment, TIMEOUT_S)
     kill_and_wait(process, descendants(process))
     janitor.clean_dead_instances()
     assert janitor.dead_instances() == []
@@ -245,7 +246,7 @@ def test_stalls_lose_nothing_and_restart_nobody(tmp_path, pause_s):
     rules = {"default": {"sleep_s": 0.3}, "fast_enemies": {"endless": True}}
     flags = "--learner.total-updates 500 --replay.capacity 36000".split()
     process = launch(run, *flags, environment=mischief(rules))
-    wait_until(lambda: num_updates(run) >= 100, "update 100")
+    wait_until(lambda: num_updates(run) >= 100, "update 100", TIMEOUT_S)
     process.send_signal(signal.SIGSTOP)
     time.sleep(pause_s)
     process.send_signal(signal.SIGCONT)
@@ -274,11 +275,11 @@ def test_a_checkpoint_that_cannot_be_written_is_reported_tried_again_and_at_last
     code, err = finish(launch(run, *flags, patch="gvz.run.saver.SAVE_RETRY_S = 0.0"))
     assert code == 1, err
     assert f"checkpoint failed, tried again within 0 s: checkpoint {run / 'policies' / '100'} could not be" in err
-    assert 100 < checkpoint_steps(run / "policies")[0] < 200, "the first one was tried again soon"
+    assert 100 < saved_steps(run / "policies")[0] < 200, "the first one was tried again soon"
     assert "error: the last checkpoint, at update 300, could not be written: " in err
     assert f"{run / 'policies' / '300'} could not be written: NotADirectoryError" in err
     assert "The newest one is of update 200; mend this and give the same command to go on from there" in err
-    assert checkpoint_steps(run / "checkpoints")[1:] == [200]
+    assert saved_steps(run / "checkpoints")[1:] == [200]
     first, *last = rows(run, "faults.jsonl")
     assert {row["kind"] for row in (first, *last)} == {"checkpoint"}
     assert 100 <= first["num_updates"] < 200, "it is told of once the writing has ended"
@@ -289,7 +290,7 @@ def test_a_checkpoint_that_cannot_be_written_is_reported_tried_again_and_at_last
     code, err = finish(launch(run, *flags))
     assert code == 0, err
     assert "goes on from update 200" in err
-    assert checkpoint_steps(run / "checkpoints") == [200, 300]
+    assert saved_steps(run / "checkpoints") == [200, 300]
 
 
 def test_numbers_that_go_wrong_end_the_run_and_are_in_no_checkpoint(tmp_path):
@@ -303,7 +304,7 @@ def test_numbers_that_go_wrong_end_the_run_and_are_in_no_checkpoint(tmp_path):
     assert str(batch) in message
     update = int(batch.stem.rpartition("_")[2])
     assert 100 < update < 200
-    assert checkpoint_steps(run / "checkpoints") == checkpoint_steps(run / "policies") == [100]
+    assert saved_steps(run / "checkpoints") == saved_steps(run / "policies") == [100]
     for folder in ("checkpoints", "policies"):
         verify(run / folder / "100")
         arrays = arrays_of(run / folder / "100")

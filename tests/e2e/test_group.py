@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import alive, arrays_of, descendants, finish, launch, num_updates, rows, wait_until
+from command import TIMEOUT_S, alive, arrays_of, descendants, finish, launch, num_updates, rows
 
+from gvz.core.durable import saved_steps
 from gvz.run.relay import free_port
-from learner.checkpoint import checkpoint_steps
+from tests.waiting import wait_until
 
 pytestmark = [pytest.mark.e2e, pytest.mark.engine, pytest.mark.timeout(1800), pytest.mark.usefixtures("nothing_left")]
 
@@ -28,7 +29,7 @@ def start(run: Path):
 
 
 def saved(run: Path) -> list[list[int]]:
-    return [checkpoint_steps(path / "checkpoints") for path in (run, run / "process_1")]
+    return [saved_steps(path / "checkpoints") for path in (run, run / "process_1")]
 
 
 def same_parameters(run: Path, step: int) -> bool:
@@ -41,7 +42,7 @@ def same_parameters(run: Path, step: int) -> bool:
 def test_a_group_trains_ends_when_one_is_killed_and_the_same_commands_resume_it(tmp_path):
     run = tmp_path / "run"
     first, second = start(run)
-    wait_until(lambda: all(saved(run)), "a checkpoint of both")
+    wait_until(lambda: all(saved(run)), "a checkpoint of both", TIMEOUT_S)
     actors = descendants(first) + descendants(second)
     second.kill()
     code, err = finish(first)
@@ -53,11 +54,11 @@ def test_a_group_trains_ends_when_one_is_killed_and_the_same_commands_resume_it(
     )
     assert err.count("error") == 1
     assert "Traceback" not in err
-    wait_until(lambda: not alive(actors), "the end of all actors and engines")
+    wait_until(lambda: not alive(actors), "the end of all actors and engines", TIMEOUT_S)
 
     common = max(set(saved(run)[0]) & set(saved(run)[1]))
     first, second = start(run)
-    wait_until(lambda: num_updates(run) > common, "further updates")
+    wait_until(lambda: num_updates(run) > common, "further updates", TIMEOUT_S)
     second.send_signal(signal.SIGTERM)
     ended = [finish(process) for process in (first, second)]
     assert [code for code, _ in ended] == [143, 143], ended

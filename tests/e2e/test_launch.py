@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from command import (
     ENV_STEPS_PER_UPDATE,
+    TIMEOUT_S,
     alive,
     arrays_of,
     descendants,
@@ -20,12 +21,13 @@ from command import (
     launch,
     num_updates,
     rows,
-    wait_until,
 )
 from scipy import stats
 
-from learner.checkpoint import checkpoint_steps, verify
+from gvz.core.durable import saved_steps
+from learner.checkpoint import verify
 from tests.processes import arguments
+from tests.waiting import wait_until
 
 pytestmark = [pytest.mark.e2e, pytest.mark.engine, pytest.mark.timeout(1800), pytest.mark.usefixtures("nothing_left")]
 
@@ -46,8 +48,8 @@ def test_a_run_trains_to_its_end_and_goes_on_when_asked_for_more(tmp_path):
     assert code == 0, err
     assert "replay" in err
     assert "processes: 1 learner, 2 actors, 4 engines" in err
-    assert checkpoint_steps(run / "checkpoints") == [100, 200]
-    assert checkpoint_steps(run / "policies") == [100, 200]
+    assert saved_steps(run / "checkpoints") == [100, 200]
+    assert saved_steps(run / "policies") == [100, 200]
     for step in (100, 200):
         verify(run / "checkpoints" / str(step))
     metrics = rows(run, "metrics.jsonl")
@@ -112,14 +114,14 @@ def test_a_run_by_the_thesis_recipe_acts_at_random_in_warm_up_and_by_its_agent_f
 def test_a_signal_saves_and_ends_everything(tmp_path, number, code):
     run = tmp_path / "run"
     process = launch(run, "--learner.total-updates", "1000000")
-    wait_until(lambda: num_updates(run) >= 40, "40 updates")
+    wait_until(lambda: num_updates(run) >= 40, "40 updates", TIMEOUT_S)
     children = descendants(process)
     assert len([p for p in children if "vizdoom" in p.name()]) == 4
     os.killpg(process.pid, number)
     got, err = finish(process)
     assert got == code, err
     assert not alive(children)
-    (saved,) = checkpoint_steps(run / "checkpoints")[-1:]
+    (saved,) = saved_steps(run / "checkpoints")[-1:]
     assert saved >= 40
     verify(run / "checkpoints" / str(saved))
     assert num_updates(run) == saved, "the last row has what came after the last log period"
@@ -129,7 +131,7 @@ def test_a_second_signal_ends_at_once_and_clean(tmp_path):
     run = tmp_path / "run"
     stuck = "gvz.run.saver.Saver.save_last = lambda *_: __import__('time').sleep(600)"
     process = launch(run, "--learner.total-updates", "1000000", patch=stuck)
-    wait_until(lambda: num_updates(run) >= 20, "20 updates")
+    wait_until(lambda: num_updates(run) >= 20, "20 updates", TIMEOUT_S)
     children = descendants(process)
     process.send_signal(signal.SIGINT)
     assert process.stderr is not None
@@ -145,7 +147,7 @@ def test_a_second_signal_ends_at_once_and_clean(tmp_path):
 def test_a_signal_while_jax_is_imported_ends_at_once(tmp_path, number, code):
     process = launch(tmp_path / "run")
     maps = Path(f"/proc/{process.pid}/maps")
-    wait_until(lambda: "jaxlib" in maps.read_text(), "the import of jax")
+    wait_until(lambda: "jaxlib" in maps.read_text(), "the import of jax", TIMEOUT_S)
     start = time.monotonic()
     process.send_signal(number)
     got, err = finish(process)
@@ -158,7 +160,7 @@ def test_a_signal_while_jax_is_imported_ends_at_once(tmp_path, number, code):
 def test_a_killed_run_goes_on_from_its_checkpoint_without_a_burst(tmp_path):
     run = tmp_path / "run"
     process = launch(run, "--learner.total-updates", "400")
-    wait_until(lambda: (run / "checkpoints" / "100").exists() and num_updates(run) >= 140, "update 140")
+    wait_until(lambda: (run / "checkpoints" / "100").exists() and num_updates(run) >= 140, "update 140", TIMEOUT_S)
     children = descendants(process)
     process.kill()
     finish(process)
@@ -178,7 +180,7 @@ def test_a_run_that_acts_on_the_learners_device_goes_on_after_a_kill_and_after_a
     run = tmp_path / "run"
     endless = "--learner.total-updates 1000000 --learner.env-steps-per-update 16".split()
     process = launch(run, "--actors.inference", "device", *endless)
-    wait_until(lambda: num_updates(run) >= 20, "20 updates")
+    wait_until(lambda: num_updates(run) >= 20, "20 updates", TIMEOUT_S)
     children = descendants(process)
     actors = [child for child in children if "actors.worker" in arguments(child)]
     assert len(actors) == 2
@@ -186,21 +188,21 @@ def test_a_run_that_acts_on_the_learners_device_goes_on_after_a_kill_and_after_a
         line for actor in actors for line in Path(f"/proc/{actor.pid}/maps").read_text().split() if "jax" in line
     ]
     actors[0].kill()
-    wait_until(lambda: any(fault["kind"] == "died" for fault in faults(run)), "the fault to be recorded")
+    wait_until(lambda: any(fault["kind"] == "died" for fault in faults(run)), "the fault to be recorded", TIMEOUT_S)
     after = num_updates(run)
-    wait_until(lambda: num_updates(run) >= after + 60, "60 updates more")
+    wait_until(lambda: num_updates(run) >= after + 60, "60 updates more", TIMEOUT_S)
     children = descendants(process)
     process.send_signal(signal.SIGINT)
     code, err = finish(process)
     assert code == 130, err
     assert not alive(children)
     assert "rings and requests" in err
-    (saved,) = checkpoint_steps(run / "checkpoints")[-1:]
+    (saved,) = saved_steps(run / "checkpoints")[-1:]
     for row in rows(run, "metrics.jsonl"):  # 300 warm-up decisions, then 16 an update
         assert abs(row["actors/env_steps"] - 300 - 16 * row["num_updates"]) <= 256 + 64
         assert row["actors/staleness_mean_versions"] < 20
     process = launch(run, *endless)  # now actors act by themselves
-    wait_until(lambda: num_updates(run) >= saved + 20, "20 updates more")
+    wait_until(lambda: num_updates(run) >= saved + 20, "20 updates more", TIMEOUT_S)
     process.send_signal(signal.SIGINT)
     code, err = finish(process)
     assert code == 130, err
@@ -216,7 +218,7 @@ def test_a_synchronous_run_cut_twice_equals_one_that_was_not(tmp_path):
     assert code == 0, err
     for at in (20, 80):
         process = launch(cut, *flags)
-        wait_until(lambda at=at: num_updates(cut) >= at, f"update {at}")
+        wait_until(lambda at=at: num_updates(cut) >= at, f"update {at}", TIMEOUT_S)
         process.send_signal(signal.SIGINT)
         code, err = finish(process)
         assert code == 130, err

@@ -17,6 +17,7 @@ from gvz.core import janitor
 from gvz.core.errors import ConfigError, EngineError, ResourceError
 from gvz.engine import process as engine_process
 from gvz.engine.engine import Engine, EngineConfig, check_config, screen_resolutions
+from tests.waiting import wait_until
 
 pytestmark = pytest.mark.engine
 
@@ -235,10 +236,7 @@ def test_an_engine_that_starts_too_late_is_given_up_and_cleared_away():
     before = set(janitor.runtime_dir().glob("*.json"))
     with pytest.raises(EngineError, match=r"not started within 0\.02 s"):
         Engine(config(start_timeout_s=0.02))
-    deadline = time.monotonic() + 60
-    while set(janitor.runtime_dir().glob("*.json")) - before and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert set(janitor.runtime_dir().glob("*.json")) <= before
+    wait_until(lambda: set(janitor.runtime_dir().glob("*.json")) <= before, "the removal of the engine's record")
 
 
 def test_what_vizdoom_refuses_is_an_engine_error(tmp_path: Path):

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -29,6 +28,7 @@ from gvz.scenarios.base import Textures
 from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, network_input
 from gvz.tasks import parse_task
 from learner.segmentation import normalized
+from tests.waiting import wait_until
 
 ENEMY, KIT = LABEL_CLASSES.index("enemy"), LABEL_CLASSES.index("kit")
 
@@ -226,10 +226,7 @@ def test_workers_have_nothing_in_shared_memory_that_a_kill_of_all_processes_woul
         os.killpg(client.pid, signal.SIGKILL)
     assert workers
     assert not any("/dev/shm" in maps for maps in mapped)
-    deadline = time.monotonic() + 60
-    while any(map(janitor.process_start, workers)) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not any(map(janitor.process_start, workers))
+    wait_until(lambda: not any(map(janitor.process_start, workers)), "the workers' end")
 
 
 def test_a_screen_is_normalized_in_training_as_it_is_later():

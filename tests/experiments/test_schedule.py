@@ -5,7 +5,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from gvz.experiments import inventory as progress
 from gvz.experiments.jobs import Command, Outlook
 from gvz.experiments.places import Machine, Slot, gpus, make_slots
 from gvz.experiments.schedule import run_jobs
+from tests.waiting import wait_until
 
 CORES = tuple(sorted(os.sched_getaffinity(0)))
 SLOT = Slot(cores=CORES, environment={})
@@ -49,13 +49,6 @@ class Program:
 
 def log(job: Program) -> str:
     return progress.log_file(job.results, job.id).read_text()
-
-
-def wait_for(file: Path) -> None:
-    deadline = time.monotonic() + 60
-    while not file.exists():
-        assert time.monotonic() < deadline, f"waited 60 s for {file}"
-        time.sleep(0.05)
 
 
 def test_jobs_are_done_command_by_command_and_done_ones_are_left_alone(tmp_path, capsys):
@@ -160,16 +153,14 @@ def test_a_signal_reaches_the_jobs_which_save_and_none_is_left(tmp_path, number,
     text = RUNNER.format(directory=str(Path(__file__).parent), saved=str(saved), pid=str(pid), results=str(tmp_path))
     runner = subprocess.Popen([sys.executable, "-c", text])
     try:
-        wait_for(pid)
+        wait_until(pid.exists, "the job's start")
         runner.send_signal(number)
         assert runner.wait(60) == code
     finally:
         runner.kill()
-    wait_for(saved)
-    deadline = time.monotonic() + 30
-    while records.is_locked(progress.log_file(tmp_path, "slow")):
-        assert time.monotonic() < deadline, "the job holds its log still"
-        time.sleep(0.05)
+    wait_until(saved.exists, "what the job saves")
+    log_file = progress.log_file(tmp_path, "slow")
+    wait_until(lambda: not records.is_locked(log_file), "the release of the job's log", 30)
     assert progress.job_state(tmp_path, "slow", done=False, begun=True) == "stopped"
 
 

@@ -158,6 +158,8 @@ def test_no_target_reads_the_value_of_a_masked_action(parts: dict, agent_file: P
 
 
 def test_parts_that_do_not_fit_together_are_refused():
+    with pytest.raises(ConfigError, match=r"agent\.hidden_input_share: got 0\.2 with nothing to hide"):
+        replace(RAINBOW, hidden_input_share=0.2)
     with pytest.raises(ConfigError, match=r"agent\.sight_augmentations: got inversion without a loss that reads them"):
         replace(RAINBOW, sight_augmentations=("inversion",))
     with pytest.raises(ConfigError, match=r"agent\.munchausen: got True with atoms, for which no form is published"):

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gvz.core.durable import saved_steps
 from gvz.core.errors import CheckpointError, WaitTimeoutError
 from learner import checkpoint
 from learner.agents.base import AgentSpec, make_agent
@@ -81,8 +82,8 @@ def test_an_empty_directory_has_nothing_to_restore(tmp_path):
 def test_old_checkpoints_are_pruned_and_parameters_kept(tmp_path):
     for step in (1, 2, 3):
         save(tmp_path, step)
-    assert checkpoint.checkpoint_steps(tmp_path / "checkpoints") == [2, 3]
-    assert checkpoint.checkpoint_steps(tmp_path / "policies") == [1, 2, 3]
+    assert saved_steps(tmp_path / "checkpoints") == [2, 3]
+    assert saved_steps(tmp_path / "policies") == [1, 2, 3]
     params, _ = checkpoint.read(tmp_path / "policies" / "1", example()["params"])
     assert equal(params, example(1)["params"])
 
@@ -90,7 +91,7 @@ def test_old_checkpoints_are_pruned_and_parameters_kept(tmp_path):
 def test_what_other_processes_go_on_from_is_kept_and_read(tmp_path):
     for step, keep_from in ((1, None), (2, 0), (3, 2), (4, 2), (5, 2)):
         save(tmp_path, step, keep_from=keep_from)
-    assert checkpoint.checkpoint_steps(tmp_path / "checkpoints") == [2, 3, 4, 5]
+    assert saved_steps(tmp_path / "checkpoints") == [2, 3, 4, 5]
     restored = checkpoint.restore_newest(tmp_path / "checkpoints", jax.eval_shape(example), newest=3)
     assert restored is not None
     assert restored.num_updates == 3
@@ -191,7 +192,7 @@ def test_a_failed_save_is_reported_and_leaves_the_old_checkpoint(tmp_path):
     saver.wait()
     assert "policies/2 could not be written" in (saver.outcome() or "")
     assert saver.outcome() is None
-    assert checkpoint.checkpoint_steps(tmp_path / "checkpoints") == [1]
+    assert saved_steps(tmp_path / "checkpoints") == [1]
 
 
 def test_every_file_is_on_the_disk_before_the_rename_and_the_rename_before_the_end(tmp_path, monkeypatch):
@@ -263,7 +264,7 @@ def test_a_full_disk_is_reported_leaves_nothing_and_the_next_save_is_whole(tmp_p
             assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == ["1"]
         else:
             assert saver.outcome() == ""
-    assert checkpoint.checkpoint_steps(tmp_path / "checkpoints") == [1, 3]
+    assert saved_steps(tmp_path / "checkpoints") == [1, 3]
     checkpoint.verify(tmp_path / "checkpoints" / "3")
 
 
@@ -312,7 +313,7 @@ def test_a_damaged_newer_checkpoint_takes_no_place_among_the_kept(tmp_path, keep
         save(tmp_path, step, keep=9)
     flip(largest(tmp_path / "checkpoints" / "9"))
     save(tmp_path, 4, keep=keep)
-    assert checkpoint.checkpoint_steps(tmp_path / "checkpoints") == left
+    assert saved_steps(tmp_path / "checkpoints") == left
     restored = checkpoint.restore_newest(tmp_path / "checkpoints", example())
     assert restored is not None
     assert restored.num_updates == 4

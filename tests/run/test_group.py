@@ -15,11 +15,12 @@ from gvz.core.stop import StopRequest
 from gvz.launch import main
 from gvz.run import link, relay
 from gvz.run.config import CheckpointConfig
-from gvz.run.config_files import load_config
+from gvz.run.config_files import config_from_dict, config_to_dict, load_config
 from gvz.run.group import Several
 from gvz.run.group_config import GroupConfig
 from gvz.run.relay import Forward, Relay, free_port
 from learner.checkpoint import Restored
+from tests.waiting import wait_until
 
 CONFIG = load_config("rainbow_4task")
 
@@ -69,17 +70,14 @@ def group_of(num_processes: int):
         yield groups
 
 
-def until(condition: Callable[[], Any], timeout_s: float = 30.0) -> Any:
-    deadline_s = time.monotonic() + timeout_s
-    while not (found := condition()):
-        assert time.monotonic() < deadline_s
-        time.sleep(0.01)
-    return found
+def until_it_may_update(group: Several, num_saved: int) -> bool:
+    """Until all are ready. It gives up before `in_threads` does."""
+    return wait_until(lambda: group.may_update(True, False, num_saved), "a step of all", 30)
 
 
 def until_no_link_is_open() -> None:
     """A link that stays open ends its process some time after its group has ended."""
-    until(lambda: not any(thread.name == "group" for thread in threading.enumerate()))
+    wait_until(lambda: not any(thread.name == "group" for thread in threading.enumerate()), "the end of all links", 30)
 
 
 def test_a_step_is_done_when_all_are_ready_and_a_save_when_nobody_writes():
@@ -88,10 +86,10 @@ def test_a_step_is_done_when_all_are_ready_and_a_save_when_nobody_writes():
         assert not groups[1].may_update(True, True, 50)
         assert not groups[2].may_update(False, False, 100)
         assert not groups[0].may_update(True, False, 100)
-        assert all(in_threads([lambda g=g: until(lambda: g.may_update(True, False, 100)) for g in groups]))
+        assert all(in_threads([lambda g=g: until_it_may_update(g, 100) for g in groups]))
         assert [group.may_save() for group in groups] == [False] * 3
         assert [group.num_common_saved for group in groups] == [50] * 3
-        assert all(in_threads([lambda g=g: until(lambda: g.may_update(True, False, 200)) for g in groups]))
+        assert all(in_threads([lambda g=g: until_it_may_update(g, 200) for g in groups]))
         assert [group.may_save() for group in groups] == [True] * 3
         assert [group.num_common_saved for group in groups] == [200] * 3
 
@@ -132,13 +130,13 @@ def test_a_process_that_goes_is_known_at_once_and_one_that_is_done_may_go():
         groups[1]._link.close()
         for group in (groups[0], groups[2]):
             with pytest.raises(GroupError, match=r"learner process 1 of 3 is gone, so the group ends; .*same commands"):
-                until(lambda g=group: g.may_update(True, False, 0))
+                until_it_may_update(group, 0)
             with pytest.raises(GroupError, match="is gone"), group.blamed():
                 raise RuntimeError("Gloo all-reduce failed: connection reset by peer")
     with group_of(2) as groups:
         in_threads([lambda g=g: g._link.gather("done", None, 30, "to end") for g in groups])
         groups[0]._opened.close()
-        until(lambda: 0 in groups[1]._link._done)
+        wait_until(lambda: 0 in groups[1]._link._done, "the other's word that it is done", 30)
         time.sleep(0.2)
         groups[1]._link.check()
 
@@ -175,7 +173,7 @@ def test_two_processes_with_one_number_and_strangers_are_turned_away(monkeypatch
     links: list[link.Link] = []
     first = threading.Thread(target=lambda: links.append(link.Link(address, 0, 2, {})), daemon=True)
     first.start()
-    until(lambda: the_relay._connections)
+    wait_until(lambda: the_relay._connections, "the first one's connection", 30)
     with pytest.raises(ConfigError, match=r"group\.process_id: process_id 0 is taken, or not one of 2; each learner"):
         link.Link(address, 0, 2, {})
     links.append(link.Link(address, 1, 2, {"of": 1}))
@@ -239,6 +237,9 @@ def test_slurm_says_which_process_this_is_and_each_has_a_directory_and_games_of_
     assert config.group.own_id == 1
     assert config.resolved_run_dir == CONFIG.resolved_run_dir / "process_1"
     assert config.games_seed != CONFIG.games_seed == CONFIG.seed
+    saved = config_to_dict(config)
+    monkeypatch.delenv("SLURM_PROCID")
+    assert config_from_dict(saved).group.own_id == 1, "its policies can be evaluated without Slurm"
 
 
 @pytest.mark.parametrize(

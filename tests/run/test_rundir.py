@@ -34,16 +34,17 @@ def test_the_directory_of_process_0_is_private_also_if_another_process_of_the_gr
     os.umask(before)
 
 
-def test_policies_that_a_run_does_not_go_on_from_are_kept_apart(tmp_path):
+@pytest.mark.parametrize("folder", ["policies", "checkpoints"])
+def test_what_a_run_does_not_go_on_from_is_kept_apart(tmp_path, folder):
     with RunDir(tmp_path) as run:
-        for directory in ("policies/10", "policies/20", "policies/25", "discarded/policies/25"):
+        for directory in (f"{folder}/10", f"{folder}/20", f"{folder}/25", f"discarded/{folder}/25"):
             (tmp_path / directory).mkdir(parents=True)
             (tmp_path / directory / "which").write_text(directory)
-        (tmp_path / "policies" / "30.tmp").mkdir()
-        run.discard_policies(10)
-        assert {p.name for p in (tmp_path / "policies").iterdir()} == {"10", "30.tmp"}
-        moved = {p.name: (p / "which").read_text() for p in (tmp_path / "discarded" / "policies").iterdir()}
-        assert moved == {"20": "policies/20", "25": "policies/25"}
+        (tmp_path / folder / "30.tmp").mkdir()
+        run.discard_after(10)
+        assert {p.name for p in (tmp_path / folder).iterdir()} == {"10", "30.tmp"}
+        moved = {p.name: (p / "which").read_text() for p in (tmp_path / "discarded" / folder).iterdir()}
+        assert moved == {"20": f"{folder}/20", "25": f"{folder}/25"}
 
 
 def test_what_goes_by_the_length_of_a_run_is_said_when_that_changes(tmp_path):

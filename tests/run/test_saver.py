@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from gvz.core.durable import saved_steps
 from gvz.run.config import CheckpointConfig
 from gvz.run.monitor import Counts
 from gvz.run.saver import Saver, Snapshot
-from learner.checkpoint import checkpoint_steps
 
 STATE = {"w": np.zeros(2, np.float32)}
 
@@ -28,14 +28,14 @@ def test_last_checkpoints_of_a_process_that_ends_alone_leave_the_one_that_all_ha
         saver.save_when_due(group)
         assert saver.wait() == ""
         group.num_common_saved = counts.updates
-    assert checkpoint_steps(tmp_path / "checkpoints") == [1000, 2000]
+    assert saved_steps(tmp_path / "checkpoints") == [1000, 2000]
     for last in (2100, 2200):  # its actors fail, twice, and no other process has saved since 2000
         counts.updates = last
         saver.save_last(group, lambda: None)
-        assert 2000 in checkpoint_steps(tmp_path / "checkpoints")
+        assert 2000 in saved_steps(tmp_path / "checkpoints")
         saver, counts = started(tmp_path, 2000)
         group.num_common_saved = 0  # until the processes have agreed on a step
     alone: Any = SimpleNamespace(num_common_saved=None)
     counts.updates = 2300
     saver.save_last(alone, lambda: None)
-    assert checkpoint_steps(tmp_path / "checkpoints") == [2200, 2300]
+    assert saved_steps(tmp_path / "checkpoints") == [2200, 2300]

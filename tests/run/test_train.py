@@ -18,6 +18,7 @@ from gvz.run.config import LogConfig, RunConfig
 from gvz.run.curriculum_config import CurriculumConfig
 from gvz.run.rundir import RunDir
 from gvz.run.train import train, with_own_segmenters
+from gvz.segmentation import segmenter_file
 from learner.agents.configs.dqn import DQNConfig
 from learner.agents.configs.ppo import PPOConfig
 from learner.agents.configs.pqn import PQNConfig
@@ -71,6 +72,17 @@ def test_a_run_keeps_the_network_of_its_segmented_frames_and_goes_on_with_it(tmp
             config, cluster=ClusterConfig(address="127.0.0.1:6379", hosts=2), mode="async", replay=ReplayConfig()
         )
         assert with_own_segmenters(on_hosts, run).env == env, "another host has no copies"
+
+
+def test_actors_find_the_networks_of_a_run_whose_directory_is_relative(tmp_path, monkeypatch):
+    """They run in a directory of their own."""
+    monkeypatch.chdir(tmp_path)
+    config = replace(DQN, env=EnvConfig(frames="segmented"))
+    with RunDir(Path("runs") / "one") as run:
+        env = with_own_segmenters(config, run).env
+    assert env.segmenter == str(tmp_path / "runs" / "one" / "segmenters")
+    monkeypatch.chdir("runs")
+    assert segmenter_file("defend_the_center", env).is_file()
 
 
 def test_a_run_ends_when_its_processor_time_is_used_up_and_is_then_done_until_it_gets_more(tmp_path):

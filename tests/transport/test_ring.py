@@ -20,6 +20,7 @@ from gvz.core.errors import TransportError, WaitTimeoutError
 from gvz.transport.messages import STEP_DTYPE, StepBlock
 from gvz.transport.ring import RingReader, RingWriter, WriterState, ring_bytes
 from gvz.transport.segment import HEADER_BYTES
+from tests.waiting import wait_until
 
 CAPACITY, SHAPE = 8, (4, 5, 3)
 
@@ -170,8 +171,7 @@ def test_waiting_ends_when_the_reader_reads_and_is_counted(reader: RingReader, w
         write(writer, number)
 
     def read_later():
-        while reader.writer_status().state != WriterState.WAITING_FOR_SPACE:
-            time.sleep(0.01)
+        wait_until(lambda: reader.writer_status().state == WriterState.WAITING_FOR_SPACE, "the writer's wait")
         time.sleep(0.1)
         reader.read(3)
 

@@ -3,6 +3,7 @@
 import contextlib
 import mmap
 import os
+import resource
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -111,6 +112,16 @@ def test_memory_that_cannot_be_had_is_an_error_with_advice_and_leaves_no_descrip
     with pytest.raises(ResourceError, match=r"got \d+ bytes of available memory, want \d+; lower actors"):
         Segment.create("gvz-test", 2**50, layout_hash=LAYOUT)
     assert descriptors() == before
+
+
+def test_too_many_open_files_are_an_error_with_advice():
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
+    try:
+        with pytest.raises(ResourceError, match=r"Too many open files; raise the limit \(`ulimit -n`\), or lower"):
+            Segment.create("gvz-test", 4096, layout_hash=LAYOUT)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
 
 
 def test_attach_to_no_descriptor():

@@ -20,6 +20,7 @@ from gvz.core import janitor
 from gvz.core.errors import EngineError, WorkerError
 from gvz.vector import crew
 from gvz.vector.env import DoomVectorEnv
+from tests.waiting import wait_until
 
 pytestmark = pytest.mark.engine
 TASK = "defend_the_center/default"
@@ -218,10 +219,7 @@ def test_nothing_is_left_after_the_programs_end(tmp_path: Path, end: str | signa
     _, errors = process.communicate(timeout=60)
     code = {"ends": 0, "closes": 0, "raises": 1}.get(str(end), -int(end) if isinstance(end, signal.Signals) else 0)
     assert process.returncode == code, errors.decode()
-    deadline = time.monotonic() + 30
-    while any(janitor.process_start(pid) is not None for pid in pids):
-        assert time.monotonic() < deadline, "a worker or an engine is still there"
-        time.sleep(0.05)
+    wait_until(lambda: not any(map(janitor.process_start, pids)), "the end of workers and engines", 30)
     assert not [name for name in files if Path(name).exists()]
     assert not list(places[0].iterdir())
     assert not list(places[1].rglob("*.json"))

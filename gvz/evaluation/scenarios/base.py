@@ -6,6 +6,7 @@ nothing of what is out of sight.
 """
 
 import itertools
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -86,6 +87,13 @@ class Sight:
         """Turns somewhere and walks there."""
         yield from [self.turn_anywhere()] * int(self.rng.integers(3, 12))
         yield from ["MOVE_FORWARD"] * steps
+
+    def step(self, steps: int = 8) -> Iterator[str]:
+        """Steps forward, and where it is stuck walks on."""
+        place = self.place
+        yield "MOVE_FORWARD"
+        if math.dist(place, self.place) < STUCK_UNITS:
+            yield from self.walk_on(steps)
 
     def _offset(self, label: "Label") -> float:
         return label.x + label.width / 2 - self._middle

@@ -1,10 +1,9 @@
 """Find Ammunition: its sweep, script and pictures."""
 
-import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from gvz.evaluation.scenarios.base import AIM, FULL_TURN, NEAR, STUCK_UNITS, Moment, Pose, Sight
+from gvz.evaluation.scenarios.base import AIM, FULL_TURN, NEAR, Moment, Pose, Sight
 
 if TYPE_CHECKING:
     from gvz.engine.engine import Label
@@ -28,7 +27,7 @@ def script(sight: Sight) -> Iterator[str]:
         ):
             yield "ATTACK"
         elif any(sight.ahead(one, max(AIM, one.width / 2)) for one in wanted):
-            yield from _step(sight)
+            yield from sight.step()
         else:
             turn = sight.turn_to(wanted[0]) if wanted else sight.turn_anywhere()
             for _ in range(FULL_TURN):
@@ -56,10 +55,3 @@ def _hides(sight: Sight, enemy: "Label", clip: "Label") -> bool:
     """Whether an enemy stands on the way to a clip."""
     apart = abs(enemy.x + enemy.width / 2 - clip.x - clip.width / 2)
     return sight.nearness(enemy) > sight.nearness(clip) and apart < enemy.width
-
-
-def _step(sight: Sight) -> Iterator[str]:
-    place = sight.place
-    yield "MOVE_FORWARD"
-    if math.dist(place, sight.place) < STUCK_UNITS:
-        yield from sight.walk_on()

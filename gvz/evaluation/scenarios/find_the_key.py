@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from gvz.evaluation.scenarios.base import AIM, FULL_TURN, HALF_TURN, NEAR, STUCK_UNITS, Moment, Pose, Sight
+from gvz.evaluation.scenarios.base import AIM, FULL_TURN, HALF_TURN, NEAR, Moment, Pose, Sight
 
 if TYPE_CHECKING:
     from gvz.engine.engine import Label
@@ -62,10 +62,7 @@ def _buttons(sight: Sight, memory: _Memory) -> Iterator[str]:
             yield from [sight.turn_from(touched[0])] * 2
             yield "MOVE_FORWARD"
         elif memory.ahead(sight):
-            place = sight.place
-            yield "MOVE_FORWARD"
-            if math.dist(place, sight.place) < STUCK_UNITS:
-                yield from sight.walk_on()
+            yield from sight.step()
         else:
             turn = sight.turn_to(wanted[0]) if wanted else sight.turn_anywhere()
             for _ in range(FULL_TURN):

@@ -1,6 +1,5 @@
 """Seek and Kill: its sweep, script and pictures."""
 
-import math
 from collections.abc import Iterator
 
 from gvz.evaluation.scenarios.base import FULL_TURN, HALF_TURN, Moment, Moving, Pose, Sight
@@ -8,8 +7,6 @@ from gvz.evaluation.scenarios.base import FULL_TURN, HALF_TURN, Moment, Moving, 
 SWEEP = (("MOVE_FORWARD", 5), ("TURN_RIGHT", 3), ("ATTACK", 1))
 MOMENTS = {"health_gathering_supreme.wad": Moment(seed=5, tics=2, pose=Pose(700, 1100, 180))}
 MOVING = Moving(first=2, tasks=("default", "red", "obstacles+resized", "blue+mixed+resized", "complete"))
-STUCK_UNITS = 4.0
-"""map units; an agent that a step forward brings less far walks against a wall"""
 
 
 def script(sight: Sight) -> Iterator[str]:
@@ -28,8 +25,4 @@ def script(sight: Sight) -> Iterator[str]:
                 if any(sight.ahead(enemy, max(HALF_TURN, enemy.width / 2)) for enemy in sight.nearest("Monster")):
                     break
         else:
-            x, y = sight.variables["POSITION_X"], sight.variables["POSITION_Y"]
-            yield "MOVE_FORWARD"
-            if math.hypot(sight.variables["POSITION_X"] - x, sight.variables["POSITION_Y"] - y) < STUCK_UNITS:
-                yield from [sight.turn_anywhere()] * int(sight.rng.integers(3, 12))
-                yield from ["MOVE_FORWARD"] * 5
+            yield from sight.step(5)
