@@ -1,4 +1,4 @@
-"""The experiment `general_segmented_train4` with the time and the episodes of `general`."""
+"""The experiment `general_segmented_train4` with the time of `general`."""
 
 import dataclasses
 
@@ -11,6 +11,5 @@ EXPERIMENT = dataclasses.replace(
     title="Generalization from four training tasks with a segmentation network, within 90 minutes of one core",
     question="What do six times the time of general_segmented_train4 give?",
     max_processor_s=LONG.max_processor_s,
-    episodes=LONG.episodes,
     players=LONG.players,
 )

@@ -12,6 +12,7 @@ import psutil
 import pytest
 from command import STARTED, TIMEOUT_S, alive
 
+from gvz.core.durable import saved_steps
 from gvz.experiments import inventory as progress
 from gvz.experiments.plan import read_plan
 from tests.processes import arguments
@@ -100,7 +101,7 @@ def test_a_gate_s_runs_end_by_their_processor_time_and_its_report_has_both_table
         directory = progress.run_directory(results, run)
         assert progress.last_processor_s(directory) >= run.max_processor_s == 0.4
         assert json.loads((directory / "config.json").read_text())["config"]["max_processor_s"] == 0.4
-        newest = progress.policies(directory)[-1]
+        newest = saved_steps(directory / "policies")[-1]
         assert newest == progress.last_update(directory) < run.total_updates == 60
         played = [json.loads(line) for line in (directory / "evaluation.jsonl").read_text().splitlines()]
         assert {row["num_updates"] for row in played} == {newest}
