@@ -128,6 +128,7 @@ def test_the_hour_of_the_main_job_says_what_its_records_give():
     [
         ("general_short", None, 50),
         ("general_train4", None, 50),
+        ("general_train4_long", None, 50),
         ("general_varied", None, 50),
         ("general_compositions", None, 50),
         ("general_compositions_long", None, 50),

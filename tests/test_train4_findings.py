@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from gvz.evaluation.statistics import difference, mean_over_scenarios
@@ -13,6 +14,8 @@ AGENTS = {
     "4 tasks": ("general_train4", "rainbow_segmented+train4_network"),
     "8 tasks": ("general_short", "rainbow_segmented"),
 }
+LONGER = ("defend_the_center", "seek_and_kill")
+STEPS = "general_train4{}/runs/**/metrics.jsonl.gz"
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +67,42 @@ def test_the_findings_say_what_networks_of_four_training_tasks_find():
                 assert f"| `{task}` | {kind} | {value:.2f} | {eight[task][kind]:.2f} |" in WORDS
 
 
+def test_the_findings_say_what_six_times_the_time_gave_on_four_training_tasks(scores: dict[tuple[str, str], Scores]):
+    folders = {"4 tasks": "general_train4_long", "8 tasks": "general"}
+    longer = {
+        (name, called): agent_scores(results_of(folder).episodes.filter(scenario=name), AGENTS[called][1])
+        for name in LONGER
+        for called, folder in folders.items()
+    }
+    for (name, called), of_agent in longer.items():
+        title, short = scenario_named(name).title, scores[name, called]
+        assert len(of_agent.runs) == {"4 tasks": 1, "8 tasks": 3}[called]
+        assert f"| {title} | {called} | 900 s | {score_cells(short, name, 'train4')} |" in WORDS
+        assert f"| {title} | {called} | 5,400 s | {score_cells(of_agent, name, 'train4')} |" in WORDS
+    gate, test = (
+        [
+            estimate_groups([(of[name, "4 tasks"], task_sets(name)[n]) for of in (longer, scores)], difference).text
+            for name in LONGER
+        ]
+        for n in (1, 2)
+    )
+    assert f"{gate[0]} and {gate[1]} points on the gate tasks, {test[0]} and {test[1]} on the test tasks." in WORDS
+    less = [
+        estimate_groups([(longer[name, called], task_sets(name)[2]) for called in folders], difference).text
+        for name in LONGER
+    ]
+    assert f"with the same time: {less[0]} and {less[1]}." in WORDS
+    for task in ("defend_the_center/gore+mossy_bricks", "seek_and_kill/blue+shadows"):
+        name, _, of_task = task.partition("/")
+        short, four, eight = (
+            np.mean([by_task[task].mean() for by_task in found.runs.values()])
+            for found in (scores[name, "4 tasks"], longer[name, "4 tasks"], longer[name, "8 tasks"])
+        )
+        assert f"`{of_task}` has {four:.0f} (after 900 seconds {short:.0f}, with eight tasks {eight:.0f})" in WORDS
+    steps = sorted(rows_of(file)[-1]["num_updates"] for file in (ROOT / "results").glob(STEPS.format("_long")))
+    assert f"{steps[0]:,} and {steps[1]:,} gradient steps" in WORDS
+
+
 def test_the_findings_say_how_long_agents_of_four_training_tasks_learned():
-    files = (ROOT / "results" / "general_train4").glob("runs/**/metrics.jsonl.gz")
-    steps = sorted(rows_of(file)[-1]["num_updates"] for file in files)
+    steps = sorted(rows_of(file)[-1]["num_updates"] for file in (ROOT / "results").glob(STEPS.format("")))
     assert f"{steps[0]:,} to {steps[-1]:,} gradient steps on four tasks" in WORDS
