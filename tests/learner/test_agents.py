@@ -108,7 +108,7 @@ def test_only_the_online_network_sees_augmented_frames_and_hidden_inputs(agent_n
     plain = plain_config(agent_name)
     if getattr(plain, "noisy", "off") != "off":
         plain = replace(plain, noisy="off")
-    plain = replace(plain, stack_size=2)
+    plain = replace(plain, stack_size=2, past_actions=SPEC.num_past_actions, game_variables=True)
     changed = replace(plain, augmentations=("inversion", "shift"), augmentation_clean_share=0.0, hidden_input_share=1.0)
     none = replace(changed, augmentation_strength=0.0, hidden_input_share=0.0)
     params, target = (made_up_params(jitted(plain)[0], seed) for seed in (0, 1))
