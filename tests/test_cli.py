@@ -86,7 +86,7 @@ def test_tasks_prints_a_table(capsys):
     [
         ("tasks --scenario seek_and_kil", "unknown scenario 'seek_and_kil' (did you mean 'seek_and_kill'?)"),
         ("tasks --tasks seek_and_kill/blu", "unknown attribute 'blu' (did you mean 'blue'?)"),
-        ("tasks --tasks seek_and_kill/blue --split test", "--tasks: got ids and also --scenario, --split, --suite or --level"),
+        ("tasks --tasks seek_and_kill/blue --split test", "got ids and also --scenario, --split, --suite or --level"),
         ("gallery --scenario nowhere", "unknown scenario 'nowhere'"),
         ("gallery --out {file}/below", "cannot be made: Not a directory"),
         ("train --config no_such", "no config 'no_such'"),
