@@ -66,7 +66,7 @@ def describe_machine() -> dict[str, Any]:
 
 def describe_commit() -> str:
     """The checkout's commit, with `+changes` if measured files differ from it; "unknown" without a checkout."""
-    return machine.commit((*machine.MEASURED, "benchmarks")) or "unknown"
+    return machine.commit((*machine.OWN_PACKAGES, "benchmarks")) or "unknown"
 
 
 def write(record: Record, directory: Path) -> Path:

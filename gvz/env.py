@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Discrete, MultiDiscrete
 
-from gvz.actions import AXES_V1, action_buttons, choice_mask
+from gvz.actions import AXES_V1, Action, action_buttons, choice_mask
 from gvz.core.env_config import EnvConfig, as_integer, typed
 from gvz.core.errors import ConfigError, EngineError
 from gvz.engine.engine import Engine, EngineConfig, check_config
@@ -198,7 +198,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             info |= {"engine_crash": True, "engine_error": str(crash)}
         return observation, info
 
-    def step(self, action: int | np.integer | np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Holds the action's buttons for `frame_skip` tics, or for the rest until the time-out.
 
         Raises:

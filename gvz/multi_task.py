@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
+from gvz.actions import Action
 from gvz.core.errors import ConfigError, TaskError
 from gvz.env import EPISODE_SEEDS, DoomEnv
 from gvz.observation import Observation
@@ -107,7 +108,7 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             rest["episode_seed"] = int(self.np_random.integers(EPISODE_SEEDS))
         return game.reset(options=rest)
 
-    def step(self, action: int | np.integer | np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """As DoomEnv's."""
         return self._game.step(action)
 

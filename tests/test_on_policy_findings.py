@@ -95,6 +95,7 @@ def test_the_findings_say_how_ppo_learned_beside_segmented_frames(scenario):
         ("dodge_projectiles/arachnotron", "`{}` has {:.0f} instead of {:.0f}"),
         ("dodge_projectiles/mancubus+resized_agent", "`{}` {:.0f} instead of {:.0f}"),
         ("health_gathering/short_agent+water", "`{}`, with {:.0f} instead of {:.0f}"),
+        ("health_gathering/poison+stimpacks", "`{}`, with {:.0f} instead of {:.0f}"),
         ("seek_and_kill/mixed_enemies+red", "`{}` {:.0f} instead of {:.0f}"),
         ("seek_and_kill/blue+mixed_enemies+resized_enemies", "`{}` {:.0f} instead of {:.0f}"),
         ("seek_and_kill/complete", "`{}` {:.0f} instead of {:.0f}"),

@@ -31,7 +31,7 @@ class Hello(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     schemas: tuple[Count, Count]
     """of messages and of batches"""
     maps: dict[str, str]
-    """task -> digest of its maps as this machine compiles them"""
+    """task -> digest of its maps as this machine compiles them, and of the network of segmented frames"""
     refusal: str = ""
     """why this machine cannot play"""
 
@@ -42,7 +42,7 @@ def hello(config: PoolConfig) -> Hello:
         versions=machine.versions(),
         code=source_digest(),
         schemas=(SCHEMA_VERSION, WIRE_VERSION),
-        maps=map_digests(config),
+        maps=content_digests(config),
     )
 
 
@@ -58,8 +58,8 @@ def differences(ours: Hello, theirs: Hello) -> list[str]:
     return found
 
 
-def map_digests(config: PoolConfig) -> dict[str, str]:
-    """Task -> digest of the file that the engine loads, of the map of one episode, which may be drawn, and of the
+def content_digests(config: PoolConfig) -> dict[str, str]:
+    """Task -> digest of the file that the engine loads, of the map of one episode (which may be drawn), and of the
     network of segmented frames.
     """
     if config.env_entry_point != REAL_GAMES:

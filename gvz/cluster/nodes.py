@@ -12,7 +12,7 @@ from typing import Any
 import gvz
 from gvz.core import janitor
 from gvz.core.errors import ConfigError, ResourceError
-from gvz.run.machine import MEASURED
+from gvz.run.machine import OWN_PACKAGES
 
 SURVEY_TIMEOUT_S = 120.0
 """for the first worker process of each node; some seconds on an idle machine"""
@@ -59,7 +59,7 @@ def source_digest() -> str:
     """Of all Python files of our packages: the beginning of a SHA-256, hexadecimal."""
     found = hashlib.sha256()
     root = Path(gvz.__file__).parent.parent
-    for file in sorted(file for package in MEASURED for file in (root / package).rglob("*.py")):
+    for file in sorted(file for package in OWN_PACKAGES for file in (root / package).rglob("*.py")):
         found.update(f"{file.relative_to(root)}\0".encode() + file.read_bytes())
     return found.hexdigest()[:8]
 

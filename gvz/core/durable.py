@@ -1,4 +1,5 @@
-"""Files that survive a power cut: their data and names are on the disk before other files refer to them. Tier 0."""
+"""Files that survive a power cut: their data and names are on the disk before other files refer to them; and where
+checkpoints and policies are. Tier 0."""
 
 import os
 from pathlib import Path
@@ -17,11 +18,6 @@ def fsync(path: Path) -> None:
         os.close(descriptor)
 
 
-def saved_steps(directory: Path) -> list[int]:
-    """Gradient steps of the checkpoints or policies in `directory`, ascending, valid or not."""
-    return sorted(int(p.name) for p in directory.glob("*") if p.is_dir() and p.name.isdecimal())
-
-
 def fsync_tree(directory: Path) -> None:
     """`fsync` of everything in `directory`, each file before the directory that names it, and `directory` last.
 
@@ -32,3 +28,8 @@ def fsync_tree(directory: Path) -> None:
         for name in files:
             fsync(Path(folder, name))
         fsync(Path(folder))
+
+
+def saved_steps(directory: Path) -> list[int]:
+    """Gradient steps of the checkpoints or policies in `directory`, ascending, valid or not."""
+    return sorted(int(p.name) for p in directory.glob("*") if p.is_dir() and p.name.isdecimal())

@@ -65,10 +65,9 @@ REWARD_PREFIX = "reward/"
 MAX_COMPONENTS = 64
 """of a file: every name is a column, and a small file could have more cells than fit into memory"""
 
-_IDENTITY = ("run_dir", "player", "params", "profile", "action_set", "frame_skip", "task", "episode", "seed")
-"""rows of one directory that are equal in these are one and the same episode"""
-_POLICY_IDENTITY = tuple(name for name in _IDENTITY if name != "run_dir")
-"""of rows outside a run directory, whose policy is known by its weights"""
+_IDENTITY = ("player", "params", "profile", "action_set", "frame_skip", "task", "episode", "seed")
+"""rows of one directory that are equal in these are one and the same episode, and so are those outside a run directory
+whose policy is known by its weights"""
 
 _NOT_RECORDS = {"discarded", "work", "checkpoints", "policies", "tensorboard"}
 """directories of a run that hold no records, or only discarded ones"""
@@ -117,9 +116,9 @@ def collect_evaluations(paths: Iterable[Path | str]) -> tuple[pl.DataFrame, list
         frame, found = _read_file(file)
         frames.append(frame)
         problems += found
-    together = pl.concat(frames, how="diagonal").unique(_IDENTITY, keep="first", maintain_order=True)
+    together = pl.concat(frames, how="diagonal").unique(("run_dir", *_IDENTITY), keep="first", maintain_order=True)
     outside = pl.col("trained_on").is_null() & pl.col("params").is_not_null()
-    seen_before = pl.int_range(pl.len()).over(_POLICY_IDENTITY) > 0
+    seen_before = pl.int_range(pl.len()).over(_IDENTITY) > 0
     together = together.filter(~(outside & seen_before))
     policies = together.drop_nulls("params").group_by("run_dir", "player", "num_updates", maintain_order=True)
     for run_dir, player, _, num_policies in policies.agg(pl.col("params").n_unique()).iter_rows():

@@ -10,15 +10,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from actors.preprocess import push_frame, start_stack
+from gvz.actions import Action
 from gvz.evaluation.scenarios.base import Sight, script_of, sweep
 
 if TYPE_CHECKING:
     from gvz.env import DoomEnv
     from gvz.observation import Observation
-
-
-Action = int | np.integer | np.ndarray
-"""what `DoomEnv.step` takes"""
 
 
 class Player(Protocol):

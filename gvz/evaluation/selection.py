@@ -50,8 +50,8 @@ class TaskSelection:
         """
         if self.tasks or self.scenario:
             return self.resolve()
-        for scenario in map(scenario_named, scenarios) if self.suite != "core" else ():
-            if scenario.suite != self.suite:
+        for scenario in map(scenario_named, scenarios):
+            if self.suite not in ("core", scenario.suite):  # core: nothing was chosen
                 raise ConfigError(
                     f"--suite: got {self.suite}, but the run was trained on {scenario.id}, which is of the suite "
                     f"{scenario.suite}; choose tasks of other scenarios by --scenario or --tasks"

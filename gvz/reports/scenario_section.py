@@ -49,7 +49,9 @@ def _section(results: Results, scenario: Scenario, out: Path) -> Section:
     blocks = []
     if agents:
         scores = {agent: agent_scores(episodes, agent) for agent in agents}
-        tables = [level_table(scenario, scores, tasks), task_table(scenario, scores, tasks, episodes)]
+        tables = [task_table(scenario, scores, tasks, episodes)]
+        if _named(scenario, tasks):
+            tables.insert(0, level_table(scenario, scores, tasks))
         if scenario.metric == "kills":
             own = {agent: agent_scores(episodes, agent, column="player_kills") for agent in agents}
             tables.append(own_kills_table(scenario, own, tasks))

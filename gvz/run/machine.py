@@ -17,7 +17,7 @@ PACKAGES = (
     *("gvizdoom", "vizdoom", "gymnasium", "jax", "jaxlib", "flax", "optax"),
     *("numpy", "opencv-python-headless", "onnxruntime"),
 )
-MEASURED = ("gvz", "actors", "learner", "configs")
+OWN_PACKAGES = ("gvz", "actors", "learner", "configs")
 _GIT_TIMEOUT_S = 30
 _INSTRUCTION_SETS = {
     "SSE4_2": "sse4_2",
@@ -95,7 +95,7 @@ def versions(packages: Sequence[str] = PACKAGES) -> dict[str, str]:
     return found
 
 
-def commit(measured: Sequence[str] = MEASURED) -> str | None:
+def commit(measured: Sequence[str] = OWN_PACKAGES) -> str | None:
     """Of the checkout this runs from, 12 digits; None outside of one, or without git.
 
     With a change in one of the `measured` directories it ends in `+changes`.

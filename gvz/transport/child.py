@@ -89,18 +89,22 @@ class ChildProcess:
         self._who = who
         path = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path)
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        with theirs:
-            passed = (theirs.fileno(), *inherited)
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", module, str(os.getpid()), *map(str, passed)],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                cwd=directory,
-                env={**os.environ, **environment, **one_core(), "PYTHONPATH": path},
-                pass_fds=passed,
-                process_group=0,
-            )
+        try:
+            with theirs:
+                passed = (theirs.fileno(), *inherited)
+                self._process = subprocess.Popen(
+                    [sys.executable, "-P", "-m", module, str(os.getpid()), *map(str, passed)],
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=log,
+                    cwd=directory,
+                    env={**os.environ, **environment, **one_core(), "PYTHONPATH": path},
+                    pass_fds=passed,
+                    process_group=0,
+                )
+        except BaseException:
+            ours.close()
+            raise
         self.pid = self._process.pid
         self.channel = Channel(ours, peer=f"{who} (pid {self.pid})")
         try:

@@ -57,19 +57,20 @@ class Segment:
         user makes it smaller.
 
         Raises:
-            ResourceError: there is not enough memory.
+            ResourceError: there is not enough memory, or too many files are open.
         """
         total = HEADER_BYTES + payload_bytes
         try:
             available = _available_bytes()
+            if total > available:  # the kernel would not refuse, but kill processes to make room
+                raise ResourceError(
+                    f"segment {name}: got {available} bytes of available memory, want {total}; {advice}"
+                )
             descriptor = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         except OSError as error:  # too many open files
             raise ResourceError(
                 f"segment {name}: {error.strerror}; raise the limit (`ulimit -n`), or {advice}"
             ) from error
-        if total > available:  # the kernel would not refuse, but kill processes to make room
-            os.close(descriptor)
-            raise ResourceError(f"segment {name}: got {available} bytes of available memory, want {total}; {advice}")
         try:
             os.posix_fallocate(descriptor, 0, total)
             fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL)

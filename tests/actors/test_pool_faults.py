@@ -1,6 +1,7 @@
 """The pool of actor processes under every fault: detected, replaced within a budget, nothing published lost."""
 
 import contextlib
+import errno
 import os
 import shutil
 import signal
@@ -18,7 +19,7 @@ from watched_pool import Run, alive, segments
 from actors import supervisor
 from actors.config import ActorsConfig
 from actors.process_pool import ProcessPool
-from gvz.core.errors import WorkerError
+from gvz.core.errors import ResourceError, WorkerError
 from gvz.transport.channel import Channel
 from gvz.transport.messages import EpisodeStats, Message, Ready
 from tests.waiting import wait_until
@@ -152,6 +153,17 @@ def test_a_process_that_cannot_be_started_again_counts_as_one_that_failed(tmp_pa
             run.until(lambda: False)
     assert [fault.kind for fault in run.faults()] == ["died", "died", "gave_up"]
     assert run.faults()[-1].fatal
+
+
+def test_a_first_process_that_cannot_be_started_is_an_error_with_advice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def refused(*_arguments: object, **_options: object) -> None:
+        raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    monkeypatch.setattr(subprocess, "Popen", refused)
+    with pytest.raises(ResourceError, match=r"an actor cannot be started: .* unavailable; use fewer actors, or raise"):
+        ProcessPool(config(tmp_path, {}))
 
 
 def test_an_actor_that_tells_of_anothers_game_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

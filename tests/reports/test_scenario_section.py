@@ -44,6 +44,9 @@ def test_levels_are_means_of_named_tasks_alone(tmp_path):
     assert levels.columns[1:3] == ("level 0 (1 task)", "level 1 (7 tasks)")
     assert {cell.text.split()[0] for row in levels.rows for cell in row[1:]} == {"40.0"}
     assert [row[1].text for row in tasks.rows[-2:]] == ["1", "0"]
+    write_rows(tmp_path / "rows.jsonl", rows[-2:])
+    (section,) = scenario_sections(read_results([tmp_path]), tmp_path)
+    assert "dodge_projectiles_levels" not in [table.id for table in section.blocks[0].tables]
 
 
 def test_the_gap_of_an_agent_is_shown_in_each_of_its_scenarios(tmp_path, experiments_writer):
