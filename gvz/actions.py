@@ -3,16 +3,11 @@
 from itertools import chain, combinations, product
 from types import MappingProxyType
 
-import numpy as np
-
 from gvz.core.env_config import ActionSet
 from gvz.scenarios.base import Scenario
 
 Buttons = tuple[str, ...]
 """buttons that are held together"""
-
-Action = int | np.integer | np.ndarray
-"""what `DoomEnv.step` takes: an action's number, or with `multi_discrete_v1` a number for each group of buttons"""
 
 _CONTRADICTORY = ({"TURN_LEFT", "TURN_RIGHT"}, {"MOVE_LEFT", "MOVE_RIGHT"}, {"MOVE_FORWARD", "MOVE_BACKWARD"})
 

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Discrete, MultiDiscrete
 
-from gvz.actions import AXES_V1, Action, action_buttons, choice_mask
+from gvz.actions import AXES_V1, action_buttons, choice_mask
 from gvz.core.env_config import EnvConfig, as_integer, typed
 from gvz.core.errors import ConfigError, EngineError
 from gvz.engine.engine import Engine, EngineConfig, check_config
@@ -33,6 +33,8 @@ from gvz.viewer import Window
 if TYPE_CHECKING:
     from gvz.engine.engine import GameState, Label
 
+Action = int | np.integer | np.ndarray
+"""what `DoomEnv.step` takes: an action's number, or with `multi_discrete_v1` a number for each group of buttons"""
 TICS_PER_SECOND = 35
 _WEAPON_UP_TIC = 10
 """tic at which the weapon is ready: episodes with a weapon start there, as LevDoom's do"""

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
-from gvz.actions import Action
 from gvz.core.errors import ConfigError, TaskError
-from gvz.env import EPISODE_SEEDS, DoomEnv
+from gvz.env import EPISODE_SEEDS, Action, DoomEnv
 from gvz.observation import Observation
 from gvz.scenarios.base import Task
 from gvz.tasks import parse_task

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from actors.preprocess import push_frame, start_stack
-from gvz.actions import Action
 from gvz.evaluation.scenarios.base import Sight, script_of, sweep
 
 if TYPE_CHECKING:
-    from gvz.env import DoomEnv
+    from gvz.env import Action, DoomEnv
     from gvz.observation import Observation
 
 
@@ -25,7 +24,7 @@ class Player(Protocol):
         """An episode of `env` has begun with `observation`. The player may look at `env`, never step it."""
         ...
 
-    def act(self) -> Action:
+    def act(self) -> "Action":
         """The next action, as `DoomEnv.step` takes it."""
         ...
 
@@ -112,7 +111,7 @@ class FramePlayer:
     frame is repeated. It changes with the next decision: copy it to keep it.
     """
 
-    def __init__(self, choose: Callable[[np.ndarray], Action], stack_size: int = 4):
+    def __init__(self, choose: Callable[[np.ndarray], "Action"], stack_size: int = 4):
         self._choose, self._stack_size = choose, stack_size
 
     def begin(self, env: "DoomEnv", observation: "Observation", info: dict[str, Any], seed: int) -> None:
@@ -121,7 +120,7 @@ class FramePlayer:
         self._stack = np.zeros((height, width, self._stack_size * channels), np.uint8)
         start_stack(self._stack, observation)
 
-    def act(self) -> Action:
+    def act(self) -> "Action":
         return self._choose(self._stack)
 
     def observe(self, observation: "Observation", info: dict[str, Any]) -> None:
