@@ -22,10 +22,12 @@ STOP_TIMEOUT_S = 5.0
 class PoolConfig(Play, frozen=True, kw_only=True):
     """What a pool plays; its actors' environments get `recycle_episodes`, too.
 
-    Lane i is game i % games_per_actor of actor i // games_per_actor. It plays task i % T until
+    Lane i is game i % games_per_actor of actor i // games_per_actor. It plays its first task until
     `Pool.assign` gives it another. A pool may have some of a run's actors only, if other machines have the others.
     """
 
+    first_tasks: tuple[int, ...] = ()
+    """indices of the tasks that lanes begin with, in turn; empty: all of them"""
     num_actors: int
     games_per_actor: int
     first_actor: int = 0
@@ -191,7 +193,8 @@ def lanes_to_begin_with(config: PoolConfig, state: dict[str, Any] | None) -> Lan
         ResumeError: `state` is of another number of lanes.
     """
     if state is None:
-        tasks = [lane % len(config.tasks) for lane in config.lanes]
+        first = config.first_tasks or tuple(range(len(config.tasks)))
+        tasks = [first[lane % len(first)] for lane in config.lanes]
         return LaneState(next_episodes=[0] * config.num_lanes, tasks=tasks)
     lanes = LaneState(next_episodes=list(state["next_episodes"]), tasks=list(state["tasks"]))
     if len(lanes.next_episodes) != config.num_lanes or len(lanes.tasks) != config.num_lanes:

@@ -237,7 +237,8 @@ class Learner:
                 self._collect(pool)
             self._update(per_call)
             num_updates += per_call
-            if pool is not None and num_updates >= published + self.config.learner.publish_period_updates:
+            period = self.config.learner.publish_period_updates
+            if pool is not None and num_updates // period > published // period:
                 published = num_updates
                 self._publish(pool)
             elif num_updates % (_UPDATES_IN_FLIGHT * per_call) == 0:

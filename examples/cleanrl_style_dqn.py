@@ -1,6 +1,6 @@
 """DQN in one file in the style of CleanRL: PyTorch, one environment, a replay of numpy arrays.
 
-pip install -r examples/requirements.txt; python examples/cleanrl_style_dqn.py --steps 200000
+python examples/cleanrl_style_dqn.py --steps 200000   (how to install: docs/how-to/use-your-own-agent.md)
 """
 
 import numpy as np

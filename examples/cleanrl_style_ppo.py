@@ -1,6 +1,6 @@
 """PPO in one file in the style of CleanRL: PyTorch, and the games of gvz.make_vec.
 
-pip install -r examples/requirements.txt; python examples/cleanrl_style_ppo.py --steps 500000
+python examples/cleanrl_style_ppo.py --steps 500000   (how to install: docs/how-to/use-your-own-agent.md)
 """
 
 import torch

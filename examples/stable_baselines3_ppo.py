@@ -1,6 +1,7 @@
 """Trains PPO of Stable-Baselines3 on some tasks of a scenario and evaluates it on others by the benchmark's protocol.
 
-pip install -r examples/requirements.txt; python examples/stable_baselines3_ppo.py --steps 200000 --episodes 20
+python examples/stable_baselines3_ppo.py --steps 200000 --episodes 20
+(how to install: docs/how-to/use-your-own-agent.md)
 """
 
 from functools import partial

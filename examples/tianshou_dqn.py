@@ -1,6 +1,6 @@
 """Double DQN of Tianshou 2 with n-step returns, several games at once.
 
-pip install -r examples/requirements.txt; python examples/tianshou_dqn.py --epochs 20
+python examples/tianshou_dqn.py --epochs 20   (how to install: docs/how-to/use-your-own-agent.md)
 """
 
 import tyro

@@ -12,7 +12,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Discrete, MultiDiscrete
 
 from gvz.actions import AXES_V1, action_buttons, choice_mask
-from gvz.core.env_config import EnvConfig, as_integer, typed
+from gvz.core.env_config import EPISODE_SEEDS, EnvConfig, as_integer, given_episode_seed, typed
 from gvz.core.errors import ConfigError, EngineError
 from gvz.engine.engine import Engine, EngineConfig, check_config
 from gvz.engine.probe import ensure_loads
@@ -43,8 +43,6 @@ _COUNTED = {"kills": "KILLCOUNT", "goals": "GOALS"}
 _SOLVED_EPISODES = 10
 _MAX_CRASHES = 3
 """crashes in a row, without a complete episode in between, after which the environment raises an error"""
-EPISODE_SEEDS = 2**31
-"""an episode's seed is smaller than this"""
 
 
 class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
@@ -172,16 +170,9 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             EngineError: the engine does not start, or does not run the task's map.
             ResourceError: render_mode human without a display, or too little shared memory.
         """
+        given = given_episode_seed(options or {})
         super().reset(seed=seed)
-        if unknown := (options or {}).keys() - {"episode_seed"}:
-            raise ValueError(f"reset: unknown options {sorted(unknown)}, want episode_seed")
-        if options and "episode_seed" in options:
-            episode_seed = as_integer(options["episode_seed"])
-        else:
-            episode_seed = int(self.np_random.integers(EPISODE_SEEDS))
-        if not 0 <= episode_seed < EPISODE_SEEDS:
-            raise ValueError(f"reset: {options}, want an integer as episode_seed, 0..{EPISODE_SEEDS - 1}")
-        self._episode_seed = episode_seed
+        self._episode_seed = int(self.np_random.integers(EPISODE_SEEDS)) if given is None else given
         if self._recycle_episodes and self._engine_episodes >= self._recycle_episodes:
             self._stop_engine()
         engine, crash = self._begin()

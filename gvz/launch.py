@@ -5,7 +5,6 @@ and errors are quick.
 """
 
 import dataclasses
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from typing import Annotated
 import tyro
 
 from gvz.core.errors import ConfigError, GvzError
-from gvz.core.stop import StopRequest
+from gvz.core.stop import StopRequest, exit_at_once
 from gvz.run.config import RunConfig, with_agent
 from gvz.run.config_files import load_config
 from gvz.run.rundir import RunDir, move_aside
@@ -41,10 +40,9 @@ def argument(arguments: Sequence[str], flag: str) -> str | None:
     """The value of a flag that decides the defaults of other flags: the last one, or None if it is not given."""
     value = None
     for i, text in enumerate(arguments):
-        if text == flag and i + 1 < len(arguments):
-            value = arguments[i + 1]
-        elif text.startswith(f"{flag}="):
-            value = text.removeprefix(f"{flag}=")
+        name, equals, behind = text.partition("=")
+        if name.replace("_", "-") == flag:  # tyro takes both
+            value = behind if equals else next(iter(arguments[i + 1 :]), value)
     return value
 
 
@@ -55,12 +53,6 @@ def parse(arguments: Sequence[str]) -> Launch:
         ConfigError, TaskError: an invalid value. SystemExit(2): flags that do not parse.
     """
     name = argument(arguments, "--config") or DEFAULT_CONFIG
-    if argument(arguments, "--tasks") is not None:
-        for flag in ("--scenario", "--training-set"):
-            if (value := argument(arguments, flag)) is not None:
-                raise ConfigError(
-                    f"{flag}: got {value} and also --tasks, which leave it without effect; want one of them"
-                )
     agent = argument(arguments, "--agent.name")
 
     def parsed(config: RunConfig) -> Launch:
@@ -70,6 +62,13 @@ def parse(arguments: Sequence[str]) -> Launch:
 
     config = load_config(name, argument(arguments, "--scenario"))
     launch = parsed(config)
+    if launch.run.tasks is not None:
+        theirs = f"the tasks of {name}" if argument(arguments, "--tasks") is None else "--tasks"
+        for flag in ("--scenario", "--training-set"):
+            if (value := argument(arguments, flag)) is not None:
+                raise ConfigError(
+                    f"{flag}: got {value} and also {theirs}, which leave it without effect; want one of them"
+                )
     played = launch.run.table.scenarios
     of_played = load_config(name, played[0].id if len(played) == 1 else None)
     return launch if of_played == config else parsed(of_played)
@@ -107,16 +106,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 stop.importing, in_group = False, config.group.num_processes > 1
                 return train(config, run, stop)
         except GvzError as error:
+            if in_group:  # a normal end would wait for the other processes
+                exit_at_once(error.exit_code, f"error: {error}")
             print(f"error: {error}", file=sys.stderr)
-            if in_group:
-                sys.stderr.flush()
-                os._exit(error.exit_code)  # a normal exit would wait for the other processes
             return error.exit_code
-        except KeyboardInterrupt:
-            print("stopped at once", file=sys.stderr)
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(stop.exit_code)  # a normal exit would wait for a thread that writes a checkpoint
+        except KeyboardInterrupt:  # it would wait for a thread that writes a checkpoint
+            exit_at_once(stop.exit_code, "stopped at once")
 
 
 if __name__ == "__main__":

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
+from gvz.core.env_config import EPISODE_SEEDS, given_episode_seed, typed
 from gvz.core.errors import ConfigError, TaskError
-from gvz.env import EPISODE_SEEDS, Action, DoomEnv
+from gvz.env import Action, DoomEnv
 from gvz.observation import Observation
 from gvz.scenarios.base import Task
 from gvz.tasks import parse_task
@@ -48,7 +49,7 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             ConfigError: no task, one twice, or tasks whose actions differ.
             TaskError, EngineError: as DoomEnv.
         """
-        if max_engines < 1:
+        if typed(int, max_engines, "max_engines") < 1:
             raise ConfigError(f"max_engines: got {max_engines}, want at least 1")
         games = [DoomEnv(task, **options) for task in tasks]
         self._games = {game.task.id: game for game in games}
@@ -92,9 +93,12 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             TaskError: no task has this id, or it is none of the environment's.
             ValueError, EngineError, ResourceError: as DoomEnv.
         """
+        options = options or {}
+        episode_seed = given_episode_seed(options, ("task",))
         super().reset(seed=seed)
-        rest = dict(options or {})
-        task = parse_task(rest.pop("task") if "task" in rest else self._sampler(self.np_random)).id
+        task = options["task"] if "task" in options else self._sampler(self.np_random)
+        if task not in self._games:  # another spelling: an alias, attributes in another order
+            task = parse_task(task).id
         if task not in self._games:
             raise TaskError(f"reset: got task {task!r}, want one of {', '.join(self._games)}")
         self._game = game = self._games[task]
@@ -103,9 +107,9 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         elif len(self._running) == self._max_engines:
             self._running.pop(0).close()
         self._running.append(game)
-        if "episode_seed" not in rest:
-            rest["episode_seed"] = int(self.np_random.integers(EPISODE_SEEDS))
-        return game.reset(options=rest)
+        if episode_seed is None:
+            episode_seed = int(self.np_random.integers(EPISODE_SEEDS))
+        return game.reset(options={"episode_seed": episode_seed})
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """As DoomEnv's."""

@@ -49,18 +49,22 @@ def register_with_gymnasium() -> None:
 
 
 class _GymnasiumFinder:
-    """An import hook for one use: finds gymnasium as usual and registers the tasks after it is loaded."""
+    """An import hook: finds gymnasium as usual, and registers the tasks after gymnasium is loaded."""
 
     def find_spec(self, name: str, _path: object = None, _target: object = None) -> ModuleSpec | None:
         if name != "gymnasium":
             return None
         sys.meta_path.remove(self)
-        spec = find_spec(name)
+        try:
+            spec = find_spec(name)
+        finally:
+            sys.meta_path.insert(0, self)  # who asks may only want to know whether there is a gymnasium
         if spec is not None and spec.loader is not None:
             load = spec.loader.exec_module
 
             def load_and_register(module: ModuleType) -> None:
                 load(module)
+                sys.meta_path.remove(self)
                 register_envs()
 
             spec.loader.exec_module = load_and_register

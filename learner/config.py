@@ -172,14 +172,15 @@ def agent_config_class(name: str) -> type[AgentConfig]:
 
 
 def change_agent(config: AgentConfig, name: str) -> AgentConfig:
-    """The configuration of another agent, with what both agents have as in `config`.
+    """The configuration of another agent, with what `config` sets otherwise than by default, where both have it.
 
     Raises:
         ConfigError: no such agent, or its configuration does not take these values.
     """
     kind = agent_config_class(name)
     wanted = {field.name for field in dataclasses.fields(kind)} - {"name"}
-    shared: dict[str, Any] = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name in wanted}
+    values = {f.name: (getattr(config, f.name), f.default) for f in dataclasses.fields(config) if f.name in wanted}
+    shared: dict[str, Any] = {name: value for name, (value, default) in values.items() if value != default}
     try:
         return kind(name=name, **shared)
     except ConfigError as error:

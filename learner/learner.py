@@ -103,6 +103,11 @@ class LearnerParts(Protocol):
         """Samples of a gradient step."""
         ...
 
+    @property
+    def num_updates_per_call(self) -> int:
+        """Gradient steps of `Learner.update`, which no publication of the parameters divides."""
+        ...
+
     def device_bytes(self) -> int:
         """Bytes of the records that the learner keeps on its devices, in all."""
         ...

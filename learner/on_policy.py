@@ -49,6 +49,10 @@ class OnPolicyParts:
     def batch_size(self) -> int:
         return rollout_step.batch_size(self.spec, self.config)
 
+    @property
+    def num_updates_per_call(self) -> int:
+        return self.config.updates_per_rollout
+
     def device_bytes(self) -> int:
         """Of the rollout that is learnt from: half of the windows."""
         return rollouts.memory_bytes(self.spec) // 2

@@ -37,6 +37,12 @@ def test_a_reader_that_has_enough_is_no_error():
     assert (done.returncode, done.stderr) == (141, b"")
 
 
+def test_closed_output_is_no_error():
+    command = ["bash", "-c", 'exec "$@" >&-', "bash", sys.executable, "-m", "gvz.cli", "--version"]
+    done = subprocess.run(command, stderr=subprocess.PIPE, timeout=120, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
 def test_help_of_a_command_says_all_that_the_overview_leaves_out(capsys):
     told = []
     for arguments in (["--help"], ["evaluate", "--help"]):

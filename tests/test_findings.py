@@ -12,7 +12,17 @@ from gvz.reports.experiment_section import comparison_table, result_table
 from gvz.reports.results import read_results
 from gvz.reports.scores import agent_scores, estimate, estimate_groups
 from gvz.tasks import named_tasks, scenario_named, scenarios
-from tests.score_tables import PAGE, ROOT, WORDS, metrics_of, results_of, rows_of, score_cells, training_episodes
+from tests.score_tables import (
+    PAGE,
+    ROOT,
+    WORDS,
+    metrics_of,
+    results_of,
+    rows_of,
+    score_cells,
+    task_sets,
+    training_episodes,
+)
 
 
 @pytest.mark.parametrize(
@@ -233,6 +243,100 @@ def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
     assert f"game variables | {' | '.join(of_segmented)} | no: `rainbow_segmented` |" in summary
 
 
+def test_the_findings_say_how_far_apart_two_seeds_of_one_agent_lie():
+    episodes, apart = results_of("gates").episodes, {"rainbow": (0.0, ""), "pqn": (0.0, "")}
+    for name, agent in episodes.select("scenario", "agent").unique().rows():
+        scores = agent_scores(episodes.filter(scenario=name), agent)
+        means = [np.mean([found.mean() for found in run]) for run in scores.cells(task_sets(name)[1])]
+        algorithm = agent.partition("_")[0]
+        if algorithm in apart and means:
+            apart[algorithm] = max(apart[algorithm], (float(max(means) - min(means)), f"{agent} {name}"))
+    (of_rainbow, shots), (of_pqn, plain) = apart.values()
+    assert (shots, plain) == ("rainbow_quick+shots_cost seek_and_kill", "pqn_quick+plain health_gathering")
+    assert f"the seed alone can lie [{of_rainbow:.0f} points apart](#free-shots-in-seek-and-kill-yes) on the" in WORDS
+    assert f"two runs of PQN [{of_pqn:.0f} points](#replay-or-on-policy-learning-replay)." in WORDS
+    assert f"On the gate tasks the two with the price lie {of_rainbow:.0f} points apart." in WORDS
+
+
+def test_the_findings_say_when_agents_of_the_gate_of_sight_survived():
+    ended_s = []
+    for variant in ("plain", "height_pool", "augmented", "height_pool_augmented"):
+        folder = ROOT / "results" / "gates" / "runs" / f"rainbow_quick+{variant}" / "health_gathering" / "train8"
+        for run in sorted(folder.iterdir()):
+            survived = [row["num_updates"] for row in rows_of(run / "episodes.jsonl.gz") if row["truncated"]]
+            assert bool(survived) == (variant != "height_pool_augmented"), "no episode of training reached the time-out"
+            updates, spent_s = ([row[key] for row in metrics_of(run)] for key in ("num_updates", "run/processor_s"))
+            ended_s += [f"{np.interp(survived[9], updates, spent_s):.0f}"] if survived else []
+    words = "after {} and {} seconds (plain), {} and {} (pooled), {} and {} (augmented)."
+    assert words.format(*ended_s) in WORDS
+
+
+def test_the_findings_say_what_the_thesis_reward_gave_for_walking_and_how_often_an_agent_shot():
+    moved, of_first = [], {}
+    for seed in (1111, 2222):
+        run = ROOT / "results" / "gates" / "runs" / "rainbow_quick+thesis" / "seek_and_kill" / "train8" / f"seed_{seed}"
+        last = rows_of(run / "episodes.jsonl.gz")[-60:]
+        rewards = np.array([row["reward_components"]["moved"] for row in last])
+        steps = np.array([row["length_steps"] for row in last])
+        moved.append((f"{np.mean(rewards / steps):.2f}", f"{rewards.mean():.0f}"))
+    (a_decision, episode), (a_decision_of_other, other) = moved
+    assert a_decision == a_decision_of_other
+    assert f"both runs with the thesis's weights got {a_decision} a decision for walking. Over an episode this" in WORDS
+    assert f"as much as the reward of {episode} and {other} kills." in WORDS
+    played = results_of("gates").episodes.filter(agent="rainbow_quick+thesis", run_seed=1111)
+    for task in task_sets("seek_and_kill")[0]:
+        rows = played.filter(task=task)
+        of_first[task] = (-10 * rows["reward/ammo_spent"].mean(), rows["player_kills"].mean())
+    *_, (shots, _) = hardly = sorted(of_first.values())[:4]
+    said = f"it had at most {shots:.2f} shots and {max(kills for _, kills in hardly):.2f} own kills an episode there."
+    assert said in WORDS
+
+
+def test_the_findings_say_what_pairs_of_attributes_gave():
+    episodes, names = results_of("general_short").episodes, ("health_gathering", "seek_and_kill")
+    agents = [f"rainbow_general ({words})" for words in ("8 tasks and pairs", "8 tasks")]
+    gains = []
+    for name in names:
+        both = [agent_scores(episodes.filter(scenario=name), agent) for agent in agents]
+        gains.append(
+            [estimate_groups([(scores, tasks) for scores in both], difference).text for tasks in task_sets(name)]
+        )
+    (_, gate, test, _), (trained, gate_of_other, test_of_other, _) = gains
+    assert f"the gate tasks lose, and the test tasks gain**: {gate} and {test} points." in WORDS
+    assert f"is shown**: {gate_of_other} points on the gate tasks and {test_of_other} on the test tasks." in WORDS
+    assert f"The training tasks lose: {trained}." in WORDS
+    tasks = (
+        "health_gathering/short_agent+water",
+        "health_gathering/obstacles+slime+stimpacks",
+        "seek_and_kill/blue+shadows",
+        "seek_and_kill/mixed_enemies+red",
+    )
+    for task in tasks:
+        found = [f"{episodes.filter(agent=agent, task=task)['normalized_score'].mean():.0f}" for agent in agents]
+        called = re.escape(task.partition("/")[2])
+        assert re.search(f"`{called}` (has )?{' instead of '.join(found)}", WORDS)
+    runs = ROOT / "results" / "general_short" / "runs" / "rainbow_general"
+    steps = [metrics_of(runs / name / "pairs" / "seed_1111")[-1]["num_updates"] for name in names]
+    assert "One seed, {:,} and {:,} gradient steps (intervals".format(*steps) in WORDS
+
+
+def test_the_findings_say_what_classes_and_the_screen_have_on_single_tasks():
+    episodes = results_of("general_short").episodes
+    agents = ("rainbow_general+classes", "rainbow_general (8 tasks)")
+
+    def scores(task: str) -> list[str]:
+        """With classes and with the screen."""
+        return [f"{episodes.filter(agent=agent, task=task)['normalized_score'].mean():.0f}" for agent in agents]
+
+    shaded, sized, poison = (
+        scores(f"health_gathering/{task}")
+        for task in ("shaded_kits+stimpacks", "poison+resized_kits+shaded_kits", "poison")
+    )
+    assert "`shaded_kits+stimpacks` has {} with classes and {} with the screen".format(*shaded) in WORDS
+    assert "`poison+resized_kits+shaded_kits` {} and {}. `poison` alone".format(*sized) in WORDS
+    assert "`poison` alone, which is trained on, has {} and {}, where".format(*poison) in WORDS
+
+
 def test_the_findings_say_how_many_games_ran_at_once():
 
     def games(runs: str) -> set[int]:
@@ -242,7 +346,11 @@ def test_the_findings_say_how_many_games_ran_at_once():
         return {len({row["lane"] for row in episodes if "lane" in row}) for episodes in rows}
 
     assert games("general_short/runs/rainbow_segmented/*/train8") == {16}
-    assert "(16,900 to 19,700 gradient steps, 16 games at once)" in WORDS
+    files = (ROOT / "results").glob("general_short/runs/rainbow_segmented/*/train8/*/metrics.jsonl.gz")
+    steps = [rows_of(file)[-1]["num_updates"] for file in files]
+    assert len(steps) == 12
+    assert f"({min(steps):,} to {max(steps):,} gradient steps, 16 games at once)" in WORDS
+    assert f"(eight tasks: {min(steps):,} to {max(steps):,}, with 16 games)" in WORDS
     assert games("general_short/runs/rainbow_general+sight_loss") == {8}
     assert "with a weight of 0.1. One seed with 8 games at once" in WORDS
     readme = (ROOT / "results" / "general" / "README.md").read_text()

@@ -69,6 +69,7 @@ def test_every_named_task_is_registered():
         ("import gymnasium, gvz", ""),
         ("import gvz, gymnasium", ""),
         ("import gvz.core.errors, gymnasium.spaces", ""),
+        ("import gvz, importlib.util; importlib.util.find_spec('gymnasium'); import gymnasium", ""),
         ("import gymnasium", "gvz:"),
         ("import gvz, gymnasium", "gvz:"),
     ],

@@ -79,8 +79,9 @@ def test_bad_input_is_named():
         gvz.make(TASKS)
     with pytest.raises(ConfigError, match="want at least one, each once"):
         gvz.make([TASKS[0], TASKS[0]])
-    with pytest.raises(ConfigError, match="max_engines: got 0, want at least 1"):
-        gvz.make(TASKS, action_set="unified_v1", max_engines=0)
+    for number, message in ((0, "got 0, want at least 1"), (1.5, "got 1.5, want int")):
+        with pytest.raises(ConfigError, match=f"max_engines: {message}"):
+            gvz.make(TASKS, action_set="unified_v1", max_engines=number)
     env = gvz.make(TASKS, action_set="unified_v1")
     with pytest.raises(
         TaskError, match="got task 'defend_the_center/gore', want one of defend_the_center/default, seek"

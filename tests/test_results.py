@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gvz.evaluation.statistics import bootstrap, bootstrap_runs
+from gvz.experiments.base import experiments
 from gvz.reports.experiment_section import result_table
 from gvz.reports.joint_section import joint_sections
 from gvz.reports.results import read_results
@@ -31,7 +32,10 @@ def test_the_quick_runs_are_better_than_chance_on_the_same_episodes():
     trained = bootstrap_runs([[[scores] for scores, _ in runs]], redraw=["runs"])
     assert bootstrap([chance]).high < trained.low
     readme, page = (ROOT / "README.md").read_text(), (folder / "README.md").read_text()
-    assert f"| random | {bootstrap([chance])} |" in readme
+    by_episode = sorted(rows_of(folder / "evaluation_random.jsonl.gz"), key=lambda row: row["episode"])
+    random = bootstrap([np.array([row["score"] for row in by_episode])], num_resamples=1000)  # as benchmarks.reference
+    assert f"| random | {random} |" in readme
+    assert f"| default | 0 | {random} |" in (ROOT / "docs" / "BENCHMARK.md").read_text()
     assert f"| rainbow_quick, 15,000 updates | {trained} |" in readme
     for seed, (scores, _) in zip((1111, 2222, 3333), runs, strict=True):
         assert f"| {seed} | {bootstrap([scores])} | {bootstrap([100 * scores / 1100])} |" in page
@@ -123,6 +127,19 @@ def test_the_hour_of_the_main_job_says_what_its_records_give():
     assert f"`rainbow_4task` needs some {readme} hours" in guide
 
 
+def test_the_guide_says_how_long_experiments_train_at_the_measured_rates():
+    guide = (ROOT / "docs" / "how-to" / "reproduce-an-experiment.md").read_text()
+    assert "15,000 gradient steps\nafter 279 seconds" in (ROOT / "results" / "rainbow_quick" / "README.md").read_text()
+    per_hour = metrics_of(ROOT / "results" / "rainbow_4task" / "seed_1111")[-1]["num_updates"]
+    thesis = ("rainbow_evaluation", "algorithm_comparison", "training_set_size", "training_difficulty")
+    runs = {name: {run.id: run.total_updates for run in experiments()[name].runs()} for name in experiments()}
+    together = dict(run for name in thesis for run in runs[name].items())
+    for title, updates in {**{f"`{name}`": runs[name] for name in thesis}, "the last four together": together}.items():
+        assert f"| {title} | {float(f'{sum(updates.values()) / per_hour:.2g}'):,.0f} hours |" in guide
+    minutes = sum(runs["quick_comparison"].values()) / 15_000 * 279 / 60
+    assert f"| `quick_comparison` | {round(minutes, -1):.0f} minutes |" in guide
+
+
 @pytest.mark.parametrize(
     ("folder", "split", "num_episodes"),
     [
@@ -212,7 +229,7 @@ def test_pages_say_what_a_gpu_gave():
     guide = " ".join((ROOT / "docs" / "how-to" / "train.md").read_text().split())
     assert f"`rainbow_4task` makes {updates[0]:.0f} gradient steps a second" in guide
     assert f"chooses the actions, too, and it makes {updates[1]:.0f} ([measured]" in guide
-    assert f"The learner alone makes up to {max(alone):,.0f}." in guide
+    assert f"The learner alone makes up to {float(f'{max(alone):.3g}'):,.0f}." in guide
     first = [
         rows[f"from the command to the first gradient step, actors.inference {where}"] for where in ("actors", "device")
     ]

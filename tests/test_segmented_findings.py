@@ -60,9 +60,10 @@ def test_the_findings_say_what_segmented_agents_have_on_single_tasks():
 
 
 def test_the_findings_say_how_much_agents_of_the_gate_moved_and_what_it_gave_by_task():
+    runs, variants = ROOT / "results" / "gates" / "runs", ("plain", "moved", "moved_more", "moved_most")
     moved, by_task = [], {"arachnotron": [], "mancubus+resized_agent": []}
-    for variant in ("plain", "moved", "moved_more", "moved_most"):
-        folder = ROOT / "results" / "gates" / "runs" / f"rainbow_segmented+{variant}" / "dodge_projectiles"
+    for variant in variants:
+        folder = runs / f"rainbow_segmented+{variant}" / "dodge_projectiles"
         rows = [row for file in sorted(folder.glob("**/evaluation.jsonl.gz")) for row in rows_of(file)]
         for name, means in by_task.items():
             scores = [row["normalized_score"] for row in rows if row["task"] == f"dodge_projectiles/{name}"]
@@ -75,6 +76,17 @@ def test_the_findings_say_how_much_agents_of_the_gate_moved_and_what_it_gave_by_
     assert f"with both, {moved[2] / 0.0005:.0f} and {moved[3] / 0.002:.0f} map units in five decisions" in WORDS
     assert "`arachnotron` has {}, {}, {} and {} by weight".format(*by_task["arachnotron"]) in WORDS
     assert "`mancubus+resized_agent` has {}, {}, {} and {}".format(*by_task["mancubus+resized_agent"]) in WORDS
+    plain = results_of("gates").episodes.filter(agent="rainbow_segmented+plain")
+    seeds = sorted(means_by_seed(plain, "dodge_projectiles", ["dodge_projectiles/arachnotron"]))
+    assert "`arachnotron`, where agents had {:.0f} to {:.0f}.".format(*seeds) in WORDS
+    files = [
+        file
+        for variant in (*variants, "shift_moved")
+        for file in (runs / f"rainbow_segmented+{variant}" / "dodge_projectiles").glob("**/metrics.jsonl.gz")
+    ]
+    steps = [rows_of(file)[-1]["num_updates"] for file in files]
+    assert len(steps) == 9
+    assert f"new enemies do. 900 seconds of processor time a run, {min(steps):,} to {max(steps):,} gradient" in WORDS
 
 
 def test_the_findings_say_what_shifted_frames_gave():
@@ -251,6 +263,23 @@ def test_the_findings_say_what_single_tasks_gained_in_six_times_the_time():
     )
 
 
+def test_the_findings_say_what_single_tasks_gained_with_a_loss_of_sight_in_six_times_the_time():
+    said = []
+    for task in (
+        "seek_and_kill/blue+shadows",
+        "seek_and_kill/complete",
+        "defend_the_center/fast_enemies",
+        "defend_the_center/mossy_bricks",
+    ):
+        for folder in ("general_short", "general"):
+            rows = results_of(folder).episodes.filter(agent="rainbow_general+sight_loss", task=task)
+            said.append(f"{rows['normalized_score'].mean():.0f}")
+    shadows, complete, fast, bricks = zip(said[::2], said[1::2], strict=True)
+    assert "`blue+shadows` falls from {} to {}, and level 4 stays at {}.".format(*shadows, complete[0]) in WORDS
+    assert complete[0] == complete[1]
+    assert "falls from {} to {}, `mossy_bricks` rises from {} to {}.".format(*fast, *bricks) in WORDS
+
+
 def test_the_findings_say_how_segmented_agents_learned_in_six_times_the_time():
     learning = []
     for name in ("defend_the_center", "seek_and_kill", "dodge_projectiles", "health_gathering"):
@@ -295,3 +324,11 @@ def test_the_findings_say_what_a_longer_horizon_gave_in_health_gathering():
     assert f"instead of {score('near', 'poison+stimpacks')}, and `poison` {score('far', 'poison')} instead of" in WORDS
     assert f"instead of {score('near', 'poison')}. `supreme` has {score('far', 'supreme')} instead of" in WORDS
     assert f"instead of {score('near', 'supreme')}." in WORDS
+    name, short = "health_gathering", results_of("general_short").episodes.filter(agent="rainbow_segmented")
+    scores = agent_scores(short.filter(scenario=name), "rainbow_segmented")
+    assert f"With 0.98 they have {estimate(scores, task_sets(name)[1]).text} (`general_segmented`)." in WORDS
+    in_gate, in_short = (
+        dict(rows.filter(scenario=name).select("run_seed", "params").unique().rows())
+        for rows in (episodes.filter(agent="rainbow_segmented+far"), short)
+    )
+    assert in_gate.items() < in_short.items(), "the same runs, and a third seed"

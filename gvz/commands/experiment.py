@@ -137,7 +137,7 @@ class PlanCommand:
 class RunCommand:
     """Run experiments: train, evaluate, play with the simple players. The same command resumes what was stopped.
 
-    Example: gvz experiment run training_set_size rainbow_evaluation --results results --shard 1/4
+    Example: gvz experiment run training_set_size rainbow_evaluation --results runs/thesis --shard 1/4
     """
 
     ask: Annotated[PlanFlags, tyro.conf.arg(name="")] = PlanFlags()

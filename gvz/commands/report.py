@@ -14,7 +14,7 @@ from gvz.core.errors import ConfigError
 class Report:
     """Make a report: one HTML page, Markdown, tables as CSV and LaTeX, figures as SVG, PDF and PNG.
 
-    Example: gvz report results/quick --out report
+    Example: gvz report runs/quick --out report
     """
 
     results: Annotated[

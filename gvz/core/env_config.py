@@ -2,7 +2,7 @@
 
 import math
 import operator
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from numbers import Integral, Real
 from pathlib import Path
@@ -194,6 +194,25 @@ def check_types(config: Any, prefix: str) -> None:
     """
     for name, kind in get_type_hints(type(config)).items():
         object.__setattr__(config, name, typed(kind, getattr(config, name), f"{prefix}.{name}"))
+
+
+EPISODE_SEEDS = 2**31
+"""an episode's seed is smaller than this"""
+
+
+def given_episode_seed(options: Mapping[str, object], others: Sequence[str] = ()) -> int | None:
+    """The episode seed in the options of an environment's `reset`; None if it has none.
+
+    Raises:
+        ValueError: an option that is neither `episode_seed` nor of `others`, or an episode seed outside [0, 2^31).
+    """
+    known = ("episode_seed", *others)
+    if unknown := [name for name in options if name not in known]:
+        raise ValueError(f"reset: unknown options {unknown}, want {' or '.join(known)}")
+    given = options.get("episode_seed")
+    if given is not None and not 0 <= as_integer(given) < EPISODE_SEEDS:
+        raise ValueError(f"reset: episode_seed {given!r}, want an integer, 0..{EPISODE_SEEDS - 1}")
+    return None if given is None else as_integer(given)
 
 
 def as_integer(value: object) -> int:

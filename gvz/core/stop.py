@@ -1,8 +1,11 @@
 """Ctrl-C and SIGTERM: the first asks the loop to finish its update, a second one ends it at once. Standard library."""
 
+import contextlib
 import os
 import signal
+import sys
 from types import FrameType
+from typing import NoReturn
 
 
 class StopRequest:
@@ -50,3 +53,16 @@ class StopRequest:
     def exit_code(self) -> int:
         """128 + the signal's number, as shells expect; 0 without one."""
         return 0 if self.signal is None else 128 + self.signal
+
+
+def exit_at_once(code: int, message: str) -> NoReturn:
+    """Ends this process without the waits of a normal end: for threads, and for the other processes of a group.
+
+    The message goes to standard error, if that can be written.
+    """
+    with contextlib.suppress(OSError):
+        print(message, file=sys.stderr)
+    for stream in filter(None, (sys.stdout, sys.stderr)):  # a closed one is None
+        with contextlib.suppress(OSError):
+            stream.flush()
+    os._exit(code)

@@ -89,12 +89,13 @@ def _watch(who: str, timeout_s: float) -> None:
             return
         if beating or _is_stopped(parent):
             heard_s = clock.look()
-    print(
-        f"error: {who} gave no sign of life for {silent_s:.0f} s and is ended; the stacks of its threads, the newest "
-        "call first:",
-        file=sys.stderr,
-        flush=True,
-    )
+    with contextlib.suppress(OSError):  # standard error is gone, or its disk is full
+        print(
+            f"error: {who} gave no sign of life for {silent_s:.0f} s and is ended; the stacks of its threads, the "
+            "newest call first:",
+            file=sys.stderr,
+            flush=True,
+        )
     os.kill(parent, _LAST_SIGNAL)
     if not select.select([sys.stdin], [], [], _DUMP_TIMEOUT_S)[0]:  # its end closes the pipe
         os.kill(parent, signal.SIGKILL)

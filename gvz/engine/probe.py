@@ -26,6 +26,8 @@ _FAULTS = re.compile(
     r"unknown|tried to register|script error|runaway script|no map|not found|execution could not continue", re.I
 )
 """ZDoom prints such a line, and goes on"""
+_DIRECTORY = re.compile(r"(?<![^\s\"'(])/.*/")
+"""of a file that a line names: a directory may have any name"""
 _SCRIPT_ERROR = "Script error"
 _ALONE_S = 20.0
 _TIMEOUT_S = 60.0
@@ -70,8 +72,8 @@ def probe_wad(wad: Path, map_name: str = "MAP01", timeout_s: float = _TIMEOUT_S)
 def _faults(text: str) -> list[str]:
     """The lines of an engine's output that tell of a fault; the cause of a script error is in the next line."""
     lines = [line for line in text.splitlines() if line.strip()]
-    before = ["", *lines]
-    return [line for last, line in zip(before, lines, strict=False) if _FAULTS.search(line) or _SCRIPT_ERROR in last]
+    pairs = zip(["", *lines], lines, strict=False)
+    return [line for last, line in pairs if _FAULTS.search(_DIRECTORY.sub("", line)) or _SCRIPT_ERROR in last]
 
 
 def _output_of_engine_alone(command: list[str]) -> str:

@@ -116,7 +116,14 @@ def collect_evaluations(paths: Iterable[Path | str]) -> tuple[pl.DataFrame, list
         frame, found = _read_file(file)
         frames.append(frame)
         problems += found
-    together = pl.concat(frames, how="diagonal").unique(("run_dir", *_IDENTITY), keep="first", maintain_order=True)
+    together = pl.concat(frames, how="diagonal")
+    unlike = together.filter(pl.col("params").is_null()).group_by("run_dir", *_IDENTITY, maintain_order=True)
+    for player, num_episodes in _sizes(unlike.agg(pl.struct("score", "length_frames").n_unique().alias("results"))):
+        problems.append(
+            f"{player}: {num_episodes} of its episodes were found with several results, of which the first is kept; "
+            "two players have this name, or two versions of one; give each a name of its own"
+        )
+    together = together.unique(("run_dir", *_IDENTITY), keep="first", maintain_order=True)
     outside = pl.col("trained_on").is_null() & pl.col("params").is_not_null()
     seen_before = pl.int_range(pl.len()).over(_IDENTITY) > 0
     together = together.filter(~(outside & seen_before))
@@ -128,6 +135,12 @@ def collect_evaluations(paths: Iterable[Path | str]) -> tuple[pl.DataFrame, list
                 "they were of one; leave out the records of the others"
             )
     return together, problems
+
+
+def _sizes(found: pl.DataFrame) -> list[tuple[str, int]]:
+    """Each player with its number of episodes that have several results."""
+    several = found.filter(pl.col("results") > 1).group_by("player", maintain_order=True).len()
+    return [(player, count) for player, count in several.iter_rows()]
 
 
 def _is_of_run(file: Path) -> bool:

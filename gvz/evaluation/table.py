@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from gvz.evaluation.play import Row
-from gvz.evaluation.statistics import bootstrap
+from gvz.evaluation.statistics import bootstrap, normalize
 from gvz.tasks import Task
 
 
@@ -25,7 +25,8 @@ def score_rows(
         JSON types: task, level and score (None of several tasks), episodes, normalized_score, and player_kills (None
         where the score is not kills); each estimate with the ends of its 95% interval, as score_low and score_high.
     """
-    chosen = [row for row in rows if identity.items() <= row.items() and row["episode"] < episodes]
+    mine = [row for row in rows if identity.items() <= row.items() and row["episode"] < episodes]
+    chosen = {(row["task"], row["episode"], row.get("base_seed", 0)): row for row in mine}.values()  # each once
     by_task = {task: [row for row in chosen if row["task"] == task.id] for task in tasks}
     played = {task: mine for task, mine in by_task.items() if mine}
     found = [_score_row({task: mine}) for task, mine in played.items()]
@@ -42,13 +43,23 @@ def _score_row(played: Mapping[Task, Sequence[Row]]) -> dict[str, Any]:
     known = {
         "score": not others,
         "normalized_score": True,
-        "player_kills": all(task.scenario.metric == "kills" for task in played),
+        "player_kills": all(
+            task.scenario.metric == "kills" and all("player_kills" in row for row in mine)
+            for task, mine in played.items()
+        ),
     }
     for name, is_known in known.items():
-        columns = [np.array([one[name] for one in mine]) for mine in played.values()] if is_known else []
+        columns = [np.array([_value(name, one, t) for one in mine]) for t, mine in played.items()] if is_known else []
         e = bootstrap(columns) if is_known else None
         row |= {name: e and e.value, f"{name}_low": e and e.low, f"{name}_high": e and e.high}
     return row
+
+
+def _value(name: str, row: Row, task: Task) -> float:
+    """Rows of earlier versions have no normalized score."""
+    if name == "normalized_score" and name not in row:
+        return normalize(row["score"], task.scenario.upper_bound(row.get("profile", "thesis")))
+    return row[name]
 
 
 def score_lines(found: Sequence[Mapping[str, Any]]) -> list[str]:

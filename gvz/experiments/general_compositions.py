@@ -8,7 +8,7 @@ EXPERIMENT = dataclasses.replace(
     SEGMENTED,
     name="general_compositions",
     title="Generalization when attributes come together in training",
-    question="What do unseen tasks gain when training has any number of the attributes that it has anyway?",
+    question="Are unseen tasks played better if training also combines any number of the eight tasks' attributes?",
     trainings=("compositions",),
     columns="training",
     notes=(

@@ -8,7 +8,7 @@ EXPERIMENT = dataclasses.replace(
     SHORT,
     name="general_pairs",
     title="Generalization when attributes come in pairs",
-    question="What do unseen tasks gain when training has pairs of the attributes that it has anyway?",
+    question="Are unseen tasks played better if training also combines each two of the eight tasks' attributes?",
     trainings=("pairs",),
     seeds=(1111, 2222),
     players=(),

@@ -8,7 +8,7 @@ EXPERIMENT = dataclasses.replace(
     SHORT,
     name="general_segmented",
     title="Generalization with a segmentation network",
-    question="How well does an agent play unseen tasks that sees what a network takes the screen for?",
+    question="How well does an agent play unseen tasks that sees what a network recognizes on the screen?",
     configs=("rainbow_segmented",),
     columns="config",
     players=(),

@@ -164,9 +164,9 @@ class Schedule:
 
     def stop(self) -> None:
         """Asks the running jobs to save themselves and waits for that."""
-        self._bars.say(f"stopping: {len(self._running)} jobs save themselves; once more to end at once")
         for running in self._running:
             running.process.stop()
+        self._bars.say(f"stopping: {len(self._running)} jobs save themselves; once more to end at once")
         clock = AwakeClock(2 * POLL_S)
         while any(running.process.poll() is None for running in self._running):
             if clock.look() > STOP_TIMEOUT_S:

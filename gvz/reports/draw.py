@@ -5,6 +5,7 @@ Each is written as SVG, PDF and PNG; the page holds the SVG.
 """
 
 import io
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,8 @@ from gvz.scenarios.base import Task
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
 """Okabe and Ito's, for readers with any colour vision; brown in place of yellow"""
 GREY = "#777777"
+LINE_LENGTH = 60
+"""characters of a line of a title or a legend; an agent's name may be longer"""
 DASHES = ("-", "--", ":", "-.")
 """lines after the eighth have the same colours again, dashed"""
 HATCHES = ("", "///", "...", "xxx")
@@ -240,7 +243,7 @@ def draw_rewards(out: Path, id: str, values: Mapping[str, Mapping[str, float]], 
 def _panel(title: str, xlabel: str, ylabel: str, inches: tuple[float, float] = PANEL_INCHES) -> tuple[Picture, Axes]:
     picture = Picture(figsize=inches)
     axes = picture.subplots()
-    axes.set(title=title, xlabel=xlabel, ylabel=ylabel)
+    axes.set(title=textwrap.fill(title, LINE_LENGTH), xlabel=xlabel, ylabel=ylabel)
     return picture, axes
 
 
@@ -253,8 +256,12 @@ def _legend(picture: Picture, axes: Axes) -> None:
     """Below the panel, where it hides nothing."""
     handles, _ = axes.get_legend_handles_labels()
     if handles:
-        columns = 1 if max(len(str(h.get_label())) for h in handles) > 26 else 2
-        picture.set_figheight(picture.get_figheight() + 0.17 * -(-len(handles) // columns))
+        labels = [textwrap.fill(str(h.get_label()), LINE_LENGTH) for h in handles]
+        for handle, label in zip(handles, labels, strict=True):
+            handle.set_label(label)
+        columns = 1 if max(map(len, labels)) > 26 else 2
+        lines = len(labels) + sum(label.count("\n") for label in labels)
+        picture.set_figheight(picture.get_figheight() + 0.17 * -(-lines // columns))
         picture.legend(loc="outside lower center", ncols=columns)
 
 

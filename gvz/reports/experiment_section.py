@@ -1,6 +1,7 @@
 """The section of an experiment: its table as in the thesis, aggregates, comparisons, curves."""
 
 import itertools
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -26,6 +27,8 @@ from gvz.reports.runs import TRAINING_SETS
 from gvz.reports.scores import Scores, estimate, estimate_groups, pick
 from gvz.tasks import LEVELS, parse_task, scenario_named
 
+MAX_ID_LENGTH = 100
+"""characters of a name in a file's name, which has at most 255"""
 _TABLE_OVER = {"gate": " on the gate tasks", "procedural": " on the maps of procedural-test"}
 """what the caption of a table says, by `evaluate_on`"""
 
@@ -242,8 +245,9 @@ def _learning_curves(results: Results, asked: PlannedExperiment, scenario: str, 
 
 
 def what_id(text: str) -> str:
-    """A name as part of a file name."""
-    return "".join(c if c.isalnum() else "_" for c in text)
+    """A name as part of a file name; one that is too long is cut and told from others by a checksum."""
+    id = "".join(c if c.isalnum() else "_" for c in text)
+    return id if len(id) <= MAX_ID_LENGTH else f"{id[:MAX_ID_LENGTH]}_{zlib.crc32(text.encode()):08x}"
 
 
 def _curves_by_level(results: Results, asked: PlannedExperiment, scenario: str, out: Path) -> list[Figure]:

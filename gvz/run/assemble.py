@@ -17,6 +17,7 @@ from actors.process_pool import ProcessPool
 from gvz.core.env_config import SIGHT_CLASSES, SIGHT_COLUMNS
 from gvz.core.errors import ConfigError
 from gvz.run.config import RunConfig, off_policy
+from gvz.run.curriculum_config import first_tasks
 from gvz.run.footprint import Footprint
 from gvz.scenarios.compiler import compile_task
 from gvz.segmentation import segmenter_of
@@ -104,6 +105,7 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
     cores = tuple(actor_cores(config.actors.placement, config.num_actors)) if plays_here else ()
     pool_config = PoolConfig(
         tasks=table.ids,
+        first_tasks=first_tasks(config.curriculum, table),
         num_actors=config.num_actors,
         games_per_actor=config.games_per_actor,
         seed=config.games_seed,

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 from rich.table import Column
 
-from gvz.run.progress import format_duration
+from gvz.run.progress import format_duration, stderr_console
 
 DRAW_PERIOD_S = 0.1
 
@@ -34,7 +34,7 @@ class Bars:
 
     def __init__(self, line_period_s: float, console: Console | None = None):
         """`line_period_s`: seconds between lines where the output is not a terminal; inf: none."""
-        self._console = Console(stderr=True) if console is None else console
+        self._console = stderr_console() if console is None else console
         name = TextColumn("{task.description}", table_column=Column(overflow="fold"))  # long: it may take two lines
         columns = (BarColumn(20), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"), name)
         self._progress = Progress(*columns, console=self._console, auto_refresh=False)

@@ -39,6 +39,12 @@ def steps_of(table: TaskTable) -> list[int]:
     return [sorted(set(difficulty)).index(one) for one in difficulty]
 
 
+def first_tasks(config: CurriculumConfig, table: TaskTable) -> tuple[int, ...]:
+    """Indices of the tasks that the games begin with, in turn."""
+    all_tasks = enumerate(steps_of(table))
+    return tuple(task for task, step in all_tasks if step == 0 or config.kind != "level")
+
+
 def check_curriculum(config: CurriculumConfig, table: TaskTable) -> None:
     """Raises ConfigError for a curriculum that has nothing to choose."""
     if config.kind == "level" and max(steps_of(table)) == 0:

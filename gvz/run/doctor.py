@@ -18,14 +18,12 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Literal
 
-import psutil
-
 from gvz.core import janitor
 from gvz.core.cache import cache_directory
 from gvz.engine.tuned import TUNED, describe_engine
 from gvz.engine.tuned.build_vizdoom import TUNED_VERSION
 from gvz.run.footprint import ACTOR_MEMORY_BYTES, ENGINE_SHM_BYTES, LEARNER_MEMORY_BYTES, format_bytes
-from gvz.run.machine import instruction_set, versions
+from gvz.run.machine import available_memory, instruction_set, versions
 
 State = Literal["ok", "note", "bad"]
 """bad: runs will fail; note: runs work, but not as well as they could"""
@@ -111,7 +109,7 @@ def check_cores() -> Finding:
 
 def check_memory() -> Finding:
     """Free memory, against the smallest run with one actor a core."""
-    free = int(psutil.virtual_memory().available)
+    free = available_memory()
     need = LEARNER_MEMORY_BYTES + len(os.sched_getaffinity(0)) * ACTOR_MEMORY_BYTES
     found = f"{format_bytes(free)} available; a small run takes {format_bytes(need)}"
     if free < need:

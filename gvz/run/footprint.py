@@ -3,10 +3,9 @@
 import shutil
 from dataclasses import dataclass
 
-import psutil
-
 from gvz.core import janitor
 from gvz.core.errors import ResourceError
+from gvz.run import machine
 
 ENGINE_SHM_BYTES = 11_000_000
 """the engine's own shared files; measured 10.8 MB at every render size (vizdoom 1.3.2)"""
@@ -112,7 +111,7 @@ def check(
         ResourceError: says what is too small, by how much, and how to get it.
     """
     shm_free = shutil.disk_usage(janitor.SHM_DIR).free if shm_free is None else shm_free
-    memory_free = int(psutil.virtual_memory().available) if memory_free is None else memory_free
+    memory_free = machine.available_memory() if memory_free is None else memory_free
     if footprint.shm_bytes > shm_free:
         need = -(-footprint.shm_bytes // 2**20)
         raise ResourceError(

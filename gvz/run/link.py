@@ -1,14 +1,13 @@
 """One process's end of its group: messages to all, values gathered from all, and who is gone. Standard library only."""
 
 import contextlib
-import os
 import socket
-import sys
 import threading
 import time
 from typing import Any
 
 from gvz.core.errors import ConfigError, GroupError, WaitTimeoutError
+from gvz.core.stop import exit_at_once
 from gvz.run.relay import close, decode, encode
 
 JOIN_TIMEOUT_S = 600.0
@@ -173,9 +172,7 @@ class Link:
         while not self._closed and time.monotonic() < deadline_s:
             time.sleep(0.1)
         if not self._closed:
-            sys.stderr.write(f"error: {self.failure}\n")
-            sys.stderr.flush()
-            os._exit(1)
+            exit_at_once(1, f"error: {self.failure}")
 
     def _complete(self, key: tuple[str, int]) -> bool:
         return len(self._values.get(key, ())) == self._num_processes

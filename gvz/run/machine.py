@@ -76,6 +76,38 @@ def hardware() -> dict[str, Any]:
     }
 
 
+def available_memory(control_groups: Path = Path("/sys/fs/cgroup"), own_groups: str | None = None) -> int:
+    """Bytes that this process can still take: of the machine's memory, within the limits of a container or batch job.
+
+    Args:
+        control_groups: where the control groups of Linux are mounted, version 1 or 2 (cgroups(7)).
+        own_groups: the text of /proc/self/cgroup; by default it is read.
+    """
+    if own_groups is None:
+        file = Path("/proc/self/cgroup")
+        own_groups = file.read_text() if file.exists() else ""
+    free = [int(psutil.virtual_memory().available)]
+    for line in own_groups.splitlines():
+        _, controllers, path = line.split(":", 2)
+        if controllers in ("", "memory"):
+            top = control_groups / controllers  # in a container, it is that of the container
+            own = Path(path.strip("/"))
+            for directory in (top / own, *(top / parent for parent in own.parents)):
+                with contextlib.suppress(OSError, ValueError):  # it has no limit, or another container has it
+                    free.append(_room_in(directory))
+    return max(0, min(free))
+
+
+def _room_in(group: Path) -> int:
+    """Bytes to the memory limit of a control group. What it holds of files gives way."""
+    limit, used, prefix = "memory.max", "memory.current", ""
+    if not (group / limit).exists():
+        limit, used, prefix = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_"
+    lines = (line.split() for line in (group / "memory.stat").read_text().splitlines())
+    files = sum(int(count) for name, count in lines if name in (f"{prefix}active_file", f"{prefix}inactive_file"))
+    return int((group / limit).read_text()) - int((group / used).read_text()) + files
+
+
 def free_device_memory() -> int | None:
     """Bytes that JAX can still take of this process's first device; None if it does not say, as on a CPU."""
     import jax

@@ -48,6 +48,7 @@ class Monitor:
         self._config, self._progress, self._telemetry, self._counts = config, progress, telemetry, counts
         self._num_actors = config.num_actors  # before cores are kept for actors: it may follow from their number
         self._num_slots, self._batch_size = parts.learner.num_slots, parts.learner.batch_size
+        self._publish_period_updates = _publish_period_updates(config, parts)
         self._expected, self._warned = _expected(config, parts), set[str]()
         self._rates, self._last_look_s, self._loss = Rates(), 0.0, float("nan")
         self._fill_share: float | None = None
@@ -122,7 +123,7 @@ class Monitor:
             num_updates=counts.updates,
             total_updates=learner.total_updates,
             row=row,
-            staleness_updates=row["actors/staleness_mean_versions"] * learner.publish_period_updates,
+            staleness_updates=row["actors/staleness_mean_versions"] * self._publish_period_updates,
             loss=self._loss,
             tasks=self._telemetry.task_statuses(),
         )
@@ -143,5 +144,10 @@ def _expected(config: RunConfig, parts: RunParts) -> Expected:
         v_min=v_min,
         v_max=v_max,
         distributional=config.support is not None,
-        staleness_versions=1 + waiting / config.env_steps_per_update / learner.publish_period_updates,
+        staleness_versions=1 + waiting / config.env_steps_per_update / _publish_period_updates(config, parts),
     )
+
+
+def _publish_period_updates(config: RunConfig, parts: RunParts) -> int:
+    """Gradient steps between two publications, on average."""
+    return max(config.learner.publish_period_updates, parts.learner.num_updates_per_call)

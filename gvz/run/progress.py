@@ -1,10 +1,13 @@
 """What a person sees while a run goes on: a live panel on a terminal, plain lines elsewhere."""
 
+import contextlib
 import math
+import os
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass
+from typing import Any, TextIO, cast
 
 from rich.columns import Columns
 from rich.console import Console, Group
@@ -139,11 +142,43 @@ def panel(status: Status, width: int) -> Group:
     return Group(head, bar, rates, *restarts, tasks)
 
 
+class _Lossy:
+    """A text stream that loses what it cannot write: progress that nobody can see is no reason to end a run."""
+
+    def __init__(self, stream: TextIO):
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> None:
+        with self._lossy():
+            self._stream.write(text)
+
+    def flush(self) -> None:
+        with self._lossy():
+            self._stream.flush()
+
+    @contextlib.contextmanager
+    def _lossy(self) -> Generator[None]:
+        try:
+            yield
+        except BrokenPipeError:  # nobody will ever read it, and Python writes what is left at the end of the process
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+        except OSError:  # such as a full disk, which may have room again
+            pass
+
+
+def stderr_console() -> Console:
+    """Standard error, for what a person sees of long work. What cannot be written is lost, without an error."""
+    return Console(stderr=True) if sys.stderr is None else Console(file=cast(TextIO, _Lossy(sys.stderr)))
+
+
 class Progress:
     """Shows statuses. Use as a context manager; messages go through `say` so that they do not tear the panel."""
 
     def __init__(self, console: Console | None = None):
-        self._console = console if console is not None else Console(file=sys.stderr)
+        self._console = stderr_console() if console is None else console
         self._live: Live | None = None
         self._next_line_s = 0.0
 

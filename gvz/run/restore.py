@@ -26,6 +26,11 @@ def restore(run: RunDir, template: Any, group: Group, say: Callable[[str], None]
                 f"{run.checkpoints}: there are checkpoints of updates {steps}, but another learner process has none of "
                 "these; bring its run directory back, or give all another --run-dir"
             )
+        if run.checkpoints.is_symlink() and not run.checkpoints.exists():
+            raise CheckpointError(
+                f"{run.checkpoints}: leads to {run.checkpoints.readlink()}, which is not there; mount its disk, or "
+                "remove the link to begin a new run"
+            )
         say(f"new run in {run.path}")
         run.truncate_records(dict.fromkeys(run.record_lengths(), 0))
         run.discard_after(0)

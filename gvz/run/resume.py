@@ -1,5 +1,6 @@
 """What may change in the configuration of a run that is resumed."""
 
+from pathlib import PurePath
 from typing import Any
 
 from gvz.core.env_config import leaves
@@ -79,5 +80,7 @@ def _values(config: RunConfig) -> dict[str, Any]:
         "tasks": config.table.ids,
         "actors.num_actors": config.num_actors,
         "actors.games_per_actor": config.games_per_actor,
+        "agent.name": str(PurePath(config.agent.name)),  # of a file, ./own.py and own.py are one
+        "agent.encoder": str(PurePath(config.agent.encoder)),
     }
     return {k: v for k, v in {**dict(leaves(config)), **derived}.items() if k not in ("scenario", "training_set")}

@@ -121,7 +121,8 @@ def check_renames(directory: Path) -> Finding:
     inside.mkdir()
     file = inside / "file"
     file.write_bytes(bytes(8192))
-    renamer = subprocess.Popen([sys.executable, "-c", _RENAMER, str(inside), str(NUM_RENAMES)])
+    command = [sys.executable, "-c", _RENAMER, str(inside), str(NUM_RENAMES)]
+    renamer = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     num_reads, bad = 0, ""
     try:
         while not bad and renamer.poll() is None:
@@ -133,10 +134,12 @@ def check_renames(directory: Path) -> Finding:
             num_reads += 1
             if len(seen) != 8192 or len(set(seen)) != 1:
                 bad = "a file was half old and half new while it was replaced"
-        renamer.wait(_TIMEOUT_S)
+        _, error = renamer.communicate(timeout=_TIMEOUT_S)
+        if not bad and renamer.returncode:
+            bad = f"a file could not be replaced: {error.splitlines()[-1]}"
     finally:
         renamer.kill()
-        renamer.wait(_TIMEOUT_S)
+        renamer.communicate()
         for left in inside.iterdir():
             left.unlink()
         inside.rmdir()

@@ -31,7 +31,7 @@ from gvz.task_table import TaskTable
 from gvz.transport.messages import EpisodeStats, Fault
 
 RECENT_EPISODES = 30
-"""episodes in a task's recent score (thesis 4.3.2 uses 30 for its KPI)"""
+"""episodes in a task's recent score (as `learner.kpi_window_episodes`)"""
 UPLOAD_TIMEOUT_S = 600.0
 """for what is not yet with Weights & Biases when a run ends; the rest stays in `wandb/`, for `wandb sync`"""
 

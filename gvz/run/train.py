@@ -154,7 +154,8 @@ class Trainer:
         """Parameters -> actors, every period, and once when warm-up ends: actors then act by the agent."""
         counts, learner = self._counts, self._config.learner
         warmed_up = counts.published_env_steps < learner.warmup_steps <= counts.env_steps
-        if warmed_up or counts.updates >= counts.published_updates + learner.publish_period_updates:
+        period = learner.publish_period_updates  # a mean: a call makes several gradient steps on a GPU
+        if warmed_up or counts.updates // period > counts.published_updates // period:
             self._published_params = self._learner.acting_params()
             counts.version += 1
             counts.published_updates, counts.published_env_steps = counts.updates, counts.env_steps

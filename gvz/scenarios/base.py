@@ -256,7 +256,7 @@ class Scenario:
         from gvz.tasks import scenario_named  # which imports this module
 
         own: dict[str, float] = {}
-        for name, weight in weights.items():
+        for name, weight in sorted(weights.items(), key=lambda pair: "." in str(pair[0])):  # the own ones come last
             scenario, dot, component = str(name).rpartition(".")
             if dot and scenario != self.id:
                 scenario_named(scenario).reward_weights({component: weight})

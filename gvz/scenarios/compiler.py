@@ -237,7 +237,8 @@ def acs_value(value: Value) -> str:
         case Uniform(low, high):
             return f"Random({acs_value(low)}, {acs_value(high)})"
         case float():
-            return f"{value:.6f}".rstrip("0").removesuffix(".") + ("" if value % 1 else ".0")
+            text = f"{value:.6f}".rstrip("0")
+            return f"{text}0" if text.endswith(".") else text
         case tuple():
             return "{" + ", ".join(f'"{v}"' if isinstance(v, str) else acs_value(v) for v in value) + "}"
         case _:

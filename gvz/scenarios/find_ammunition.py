@@ -7,8 +7,8 @@ Observation: the screen with weapon and HUD; variables KILLCOUNT, AMMO2, HEALTH,
 Reward: [kill] + 0.5 [clip taken] - 0.5 [decoy taken] + 0.01 - [death].
 Start: a random place of a room, a random angle, and a pistol without bullets. 12 clips of 2 bullets lie at other random
     places of 25, at least 150 units (in x and y together) from the agent; no more come. 6 demons of 1 health walk
-    towards the agent at speed 4 (Doom's: 10). 60 tics after its death one comes back, at least 400 units away. The
-    agent takes a quarter of the damage.
+    towards the agent at speed 4 (Doom's: 10). 60 tics after its death one comes back, at least 400 units (in
+    x and y together) away. The agent takes a quarter of the damage.
 Termination: the agent dies. Truncation: after 1400 tics.
 Metric: kills; a score is at most 24, as there are 24 bullets. An agent that knows all places, misses nothing and is
     never hindered kills the last one after 1240 tics on average (a simulation). No enemy hurts another.

@@ -6,9 +6,8 @@ import numpy as np
 from gymnasium.spaces import Discrete, MultiDiscrete
 from gymnasium.vector import AutoresetMode
 
-from gvz.core.env_config import as_integer, typed
+from gvz.core.env_config import given_episode_seed, typed
 from gvz.core.errors import ConfigError
-from gvz.env import EPISODE_SEEDS
 from gvz.scenarios.base import Task
 from gvz.tasks import id_for_processes
 
@@ -103,13 +102,7 @@ def reset_options(options: dict[str, object] | None, num_envs: int) -> tuple[int
         ValueError: an unknown option, an episode seed outside [0, 2^31), or what is no mask.
     """
     options = options or {}
-    if unknown := options.keys() - {"episode_seed", "reset_mask"}:
-        raise ValueError(f"reset: unknown options {sorted(unknown)}, want episode_seed or reset_mask")
-    episode_seed, mask = options.get("episode_seed"), options.get("reset_mask")
-    if episode_seed is not None:
-        if not 0 <= (number := as_integer(episode_seed)) < EPISODE_SEEDS:
-            raise ValueError(f"reset: episode_seed {episode_seed!r}, want an integer, 0..{EPISODE_SEEDS - 1}")
-        episode_seed = number
+    episode_seed, mask = given_episode_seed(options, ("reset_mask",)), options.get("reset_mask")
     if mask is None:
         return episode_seed, np.ones(num_envs, bool)
     if not isinstance(mask, np.ndarray) or mask.dtype != bool or mask.shape != (num_envs,) or not mask.any():

@@ -14,9 +14,9 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from gvz.core.env_config import EnvConfig
+from gvz.core.env_config import EPISODE_SEEDS, EnvConfig
 from gvz.core.errors import ConfigError, GvzError
-from gvz.env import EPISODE_SEEDS, DoomEnv
+from gvz.env import DoomEnv
 from gvz.observation import Observation
 from gvz.scenarios.base import Task
 from gvz.transport.messages import Decision, Outcome, VectorSpec

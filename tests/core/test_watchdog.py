@@ -4,6 +4,8 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
+from typing import IO
 
 import pytest
 
@@ -27,9 +29,9 @@ with Watchdog("the learner", 1.0) as watchdog:
 """
 
 
-def begin(body: str) -> subprocess.Popen[str]:
+def begin(body: str, stderr: IO[str] | int = subprocess.PIPE) -> subprocess.Popen[str]:
     code = STUCK.format(body=body)
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=stderr, text=True)
     assert process.stdout is not None
     assert process.stdout.readline() == "begun\n"
     return process
@@ -43,6 +45,11 @@ def test_a_stuck_process_is_ended_and_shows_where_it_hangs(where):
     assert process.returncode == -signal.SIGVTALRM
     assert err.startswith("error: the learner gave no sign of life for 1 s and is ended; the stacks of its threads")
     assert f"in {where}" in err
+
+
+def test_a_stuck_process_whose_standard_error_cannot_be_written_is_ended_too():
+    with Path("/dev/full").open("w") as full, begin("wait_for_the_device()", full) as process:
+        assert process.wait(60) == -signal.SIGVTALRM
 
 
 def test_the_watchdog_of_a_killed_process_ends_with_it():

@@ -1,5 +1,6 @@
 """A file that an engine cannot start on is found out in a sub-process, with the engine's own words."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -55,6 +56,12 @@ def test_a_file_that_is_loaded_with_complaints_is_an_error(tmp_path: Path):
     wad = with_decorate(tmp_path / "odd.wad", decorate + "\nACTOR Foo { }\nACTOR Foo { }\n")
     with pytest.raises(EngineError, match="cannot be played: Tried to register class 'Foo' more than once"):
         probe_wad(wad)
+
+
+def test_the_place_of_a_file_is_no_complaint(tmp_path: Path):
+    place = tmp_path / "unknown" / "no map not found"
+    place.mkdir(parents=True)
+    assert "adding" in probe_wad(Path(shutil.copy(STOCK_WAD, place)))
 
 
 def test_a_file_without_the_map_is_an_error():

@@ -86,6 +86,14 @@ def test_episodes_of_a_run_are_there_once_with_those_of_a_file_elsewhere(tmp_pat
     assert frame.select("episode", "run_dir").rows() == [(0, str(run_dir)), (1, str(tmp_path))]
 
 
+def test_two_players_of_one_name_are_told_of(tmp_path):
+    (tmp_path / "mine.jsonl").write_text(line(player="human") + line(player="human", episode=1))
+    (tmp_path / "yours.jsonl").write_text(line(player="human", score=5.0) + line(player="human", episode=1))
+    frame, (problem,) = collect_evaluations([tmp_path])
+    assert problem.startswith("human: 1 of its episodes were found with several results, of which the first is kept")
+    assert frame["score"].to_list() == [550.0, 550.0]
+
+
 def test_two_policies_of_one_name_are_told_of(tmp_path):
     policy = {"player": "r/seed_1@9", "run": "r", "run_seed": 1, "num_updates": 9}
     (tmp_path / "mine.jsonl").write_text(line(**policy, params="abc") + line(**policy, params="def"))

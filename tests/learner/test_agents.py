@@ -162,6 +162,9 @@ def test_parts_that_do_not_fit_together_are_refused():
         replace(RAINBOW, hidden_input_share=0.2)
     with pytest.raises(ConfigError, match=r"agent\.sight_augmentations: got inversion without a loss that reads them"):
         replace(RAINBOW, sight_augmentations=("inversion",))
+    for field, value in (("noisy_epsilon", 0.1), ("noisy_period_steps", 16)):
+        with pytest.raises(ConfigError, match=f"agent.{field}: got {value} without noise; set agent."):
+            replace(RAINBOW, noisy="off", **{field: value})  # pyright: ignore[reportArgumentType]
     with pytest.raises(ConfigError, match=r"agent\.munchausen: got True with atoms, for which no form is published"):
         replace(RAINBOW, munchausen=True)
     with pytest.raises(ConfigError, match=r"agent\.num_quantiles: got quantiles of no distribution"):

@@ -269,8 +269,6 @@ def test_values_of_a_delayed_reward_are_learnt_sooner_with(part: dict[str, Any],
     plain, with_part = value_error(learning_seed, OFF), value_error(learning_seed, replace(OFF, **part))
     record_property("without", plain)
     record_property("with", with_part)
-    record_property("without", plain)
-    record_property("with", with_part)
     record_property("ratio of errors", with_part / plain)
     assert with_part < 0.5 * plain
 

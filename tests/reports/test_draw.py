@@ -7,6 +7,7 @@ import numpy as np
 from gvz.evaluation.statistics import Estimate
 from gvz.reports.document import Figure
 from gvz.reports.draw import COLOURS, draw_histogram, draw_levels, draw_rewards
+from gvz.reports.experiment_section import what_id
 
 AGENTS = [f"agent {number}" for number in range(2 * len(COLOURS) + 3)]
 
@@ -28,3 +29,15 @@ def test_no_two_agents_look_alike(tmp_path):
     for figure in figures:
         looks = _looks(figure)
         assert len(looks) == len(set(looks)) == len(AGENTS), figure.id
+
+
+def test_a_very_long_name_is_wrapped_and_its_file_can_be_written(tmp_path, recwarn):
+    """As that of an agent that differs from another in many settings."""
+    names = [f"rainbow_quick ({', '.join(f'learner.setting_{n} {n}' for n in range(20))}, seed {s})" for s in (1, 2)]
+    assert len({what_id(name) for name in names}) == 2
+    estimate = Estimate(value=50.0, low=40.0, high=60.0)
+    for name in names:
+        draw_levels(tmp_path, what_id(name), name, (0, 1), dict.fromkeys(names, (estimate, estimate)), name)
+    assert len(list(tmp_path.rglob("*.svg"))) == 2
+    assert not recwarn.list
+    assert what_id("a (b 0.5)") == "a__b_0_5_"

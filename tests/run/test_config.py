@@ -15,12 +15,14 @@ from gvz.actions import UNIFIED_V1
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError, TaskError
 from gvz.launch import main, parse, resumed_config
-from gvz.run.config import RunConfig
+from gvz.run.config import RunConfig, with_agent
 from gvz.run.config_files import config_from_dict, config_to_dict, configs_directory, load_config
 from gvz.run.resume import differences
 from gvz.run.rundir import RunDir
 from gvz.tasks import scenario_named
+from learner.agents.configs.dqn import DQNConfig
 from learner.agents.configs.ppo import PPOConfig
+from learner.agents.configs.pqn import PQNConfig
 from learner.augment import AUGMENTATIONS
 from learner.config import Augmentation, LearnerConfig, OnPolicyConfig, ReplayConfig
 
@@ -152,6 +154,9 @@ def test_a_weight_may_be_of_one_scenario():
         for scenario in map(scenario_named, ("seek_and_kill", "defend_the_center"))
     ]
     assert [(found["kill"], found.get("moved")) for found in by_scenario] == [(2.0, 0.0), (2.0, None)]
+    for name in ("defend_the_center", "seek_and_kill"):  # it goes before that of all, in whatever order
+        assert scenario_named(name).reward_weights({f"{name}.kill": 5.0, "kill": 1.0})["kill"] == 5.0
+        assert scenario_named(name).reward_weights({"kill": 1.0, f"{name}.kill": 5.0})["kill"] == 5.0
     with pytest.raises(TaskError, match="unknown scenario 'seek_an_kill'"):
         scenario_named("defend_the_center").reward_weights({"seek_an_kill.moved": 0.0})
     with pytest.raises(ConfigError, match="unknown component 'move'"):
@@ -184,6 +189,9 @@ BAD = {
     "--tasks defend_the_center/gor": "gore",
     "--tasks defend_the_center/gore --scenario seek_and_kill": "--scenario: got seek_and_kill and also --tasks",
     "--tasks defend_the_center/gore --training-set=4": "--training-set: got 4 and also --tasks",
+    "--tasks defend_the_center/gore --training_set 4": "--training-set: got 4 and also --tasks",
+    "--config rainbow_all --training-set 8": "--training-set: got 8 and also the tasks of rainbow_all",
+    "--config rainbow_all.py --scenario=seek_and_kill": "--scenario: got seek_and_kill and also the tasks of rainbow_a",
     "--tasks defend_the_center/gore health_gathering/lava": "want one scenario",
     "--tasks defend_the_center/gore defend_the_center/gore": "one task twice",
     "--scenario doom": "defend_the_center",
@@ -348,6 +356,14 @@ def test_an_agent_that_learns_on_policy_brings_its_kind_of_learner():
     assert run.agent == PPOConfig(clip=0.1)
     back = parse("--config pqn_quick --agent.name dqn".split()).run
     assert (back.learner, back.replay) == (LearnerConfig(total_updates=5_000), ReplayConfig())
+
+
+def test_another_agent_has_its_own_defaults_beside_what_the_config_file_sets():
+    quick = load_config("pqn_quick").agent
+    assert with_agent(load_config("rainbow_4task"), "pqn").agent == PQNConfig()
+    assert with_agent(load_config("rainbow_4task"), "dqn").agent == DQNConfig()
+    ppo = with_agent(load_config("pqn_quick"), "ppo").agent
+    assert (ppo.encoder, ppo.td_lambda, ppo.conv_channels) == ("nature", PPOConfig().td_lambda, quick.conv_channels)
 
 
 def test_help_shows_the_options_of_the_runs_learner_alone(capsys):

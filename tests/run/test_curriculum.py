@@ -1,16 +1,19 @@
 """Curricula: which task is drawn, and that a run goes on with the same draws."""
 
 import dataclasses
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 
+from actors.pool import lanes_to_begin_with
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError
+from gvz.run.assemble import assemble
 from gvz.run.config_files import load_config
 from gvz.run.curriculum import Curriculum
-from gvz.run.curriculum_config import CurriculumConfig
+from gvz.run.curriculum_config import CurriculumConfig, first_tasks, steps_of
 from gvz.task_table import task_table
 from gvz.transport.messages import EpisodeStats
 
@@ -38,6 +41,16 @@ def play(lessons: Curriculum, percent_of, episodes: int) -> list[int]:
             lessons.next_task(ended(drawn[-1]), percent_of(drawn[-1], number) if callable(percent_of) else percent_of)
         )
     return drawn[1:]
+
+
+def test_games_begin_with_tasks_of_open_levels():
+    assert first_tasks(CurriculumConfig(kind="level"), TABLE) == (0,)
+    assert first_tasks(CurriculumConfig(kind="uniform"), TABLE) == (0, 1, 2, 3)
+    config = load_config("rainbow_4task")
+    pool = assemble(dataclasses.replace(config, curriculum=CurriculumConfig(kind="level")), Path()).pool_config
+    easiest = np.flatnonzero(np.equal(steps_of(config.table), 0))
+    assert sorted(set(lanes_to_begin_with(pool, None).tasks)) == list(easiest)
+    assert 0 < len(easiest) < len(config.table)
 
 
 def test_a_fixed_game_keeps_its_task():

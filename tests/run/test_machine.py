@@ -7,6 +7,7 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
+import psutil
 import pytest
 
 from gvz.run import machine
@@ -30,6 +31,29 @@ def checkout(tmp_path, monkeypatch) -> Path:
     git(tmp_path, "commit", "--quiet", "-m", "first")
     monkeypatch.setattr(machine, "ROOT", tmp_path)
     return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("group", "own_groups", "files"),
+    [
+        ("job", "0::/job/step\n", ("memory.max", "memory.current", "")),
+        ("memory/job", "4:memory:/job/step\n0::/\n", ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_")),
+        ("", "0::/\n", ("memory.max", "memory.current", "")),  # within a container
+        ("memory", "4:memory:/docker/1f\n", ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_")),
+    ],
+)
+def test_memory_has_the_limits_of_containers_and_batch_jobs(tmp_path, group, own_groups, files):
+    limit, used, prefix = files
+    directory = tmp_path / group
+    (directory / "step").mkdir(parents=True)
+    (directory / limit).write_text("3000000\n")
+    (directory / used).write_text("2500000\n")
+    (directory / "memory.stat").write_text(f"anon 1\n{prefix}inactive_file 400000\n{prefix}active_file 30000\n")
+    (directory / "step" / limit).write_text("max\n" if limit == "memory.max" else f"{2**63 - 4096}\n")
+    (directory / "step" / used).write_text("2500000\n")
+    (directory / "step" / "memory.stat").write_text("")
+    assert machine.available_memory(tmp_path, own_groups) == 930_000
+    assert 930_000 < machine.available_memory(tmp_path / "none", own_groups) <= psutil.virtual_memory().total
 
 
 def test_all_of_it_is_json_and_of_this_machine():

@@ -1,9 +1,14 @@
 """What a person sees: every number on the panel and in the plain line, on a terminal and off it."""
 
+import contextlib
 import dataclasses
 import io
 import math
+import os
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -72,6 +77,33 @@ def test_off_a_terminal_lines_are_printed_rarely(monkeypatch):
     lines = out.getvalue().splitlines()
     assert len(lines) == 3
     assert lines[1] == "checkpoint written"
+
+
+SPEAKING = """
+from gvz.run.bars import Bar, Bars
+from gvz.run.progress import Progress
+with Progress() as progress, Bars(0.0) as bars:
+    for speaker in (progress, bars) * 2:
+        speaker.say("a line")
+        bars.show([Bar(name="jobs", done=1, total=2, unit="jobs")])
+print("goes on")
+"""
+
+
+@pytest.mark.parametrize("where", ["pipe without a reader", "full disk", "closed"])
+def test_progress_that_nobody_can_see_stops_nothing(where):
+    """As in `gvz train 2>&1 | tee log`, of which Ctrl-C ends both."""
+    with contextlib.ExitStack() as until_closed:
+        if where == "full disk":
+            stderr = until_closed.enter_context(Path("/dev/full").open("w"))
+        else:
+            reading, stderr = os.pipe()
+            os.close(reading)
+            until_closed.callback(os.close, stderr)
+        closing = [] if where != "closed" else ["bash", "-c", 'exec "$@" 2>&-', "bash"]
+        command = [*closing, sys.executable, "-c", SPEAKING]
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=stderr, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stdout) == (0, "goes on\n")
 
 
 @pytest.mark.parametrize("width", [60, 80, 120])

@@ -9,9 +9,12 @@ from pathlib import Path
 
 import pytest
 
+import gvz
 from gvz.core import records
-from gvz.core.errors import ConfigError, GvzError, ResumeError
+from gvz.core.errors import CheckpointError, ConfigError, GvzError, ResumeError
 from gvz.run.config_files import load_config
+from gvz.run.group import Alone
+from gvz.run.restore import restore
 from gvz.run.rundir import RunDir, move_aside
 from tests.full_disk import full_disk
 
@@ -32,6 +35,27 @@ def test_the_directory_of_process_0_is_private_also_if_another_process_of_the_gr
         assert stat.S_IMODE((tmp_path / "runs" / "one").stat().st_mode) == 0o700
         assert stat.S_IMODE((tmp_path / "runs").stat().st_mode) == 0o777
     os.umask(before)
+
+
+def test_a_run_goes_on_with_its_own_file_however_its_path_is_written(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.py").write_text((Path(gvz.__file__).parents[1] / "learner" / "encoders" / "nature.py").read_text())
+    agent = dataclasses.replace(CONFIG.agent, encoder="./own.py")
+    with RunDir(tmp_path / "run") as run:
+        run.write_config(dataclasses.replace(CONFIG, agent=agent))
+        for path in ("./own.py", "own.py", f"{tmp_path}/own.py"):
+            assert (
+                run.check_resumable(dataclasses.replace(CONFIG, agent=dataclasses.replace(agent, encoder=path))) == []
+            )
+
+
+def test_checkpoints_on_a_disk_that_is_not_there_are_no_new_run(tmp_path):
+    with RunDir(tmp_path / "run") as run:
+        run.append("metrics.jsonl", {"row": 1})
+        run.checkpoints.symlink_to(tmp_path / "not mounted")
+        with pytest.raises(CheckpointError, match=r"checkpoints: leads to .*not mounted, which is not there"):
+            restore(run, None, Alone(), print)
+    assert (tmp_path / "run" / "metrics.jsonl").read_text()
 
 
 @pytest.mark.parametrize("folder", ["policies", "checkpoints"])

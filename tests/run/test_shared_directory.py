@@ -67,6 +67,15 @@ def test_where_a_file_is_replaced_in_two_steps_renames_are_found_bad(tmp_path, m
     assert list(tmp_path.iterdir()) == []
 
 
+def test_where_a_file_cannot_be_replaced_renames_are_found_bad(tmp_path, monkeypatch):
+    fails = "def no(*_): raise OSError(95, 'Operation not supported')\nimport os\nos.replace = no\n"
+    monkeypatch.setattr(shared_directory, "_RENAMER", fails + shared_directory._RENAMER)
+    finding = shared_directory.check_renames(tmp_path)
+    assert finding.state == "bad"
+    assert finding.found.endswith("a file could not be replaced: OSError: [Errno 95] Operation not supported")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_mark_is_known_by_its_place_text_and_lock(tmp_path):
     with shared_directory.mark(tmp_path) as (path, text):
         assert shared_directory.problem(path, text) == ""

@@ -15,11 +15,9 @@ from gvz.evaluation.play import play_episode
 from gvz.evaluation.players import CLASSES
 from gvz.evaluation.simple import player_env
 from gvz.observation import label_class
-from gvz.scenarios.base import Task
 from gvz.scenarios.compiler import map_source
 from gvz.scenarios.find_ammunition import DECOYS
 from gvz.scenarios.find_the_key import ROOM_SPOTS
-from gvz.scenarios.map_set import MapSet
 from gvz.tasks import parse_task, scenario_named
 from gvz.wad.udmf import parse_textmap
 from tests.scenarios.measure import Player
@@ -172,11 +170,12 @@ def test_clips_lie_at_the_places_of_find_the_key(name: str):
 
 
 @pytest.mark.engine
-def test_drawn_layouts_hold_all_enemies_and_clips():
-    with closing(DoomEnv(Task(scenario_named("find_ammunition"), maps=MapSet("test", 6)), buffers=("labels",))) as env:
-        for seed in range(6):
-            env.reset(options={"episode_seed": seed})
-            assert env._variables["SPAWNED"] == 6
+@pytest.mark.parametrize("name", ["procedural", "procedural-test"])
+def test_a_drawn_layout_holds_all_enemies_and_clips(start, name: str):
+    player = start(name)
+    player.step()
+    clips = sum(kind.startswith("Bullet") for kind, _, _ in player.objects())
+    assert (player["SPAWNED"], clips) == (6, 12)
 
 
 @pytest.mark.engine

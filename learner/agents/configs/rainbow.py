@@ -46,9 +46,10 @@ class RainbowConfig(ValueConfig):
     noisy_sigma: Annotated[float, Range(0.0, 10.0)] = 0.017
     """initial sigma of the noisy layers"""
     noisy_period_steps: Annotated[int, Range(1, 10**6)] = 1
-    """decisions of each game for which an actor keeps one draw of noise. 1: every decision of every game has its own.
-    More: all games of an actor share the draw, which is folded into the weights, so that acting costs as much as
-    without noise. Each decision's noise has the same distribution, but within a stretch the policy is deterministic"""
+    """decisions of each game for which an actor keeps one draw of noise. 1: every decision has its own, and with
+    factorized noise every game. More: all games of an actor share the draw, which is folded into the weights, so that
+    acting costs as much as without noise. Each decision's noise has the same distribution, but within a stretch the
+    policy is deterministic"""
     sight_weight: Annotated[float, Range(0.0, 1000.0)] = 0.0
     """weight of a further loss: tell from the encoder's features what is in sight, by class and column, as the engine's
     labels have it (game features, Lample and Chaplot 2017). Labels are needed in training alone; 0: off"""
@@ -67,6 +68,10 @@ class RainbowConfig(ValueConfig):
                 "agent.munchausen: got True with atoms, for which no form is published; set agent.num_quantiles, or "
                 "agent.distributional False"
             )
+        if self.noisy == "off" and self.noisy_period_steps != 1:
+            raise ConfigError(f"agent.noisy_period_steps: got {self.noisy_period_steps} without noise; set agent.noisy")
+        if self.noisy == "off" and self.noisy_epsilon:
+            raise ConfigError(f"agent.noisy_epsilon: got {self.noisy_epsilon} without noise; set agent.epsilon_end")
         if self.sight_augmentations and not self.learns_sight:
             raise ConfigError(
                 f"agent.sight_augmentations: got {' '.join(self.sight_augmentations)} without a loss that reads them; "
