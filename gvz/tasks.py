@@ -53,9 +53,10 @@ def parse_task(text: str) -> Task:
 
     Args:
         text: `<scenario>/default`, `<scenario>/complete` or `<scenario>/<attribute>+<attribute>...`, attributes
-            in any order and by any of their names (`fast` is `fast_enemies`), each perhaps with a severity from 0 to 1, such as `fast_enemies=0.5` (also `complete=0.5`);
-            or a set of drawn maps (gvz.scenarios.map_set), such as `<scenario>/varied-10`, which may have attributes,
-            too (`<scenario>/varied+fast_enemies`), or `<scenario>/procedural-train-100+layout=0.5`.
+            in any order and by any of their names (`fast` is `fast_enemies`), each perhaps with a severity from 0 to
+            1, such as `fast_enemies=0.5` (also `complete=0.5`); or a set of drawn maps (gvz.scenarios.map_set), such as
+            `<scenario>/varied-10`, which may have attributes, too (`<scenario>/varied+fast_enemies`), or
+            `<scenario>/procedural-train-100+layout=0.5`.
 
     Raises:
         TaskError: another form, an unknown name, or two attributes of one group; the message says what is possible.
