@@ -25,10 +25,11 @@ DESCRIPTION = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns the exit code: 0 done, 1 failed, 2 bad input, 130 interrupted."""
+    if sys.stdout is None:  # closed by who started us
+        sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115
     try:
         code = run(list(sys.argv[1:] if arguments is None else arguments))
-        if sys.stdout is not None:  # closed by who started us
-            sys.stdout.flush()
+        sys.stdout.flush()
         return code
     except GvzError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -95,13 +95,9 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         """
         options = options or {}
         episode_seed = given_episode_seed(options, ("task",))
+        given = self._game_of(options["task"]) if "task" in options else None
         super().reset(seed=seed)
-        task = options["task"] if "task" in options else self._sampler(self.np_random)
-        if task not in self._games:  # another spelling: an alias, attributes in another order
-            task = parse_task(task).id
-        if task not in self._games:
-            raise TaskError(f"reset: got task {task!r}, want one of {', '.join(self._games)}")
-        self._game = game = self._games[task]
+        self._game = game = self._game_of(self._sampler(self.np_random)) if given is None else given
         if game in self._running:
             self._running.remove(game)
         elif len(self._running) == self._max_engines:
@@ -110,6 +106,19 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         if episode_seed is None:
             episode_seed = int(self.np_random.integers(EPISODE_SEEDS))
         return game.reset(options={"episode_seed": episode_seed})
+
+    def _game_of(self, task: object) -> DoomEnv:
+        """The game of a task, named by any of its names.
+
+        Raises:
+            TaskError: as `reset`.
+        """
+        name = task.id if isinstance(task, Task) else str(task)
+        if name not in self._games:
+            name = parse_task(name).id
+        if name not in self._games:
+            raise TaskError(f"reset: got task {name!r}, want one of {', '.join(self._games)}")
+        return self._games[name]
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """As DoomEnv's."""

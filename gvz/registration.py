@@ -64,7 +64,8 @@ class _GymnasiumFinder:
 
             def load_and_register(module: ModuleType) -> None:
                 load(module)
-                sys.meta_path.remove(self)
+                if self in sys.meta_path:
+                    sys.meta_path.remove(self)
                 register_envs()
 
             spec.loader.exec_module = load_and_register

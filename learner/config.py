@@ -179,8 +179,9 @@ def change_agent(config: AgentConfig, name: str) -> AgentConfig:
     """
     kind = agent_config_class(name)
     wanted = {field.name for field in dataclasses.fields(kind)} - {"name"}
-    values = {f.name: (getattr(config, f.name), f.default) for f in dataclasses.fields(config) if f.name in wanted}
-    shared: dict[str, Any] = {name: value for name, (value, default) in values.items() if value != default}
+    default = type(config)()
+    values = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name in wanted}
+    shared: dict[str, Any] = {name: value for name, value in values.items() if value != getattr(default, name)}
     try:
         return kind(name=name, **shared)
     except ConfigError as error:

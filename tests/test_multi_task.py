@@ -1,5 +1,7 @@
 """Several tasks as one environment: the games are those of the single environments."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -8,6 +10,8 @@ import gvz
 from gvz.core.errors import ConfigError, TaskError
 from gvz.env import DoomEnv
 from gvz.multi_task import MultiTaskEnv
+from gvz.scenarios.base import Attribute, Content, Task, Textures
+from gvz.tasks import parse_task
 
 TASKS = ("defend_the_center/default", "seek_and_kill/default", "dodge_projectiles/default")
 
@@ -87,5 +91,23 @@ def test_bad_input_is_named():
         TaskError, match="got task 'defend_the_center/gore', want one of defend_the_center/default, seek"
     ):
         env.reset(options={"task": "defend_the_center/gore"})
-    with pytest.raises(TaskError, match="'doom'"):
-        env.reset(options={"task": "doom"})
+    before = env.np_random.bit_generator.state
+    for options in ({"task": "doom"}, {"task": ["doom"]}, {"task": TASKS[0], "episode_seed": -5}):
+        with pytest.raises((TaskError, ValueError), match=r"doom|episode_seed -5"):
+            env.reset(seed=9, options=options)
+    assert (env.np_random.bit_generator.state, env._running) == (before, [])
+
+
+@pytest.mark.engine
+def test_a_task_of_an_attribute_that_is_in_no_file_is_played():
+    (scenario,) = {parse_task(task).scenario for task in TASKS[:1]}
+    ice = Textures("FLAT14", "FWATER1", "CEIL4_3")
+    own = dataclasses.replace(
+        scenario,
+        attributes=(
+            *scenario.attributes,
+            Attribute(name="on_ice", groups=("textures",), content=Content(textures=ice)),
+        ),
+    )
+    with gvz.make([Task(own, ("on_ice",)), TASKS[0]]) as env:
+        assert {env.reset(seed=seed)[1]["task"] for seed in range(4)} == set(env.tasks)

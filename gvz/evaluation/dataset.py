@@ -69,6 +69,9 @@ _IDENTITY = ("player", "params", "profile", "action_set", "frame_skip", "task", 
 """rows of one directory that are equal in these are one and the same episode, and so are those outside a run directory
 whose policy is known by its weights"""
 
+_NUM_RESULTS = pl.max_horizontal(pl.col("score").n_unique(), pl.col("length_frames").drop_nulls().n_unique())
+"""of the rows of one episode"""
+
 _NOT_RECORDS = {"discarded", "work", "checkpoints", "policies", "tensorboard"}
 """directories of a run that hold no records, or only discarded ones"""
 
@@ -118,7 +121,7 @@ def collect_evaluations(paths: Iterable[Path | str]) -> tuple[pl.DataFrame, list
         problems += found
     together = pl.concat(frames, how="diagonal")
     unlike = together.filter(pl.col("params").is_null()).group_by("run_dir", *_IDENTITY, maintain_order=True)
-    for player, num_episodes in _sizes(unlike.agg(pl.struct("score", "length_frames").n_unique().alias("results"))):
+    for player, num_episodes in _sizes(unlike.agg(_NUM_RESULTS)):
         problems.append(
             f"{player}: {num_episodes} of its episodes were found with several results, of which the first is kept; "
             "two players have this name, or two versions of one; give each a name of its own"
@@ -139,7 +142,7 @@ def collect_evaluations(paths: Iterable[Path | str]) -> tuple[pl.DataFrame, list
 
 def _sizes(found: pl.DataFrame) -> list[tuple[str, int]]:
     """Each player with its number of episodes that have several results."""
-    several = found.filter(pl.col("results") > 1).group_by("player", maintain_order=True).len()
+    several = found.filter(pl.col("score") > 1).group_by("player", maintain_order=True).len()
     return [(player, count) for player, count in several.iter_rows()]
 
 

@@ -40,7 +40,11 @@ def wanted_episodes(tasks: Sequence[Task], episodes: int, base_seeds: Sequence[i
 def rows_of(player_spec: PlayerSpec, rows: Iterable[Row]) -> dict[Episode, Row]:
     """The rows of a record file that are this player_spec's. Rows older than base seeds are of base seed 0."""
     mine = player_spec.identity.items()
-    return {Episode(r["task"], r["episode"], r.get("base_seed", 0)): r for r in rows if mine <= r.items()}
+    found: dict[Episode, Row] = {}
+    for r in rows:  # of two rows of one episode, the first counts
+        if mine <= r.items():
+            found.setdefault(Episode(r["task"], r["episode"], r.get("base_seed", 0)), r)
+    return found
 
 
 def read_rows(file: Path) -> list[Row]:

@@ -26,8 +26,10 @@ def score_rows(
         where the score is not kills); each estimate with the ends of its 95% interval, as score_low and score_high.
     """
     mine = [row for row in rows if identity.items() <= row.items() and row["episode"] < episodes]
-    chosen = {(row["task"], row["episode"], row.get("base_seed", 0)): row for row in mine}.values()  # each once
-    by_task = {task: [row for row in chosen if row["task"] == task.id] for task in tasks}
+    chosen: dict[Any, Row] = {}
+    for row in mine:  # an episode that is there twice counts once, the first time
+        chosen.setdefault((row["task"], row["episode"], row.get("base_seed", 0)), row)
+    by_task = {task: [row for row in chosen.values() if row["task"] == task.id] for task in tasks}
     played = {task: mine for task, mine in by_task.items() if mine}
     found = [_score_row({task: mine}) for task, mine in played.items()]
     return [*found, _score_row(played)] if len(played) > 1 else found
@@ -56,10 +58,12 @@ def _score_row(played: Mapping[Task, Sequence[Row]]) -> dict[str, Any]:
 
 
 def _value(name: str, row: Row, task: Task) -> float:
-    """Rows of earlier versions have no normalized score."""
-    if name == "normalized_score" and name not in row:
-        return normalize(row["score"], task.scenario.upper_bound(row.get("profile", "thesis")))
-    return row[name]
+    """Rows of earlier versions have no normalized score, and their kills may exceed the upper bound."""
+    if "normalized_score" in row or name == "player_kills":
+        return row[name]
+    bound = task.scenario.upper_bound(row.get("profile", "thesis"))
+    score = min(row["score"], bound)
+    return score if name == "score" else normalize(score, bound)
 
 
 def score_lines(found: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -3,6 +3,7 @@
 import dataclasses
 
 from gvz.experiments.general_segmented_long import EXPERIMENT as SEGMENTED
+from gvz.experiments.general_segmented_long import PUBLISHED_NOTE
 
 EXPERIMENT = dataclasses.replace(
     SEGMENTED,
@@ -12,7 +13,8 @@ EXPERIMENT = dataclasses.replace(
     configs=("ppo_segmented",),
     seeds=(1111,),
     notes=(
-        "Agents see what the networks that come with GViZDoom take the screen for, and the scenario's game variables. "
-        "They have the discounts and the rewards of rainbow_segmented. No frames are shifted in training.",
+        "Agents see what the networks that come with GViZDoom recognize on the screen, and the scenario's game "
+        "variables. They have the discounts and the rewards of rainbow_segmented. No frames are shifted in training.",
+        PUBLISHED_NOTE,
     ),
 )

@@ -134,7 +134,7 @@ def draw_matrix(out: Path, id: str, title: str, names: Sequence[str], values: np
         axes.xaxis.tick_top()
         axes.tick_params(length=0, labelsize=8)
         axes.spines[:].set_visible(False)
-        axes.set_title(title, fontsize=10)
+        axes.set_title(textwrap.fill(title, LINE_LENGTH), fontsize=10)
         return _written(picture, out, id, caption, wide=True)
 
 
@@ -175,10 +175,12 @@ def draw_heat_map(
     names = [attribute.name for attribute in tasks[0].scenario.attributes]
     attributes = [name for name in names if any(name in task.attributes for task in tasks)]
     num_marks, num_agents = len(attributes), len(scores)
-    mark_inches, agent_inches = 0.25, 0.55
+    agents = [textwrap.fill(agent, LINE_LENGTH) for agent in scores]
+    longest = max(len(line) for agent in agents for line in agent.splitlines())
+    mark_inches, agent_inches = 0.25, 0.55 + 0.15 * max(agent.count("\n") for agent in agents)
     width = 2.4 + mark_inches * num_marks + agent_inches * num_agents
     with mpl.rc_context({**STYLE, "axes.grid": False}):
-        picture = Picture(figsize=(max(PANEL_INCHES[0], width), 1.7 + 0.24 * len(tasks)))
+        picture = Picture(figsize=(max(PANEL_INCHES[0], width), 1.7 + 0.24 * len(tasks) + 0.07 * max(0, longest - 24)))
         marks, heat = picture.subplots(1, 2, sharey=True, width_ratios=(0.22 * max(1, num_marks), 0.62 * num_agents))
         picture.suptitle(title, fontsize=10)
         table = np.array([[np.nan if v is None else v for v in values] for values in scores.values()]).T
@@ -187,7 +189,7 @@ def draw_heat_map(
             text = "-" if np.isnan(value) else f"{value:.0f}"
             shade = "white" if value < 60 else "black"
             heat.text(column, row, text, ha="center", va="center", fontsize=8, color=GREY if np.isnan(value) else shade)
-        heat.set_xticks(range(num_agents), list(scores), rotation=90)
+        heat.set_xticks(range(num_agents), agents, rotation=90)
         for row, task in enumerate(tasks):
             marks.plot(range(num_marks), [row] * num_marks, ".", color="#dddddd", markersize=5)
             columns = [attributes.index(name) for name in task.attributes]

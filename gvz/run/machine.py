@@ -89,7 +89,7 @@ def available_memory(control_groups: Path = Path("/sys/fs/cgroup"), own_groups: 
     free = [int(psutil.virtual_memory().available)]
     for line in own_groups.splitlines():
         _, controllers, path = line.split(":", 2)
-        if controllers in ("", "memory"):
+        if not controllers or "memory" in controllers.split(","):
             top = control_groups / controllers  # in a container, it is that of the container
             own = Path(path.strip("/"))
             for directory in (top / own, *(top / parent for parent in own.parents)):

@@ -136,7 +136,7 @@ def check_renames(directory: Path) -> Finding:
                 bad = "a file was half old and half new while it was replaced"
         _, error = renamer.communicate(timeout=_TIMEOUT_S)
         if not bad and renamer.returncode:
-            bad = f"a file could not be replaced: {error.splitlines()[-1]}"
+            bad = f"a file could not be replaced: {(error.splitlines() or [f'exit code {renamer.returncode}'])[-1]}"
     finally:
         renamer.kill()
         renamer.communicate()

@@ -28,8 +28,8 @@ from learner.observation import Observation
 class PQN(QAgent):
     """Records with every action the largest action value there, which is what its returns bootstrap from.
 
-    Differs: the published code works these values out where it learns. Here they are those of the parameters that
-    acted; with one publication a rollout and no wait between them these are the same.
+    As in the published code, these values are those of the parameters that acted. Differs: there, all steps of a
+    rollout have the same parameters; here actors go on while the learner learns, so that some steps have older ones.
     """
 
     config: PQNConfig

@@ -87,7 +87,7 @@ def test_episodes_of_a_run_are_there_once_with_those_of_a_file_elsewhere(tmp_pat
 
 
 def test_two_players_of_one_name_are_told_of(tmp_path):
-    (tmp_path / "mine.jsonl").write_text(line(player="human") + line(player="human", episode=1))
+    (tmp_path / "mine.jsonl").write_text(line(player="human") + line(player="human", episode=1, length_frames=9))
     (tmp_path / "yours.jsonl").write_text(line(player="human", score=5.0) + line(player="human", episode=1))
     frame, (problem,) = collect_evaluations([tmp_path])
     assert problem.startswith("human: 1 of its episodes were found with several results, of which the first is kept")

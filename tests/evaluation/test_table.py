@@ -17,12 +17,13 @@ def test_each_task_has_its_mean_interval_and_episodes():
 
 def test_rows_of_earlier_versions_have_what_follows_from_their_score_and_count_once():
     (default, *_) = named_tasks("defend_the_center")
-    rows = [{"player": "p", "task": default.id, "episode": n, "score": 110.0} for n in (0, 1, 1)]
+    rows = [{"player": "p", "task": default.id, "episode": n, "score": 110.0} for n in (0, 1)]
+    rows.append({**rows[0], "score": 1100.0})
     (row,) = score_rows(rows, {"player": "p"}, [default], episodes=9)
     assert (row["episodes"], row["score"], row["normalized_score"]) == (2, 110.0, 10.0)
     (kills, *_) = named_tasks("seek_and_kill")
-    (row,) = score_rows([{**rows[0], "task": kills.id, "score": 1.0}], {"player": "p"}, [kills], episodes=9)
-    assert row["player_kills"] is None
+    (row,) = score_rows([{**rows[0], "task": kills.id, "score": 25.0}], {"player": "p"}, [kills], episodes=9)
+    assert (row["player_kills"], row["score"], row["normalized_score"]) == (None, 20.0, 100.0)
 
 
 def test_own_kills_stand_beside_a_score_that_is_kills():

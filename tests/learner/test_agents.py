@@ -13,6 +13,7 @@ import pytest
 from gvz.core.errors import ConfigError
 from gvz.core.registry import discover
 from learner.agents.base import OffPolicyAgent, epsilon_greedy, make_agent
+from learner.augment import training_view
 from learner.config import ValueConfig, agent_config_class, change_agent
 from tests.learner.small_agents import ALL_OFF, RAINBOW, SPEC, A, B, batch, jitted, made_up_params
 
@@ -162,9 +163,6 @@ def test_parts_that_do_not_fit_together_are_refused():
         replace(RAINBOW, hidden_input_share=0.2)
     with pytest.raises(ConfigError, match=r"agent\.sight_augmentations: got inversion without a loss that reads them"):
         replace(RAINBOW, sight_augmentations=("inversion",))
-    for field, value in (("noisy_epsilon", 0.1), ("noisy_period_steps", 16)):
-        with pytest.raises(ConfigError, match=f"agent.{field}: got {value} without noise; set agent."):
-            replace(RAINBOW, noisy="off", **{field: value})  # pyright: ignore[reportArgumentType]
     with pytest.raises(ConfigError, match=r"agent\.munchausen: got True with atoms, for which no form is published"):
         replace(RAINBOW, munchausen=True)
     with pytest.raises(ConfigError, match=r"agent\.num_quantiles: got quantiles of no distribution"):
@@ -228,6 +226,34 @@ def test_epsilon_is_the_share_of_uniformly_random_actions():
     for epsilon in (0.3, 1.0):
         counts = np.bincount(draw(jax.random.key(1), q, jnp.float32(epsilon)), minlength=3) / 6000
         np.testing.assert_allclose(counts, [epsilon / 3, epsilon / 3, 1 - 2 * epsilon / 3], atol=0.025)
+
+
+def test_noise_can_have_random_actions_beside_it():
+    config = replace(RAINBOW, noisy="factorized", noisy_epsilon=0.3)
+    assert [config.epsilon(steps) for steps in (0, 10**7)] == [0.3, 0.3]
+    assert replace(config, noisy="off").epsilon(10**7) == pytest.approx(config.epsilon_end)
+    agent, act, _, _ = jitted(config)
+    obs = jax.tree.map(lambda x: jnp.repeat(x[:1], 3000, axis=0), batch().obs_t)
+    params = made_up_params(agent, 0, sigma=0.0)  # so that the noise alone would choose one action
+    (greedy, _), (chosen, _) = (
+        act(params, jax.random.key(1), obs, jnp.float32(epsilon)) for epsilon in (0.0, config.epsilon(0))
+    )
+    assert len(set(np.asarray(greedy).tolist())) == 1
+    np.testing.assert_allclose(np.mean(np.asarray(chosen != greedy)), 0.3 * (A - 1) / A, atol=0.04)
+
+
+def test_hidden_inputs_are_whole_samples_drawn_at_random():
+    config = replace(
+        plain_config("dqn"), past_actions=SPEC.num_past_actions, game_variables=True, hidden_input_share=0.2
+    )
+    obs = jax.tree.map(lambda x: jnp.ones((5000, *x.shape[1:]), x.dtype), batch().obs_t)
+    seen = training_view(config, jax.random.key(1), obs)
+    hidden = np.asarray(seen.vector == 0).all(1)
+    np.testing.assert_allclose(hidden.mean(), 0.2, atol=0.025)
+    assert (np.asarray(seen.vector == 0).any(1) == hidden).all()
+    assert ((np.asarray(seen.actions) == -1) == hidden[:, None]).all()
+    others = replace(seen, vector=obs.vector, actions=obs.actions)
+    jax.tree.map(np.testing.assert_array_equal, others, obs)
 
 
 def test_unknown_agent_is_refused_with_the_known_ones():

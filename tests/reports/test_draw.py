@@ -6,8 +6,9 @@ import numpy as np
 
 from gvz.evaluation.statistics import Estimate
 from gvz.reports.document import Figure
-from gvz.reports.draw import COLOURS, draw_histogram, draw_levels, draw_rewards
+from gvz.reports.draw import COLOURS, draw_heat_map, draw_histogram, draw_levels, draw_matrix, draw_rewards
 from gvz.reports.experiment_section import what_id
+from gvz.tasks import named_tasks
 
 AGENTS = [f"agent {number}" for number in range(2 * len(COLOURS) + 3)]
 
@@ -38,6 +39,9 @@ def test_a_very_long_name_is_wrapped_and_its_file_can_be_written(tmp_path, recwa
     estimate = Estimate(value=50.0, low=40.0, high=60.0)
     for name in names:
         draw_levels(tmp_path, what_id(name), name, (0, 1), dict.fromkeys(names, (estimate, estimate)), name)
-    assert len(list(tmp_path.rglob("*.svg"))) == 2
+    tasks = named_tasks("defend_the_center")
+    draw_heat_map(tmp_path, "tasks", "tasks", tasks, {name: [50.0] * len(tasks) for name in names}, "by task")
+    draw_matrix(tmp_path, "pairs", names[0], ["a", "b"], np.eye(2), "pairs")
+    assert len(list(tmp_path.rglob("*.svg"))) == 4
     assert not recwarn.list
     assert what_id("a (b 0.5)") == "a__b_0_5_"

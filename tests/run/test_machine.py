@@ -37,6 +37,7 @@ def checkout(tmp_path, monkeypatch) -> Path:
     ("group", "own_groups", "files"),
     [
         ("job", "0::/job/step\n", ("memory.max", "memory.current", "")),
+        ("cpu,memory/job", "4:cpu,memory:/job/step\n", ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_")),
         ("memory/job", "4:memory:/job/step\n0::/\n", ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_")),
         ("", "0::/\n", ("memory.max", "memory.current", "")),  # within a container
         ("memory", "4:memory:/docker/1f\n", ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_")),

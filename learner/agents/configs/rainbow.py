@@ -57,7 +57,7 @@ class RainbowConfig(ValueConfig):
     """random changes of the frames that this loss alone learns from, as `augmentations`, and with their strength and
     clean share. The values learn from frames without these. Empty: this loss reads what the values read"""
     noisy_epsilon: Share = 0.0
-    """probability of a uniformly random action beside the noise"""
+    """probability of a uniformly random action beside the noise; without noise it is epsilon_end"""
 
     def __post_init__(self) -> None:
         ValueConfig.__post_init__(self)  # super() knows no class with slots
@@ -68,10 +68,6 @@ class RainbowConfig(ValueConfig):
                 "agent.munchausen: got True with atoms, for which no form is published; set agent.num_quantiles, or "
                 "agent.distributional False"
             )
-        if self.noisy == "off" and self.noisy_period_steps != 1:
-            raise ConfigError(f"agent.noisy_period_steps: got {self.noisy_period_steps} without noise; set agent.noisy")
-        if self.noisy == "off" and self.noisy_epsilon:
-            raise ConfigError(f"agent.noisy_epsilon: got {self.noisy_epsilon} without noise; set agent.epsilon_end")
         if self.sight_augmentations and not self.learns_sight:
             raise ConfigError(
                 f"agent.sight_augmentations: got {' '.join(self.sight_augmentations)} without a loss that reads them; "
