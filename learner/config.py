@@ -179,7 +179,7 @@ def change_agent(config: AgentConfig, name: str) -> AgentConfig:
     """
     kind = agent_config_class(name)
     wanted = {field.name for field in dataclasses.fields(kind)} - {"name"}
-    default = type(config)()
+    default = type(config)(name=config.name)
     values = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name in wanted}
     shared: dict[str, Any] = {name: value for name, value in values.items() if value != getattr(default, name)}
     try:
