@@ -14,8 +14,12 @@ AGENTS = {
     "4 tasks": ("general_train4", "rainbow_segmented+train4_network"),
     "8 tasks": ("general_short", "rainbow_segmented"),
 }
-LONGER = ("defend_the_center", "seek_and_kill")
+LONGER = ("defend_the_center", "health_gathering", "seek_and_kill")
 STEPS = "general_train4{}/runs/**/metrics.jsonl.gz"
+
+
+def in_words(numbers: list[str]) -> str:
+    return f"{', '.join(numbers[:-1])} and {numbers[-1]}"
 
 
 @pytest.fixture(scope="module")
@@ -86,13 +90,18 @@ def test_the_findings_say_what_six_times_the_time_gave_on_four_training_tasks(sc
         ]
         for n in (1, 2)
     )
-    assert f"{gate[0]} and {gate[1]} points on the gate tasks, {test[0]} and {test[1]} on the test tasks." in WORDS
+    assert f"{in_words(gate)} points on the gate tasks, {in_words(test)} on the test tasks." in WORDS
     less = [
         estimate_groups([(longer[name, called], task_sets(name)[2]) for called in folders], difference).text
         for name in LONGER
     ]
-    assert f"with the same time: {less[0]} and {less[1]}." in WORDS
-    for task in ("defend_the_center/gore+mossy_bricks", "seek_and_kill/blue+shadows"):
+    assert f"with the same time: {in_words(less)}." in WORDS
+    unseen = (
+        "defend_the_center/gore+mossy_bricks",
+        "health_gathering/poison+resized_kits+shaded_kits",
+        "seek_and_kill/blue+shadows",
+    )
+    for task in unseen:
         name, _, of_task = task.partition("/")
         short, four, eight = (
             np.mean([by_task[task].mean() for by_task in found.runs.values()])
@@ -100,7 +109,7 @@ def test_the_findings_say_what_six_times_the_time_gave_on_four_training_tasks(sc
         )
         assert f"`{of_task}` has {four:.0f} (after 900 seconds {short:.0f}, with eight tasks {eight:.0f})" in WORDS
     steps = sorted(rows_of(file)[-1]["num_updates"] for file in (ROOT / "results").glob(STEPS.format("_long")))
-    assert f"{steps[0]:,} and {steps[1]:,} gradient steps" in WORDS
+    assert f"{steps[0]:,} to {steps[-1]:,} gradient steps, 50 episodes" in WORDS
 
 
 def test_the_findings_say_how_long_agents_of_four_training_tasks_learned():
