@@ -69,7 +69,8 @@ def changed_view(
         surroundings: of another task of the scenario: things may stand before it.
         decorations: further ones, which then stand there as well.
         others: whose things then stand there as well.
-        known_styles: of OUTLINES, those that some task has; three of four styles that are drawn are of these.
+        known_styles: of OUTLINES, those that some task has. Three of four styles that are drawn are of these, the others
+            any of these and of the styles that are no outline.
         tints_and_patches: whether some of the other surroundings have them.
 
     Returns:
@@ -190,10 +191,14 @@ def _is(labels: np.ndarray, classes: tuple[str, ...]) -> np.ndarray:
 
 
 def _drawn_style(rng: np.random.Generator, known_styles: Sequence[str]) -> str | None:
-    """A render style for things that have none of OUTLINES, or none."""
+    """A render style for things that have none of OUTLINES, or none.
+
+    Of OUTLINES only the known ones are drawn: others would show a network what only tasks of the gates or tests look like.
+    """
     if rng.random() >= 0.6:
         return None
-    names = known_styles if known_styles and rng.random() < 0.75 else tuple(_STYLES)
+    allowed = tuple(name for name in _STYLES if name in known_styles or name not in OUTLINES)
+    names = known_styles if known_styles and rng.random() < 0.75 else allowed
     return names[int(rng.integers(len(names)))]
 
 
