@@ -69,8 +69,8 @@ def changed_view(
         surroundings: of another task of the scenario: things may stand before it.
         decorations: further ones, which then stand there as well.
         others: whose things then stand there as well.
-        known_styles: of OUTLINES, those that some task has. Three of four styles that are drawn are of these, the others
-            any of these and of the styles that are no outline.
+        known_styles: of OUTLINES, those that some task has. Three of four styles that are drawn are of these, the
+            others any of these or of the styles that are no outline.
         tints_and_patches: whether some of the other surroundings have them.
 
     Returns:
@@ -193,7 +193,7 @@ def _is(labels: np.ndarray, classes: tuple[str, ...]) -> np.ndarray:
 def _drawn_style(rng: np.random.Generator, known_styles: Sequence[str]) -> str | None:
     """A render style for things that have none of OUTLINES, or none.
 
-    Of OUTLINES only the known ones are drawn: others would show a network what only tasks of the gates or tests look like.
+    Of OUTLINES only the known ones are drawn: others would show a network looks that only gate or test tasks have.
     """
     if rng.random() >= 0.6:
         return None
