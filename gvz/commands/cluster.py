@@ -25,13 +25,13 @@ class PlanCluster:
     hosts: int
     """machines that play"""
     cores: int
-    """of each, all of them used by actors"""
+    """cores of each host; actors use all of them"""
     config: str = "rainbow_4task"
-    """config file whose frames, network and replay it is"""
+    """config file with the size of frames, the network and the replay"""
     gbit_per_s: float = 10.0
     """network of the learner's host, each way"""
     devices: int = 1
-    """of the learner"""
+    """GPUs or other devices of the learner"""
     updates_per_s: float | None = None
     """gradient steps of one device (learner/updates_per_s of a run's metrics); without it the devices limit nothing"""
     publish_period_s: float = 1.0
@@ -108,7 +108,7 @@ class ClusterDoctor:
     address: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="HOST:PORT", help_behavior_hint="")]
     """the head"""
     shared: Path | None = None
-    """a directory that all nodes are to see, with the locks of the others"""
+    """check this directory, too: each node must see its files, and the locks that other nodes hold in it"""
     public: bool = False
     """its nodes may have public addresses"""
     json: bool = False

@@ -21,7 +21,7 @@ class Doctor:
     shared: Path | None = None
     """check this directory instead, for several machines that work in it: locks, renames, fsync"""
     hold: float | None = None
-    """seconds to hold a lock in the shared directory; give the command on another machine meanwhile"""
+    """seconds to hold a lock in the shared directory; meanwhile give the command without --hold on another machine"""
     json: bool = False
     """one JSON object a line instead of a table"""
 

@@ -187,7 +187,8 @@ class Status:
     results: Path = DEFAULT_RESULTS
     """results directory"""
     shard: str = "1/1"
-    """i/n: only the jobs of this shard of all experiments of the directory; a command with some of them has others"""
+    """i/n: only the jobs of this shard. All experiments of the directory are divided together, also those that a `run`
+    did not name"""
     json: bool = False
     """one JSON object a line for each job, instead of text"""
 
