@@ -40,6 +40,7 @@ OPTIONAL: dict[str, pl.DataType] = {
     "profile": pl.String(),
     "action_set": pl.String(),
     "frame_skip": pl.Int64(),
+    "observes": pl.String(),
     "normalized_score": pl.Float64(),
     "kills": pl.Float64(),
     "player_kills": pl.Float64(),
@@ -49,7 +50,8 @@ OPTIONAL: dict[str, pl.DataType] = {
     "terminated": pl.Boolean(),
     "truncated": pl.Boolean(),
 }
-"""fields that are null where a row lacks them; `run`, `run_seed`, `num_updates` and `params` are a trained player's"""
+"""fields that are null where a row lacks them. `run`, `run_seed`, `num_updates` and `params` are a trained player's.
+`observes` is that of a player of your own which has more or other than the screen"""
 
 DERIVED: dict[str, pl.DataType] = {
     "scenario": pl.String(),
@@ -65,7 +67,7 @@ REWARD_PREFIX = "reward/"
 MAX_COMPONENTS = 64
 """of a file: every name is a column, and a small file could have more cells than fit into memory"""
 
-_IDENTITY = ("player", "params", "profile", "action_set", "frame_skip", "task", "episode", "seed")
+_IDENTITY = ("player", "params", "profile", "action_set", "frame_skip", "observes", "task", "episode", "seed")
 """rows of one directory that are equal in these are one and the same episode, and so are those outside a run directory
 whose policy is known by its weights"""
 

@@ -25,6 +25,13 @@ def row_identity(player: Mapping[str, Any], env: EnvConfig) -> dict[str, Any]:
     return {**player, **rules}
 
 
+def _observes(env: EnvConfig) -> dict[str, str]:
+    """The field `observes` of a player that has more or other than the screen; nothing for one that has it alone."""
+    frames = [" ".join((env.frames, env.segmenter)).strip()] if env.frames != "screen" else []
+    more = [*frames, *env.buffers, *(["sight"] if env.sight else [])]
+    return {"observes": ", ".join(more)} if more else {}
+
+
 def simple_player(name: SimplePlayerName, env: EnvConfig) -> PlayerSpec:
     """A simple player under the rules of `env`."""
     env = player_env(name, env)
@@ -39,10 +46,10 @@ def wanted_episodes(tasks: Sequence[Task], episodes: int, base_seeds: Sequence[i
 
 def rows_of(player_spec: PlayerSpec, rows: Iterable[Row]) -> dict[Episode, Row]:
     """The rows of a record file that are this player_spec's. Rows older than base seeds are of base seed 0."""
-    mine = player_spec.identity.items()
+    mine, observes = player_spec.identity.items(), player_spec.identity.get("observes")
     found: dict[Episode, Row] = {}
     for r in rows:  # of two rows of one episode, the first counts
-        if mine <= r.items():
+        if mine <= r.items() and r.get("observes") == observes:
             found.setdefault(Episode(r["task"], r["episode"], r.get("base_seed", 0)), r)
     return found
 
@@ -172,7 +179,8 @@ def evaluate_player(
         GvzError: an episode could not be played.
     """
     env = EnvConfig() if env is None else env
-    player_spec = PlayerSpec(make_player=make_player, env=env, identity=row_identity({"player": name}, env))
+    identity = row_identity({"player": name}, env) | _observes(env)
+    player_spec = PlayerSpec(make_player=make_player, env=env, identity=identity)
     parsed = [parse_task(id_for_processes(task)) for task in tasks]
     wanted = wanted_episodes(parsed, episodes, [base_seed])
     file = RecordFile(Path(out))

@@ -123,7 +123,8 @@ def with_agents(episodes: pl.DataFrame, agents: dict[str, str]) -> pl.DataFrame:
     age = pl.col("num_updates").rank("dense", descending=True)  # 1: the newest checkpoint
     num_checkpoints = pl.col("num_updates").n_unique()
     final = (age <= (num_checkpoints / 4).ceil()).over(ONE_RUN).fill_null(value=True)
-    agent = pl.coalesce(named, "player")
+    seen = pl.format(" ({})", "observes").fill_null("")  # of a player of one's own that has other than the screen
+    agent = pl.concat_str(pl.coalesce(named, "player"), seen)
     return episodes.with_columns(agent=agent, final=final).with_columns(agent=pl.concat_str("agent", *_other_rules()))
 
 

@@ -178,6 +178,22 @@ def test_anybody_s_player_is_evaluated_by_the_same_protocol(tmp_path):
 
 
 @pytest.mark.engine
+def test_rows_say_what_else_than_the_screen_a_player_observes(tmp_path):
+    def play(**env) -> list[dict]:
+        return evaluate_player(RandomPlayer, [TASK], path, name="mine", episodes=1, env=EnvConfig(**env))
+
+    path = tmp_path / "rows.jsonl"
+    (screen,), (classes,) = play(), play(frames="classes")
+    assert classes == {**screen, "observes": "classes"}
+    assert play(frames="segmented", segmenter="train4", sight=True) == [
+        {**screen, "observes": "segmented train4, sight"}
+    ]
+    assert play(buffers=("labels", "depth"))[0]["observes"] == "labels, depth"
+    assert (play(), play(frames="classes")) == ([screen], [classes])
+    assert len(read_rows(path)) == 4
+
+
+@pytest.mark.engine
 def test_actions_are_never_repeated_by_chance_in_an_evaluation(tmp_path):
     task, env = "dodge_projectiles/default", player_env("sweep", EnvConfig())
     plain, sticky = (

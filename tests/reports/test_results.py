@@ -81,6 +81,14 @@ def test_an_agent_that_played_by_several_rules_is_several(tmp_path):
     assert set(read_results([tmp_path]).episodes["agent"]) == {"b (frame_skip 4)", "b (frame_skip 8)"}
 
 
+def test_players_that_observe_other_than_the_screen_have_it_in_their_names(tmp_path):
+    task = "defend_the_center/default"
+    rows = [evaluation_row("a", task, 0, 10.0), evaluation_row("a", task, 0, 20.0, observes="classes")]
+    write_rows(tmp_path / "rows.jsonl", rows)
+    shown = read_results([tmp_path]).episodes.select("agent", "normalized_score").rows()
+    assert shown == [("a", 10.0), ("a (classes)", 20.0)]
+
+
 def test_agents_of_different_maps_that_played_the_same_are_not_one(tmp_path, experiments_writer):
     plan = Plan.of("procedural_gap", scale=0.0001, scenarios=("defend_the_center",))
     experiments_writer(tmp_path, plan, lambda _: 50.0)
