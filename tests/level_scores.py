@@ -1,16 +1,21 @@
-"""Scores of all players by level, from their records; `python -m tests.level_scores` draws docs/images/levels.png."""
+"""Scores of all players by level, from their records.
+
+`python -m tests.level_scores` prints the rows of the findings' two tables and draws docs/images/levels.png.
+"""
 
 import tempfile
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
+import polars as pl
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from gvz.evaluation.statistics import mean_over_scenarios
 from gvz.reports.document import Cell
 from gvz.reports.draw import draw_levels
-from gvz.reports.scores import agent_scores, estimate_groups
-from gvz.tasks import LEVELS, named_tasks, scenarios
+from gvz.reports.scores import Scores, agent_scores, estimate_groups
+from gvz.tasks import LEVELS, Task, named_tasks, scenarios
 from tests.score_tables import ROOT, results_of
 
 PLAYERS = {
@@ -25,15 +30,51 @@ PLAYERS = {
 PICTURE = ROOT / "docs" / "images" / "levels.png"
 
 
-def level_cells(player: str) -> list[Cell]:
-    """Percent of the bound on the test tasks, then on all named tasks of each level: means over the scenarios."""
+def _scores(player: str, percent: pl.Expr | None = None) -> dict[str, Scores]:
+    """By scenario: percent of the bound, or another expression of the rows."""
     folder, agent = PLAYERS[player]
     episodes = results_of(folder).episodes
-    scores = {name: agent_scores(episodes.filter(scenario=name), agent) for name in scenarios()}
-    sets = [{name: named_tasks(name, split="test") for name in scenarios()}]
-    sets += [{name: named_tasks(name, level=level) for name in scenarios()} for level in LEVELS]
-    groups = [[(scores[name], [task.id for task in tasks[name]]) for name in scenarios()] for tasks in sets]
-    return [estimate_groups(group, mean_over_scenarios) for group in groups]
+    if percent is not None:
+        episodes = episodes.with_columns(normalized_score=percent)
+    return {name: agent_scores(episodes.filter(scenario=name), agent) for name in scenarios()}
+
+
+def _mean(scores: Mapping[str, Scores], tasks: Callable[[str], Collection[Task]]) -> Cell:
+    """The mean over the scenarios on these tasks of each."""
+    groups = [(of_scenario, [task.id for task in tasks(name)]) for name, of_scenario in scores.items()]
+    return estimate_groups(groups, mean_over_scenarios)
+
+
+def _test_tasks(name: str) -> tuple[Task, ...]:
+    return named_tasks(name, split="test")
+
+
+def level_cells(player: str) -> list[Cell]:
+    """Percent of the bound on the test tasks, then on all named tasks of each level: means over the scenarios."""
+    scores = _scores(player)
+    levels = [_mean(scores, lambda name, level=level: named_tasks(name, level=level)) for level in LEVELS]
+    return [_mean(scores, _test_tasks), *levels]
+
+
+_OWN_KILLS = (
+    pl.when(pl.col("scenario") == "seek_and_kill")
+    .then(5 * pl.col("player_kills").clip(upper_bound=20))
+    .otherwise("normalized_score")
+)
+"""percent of the bound, of 20 kills in Seek and Kill, where enemies' kills of each other do not count"""
+
+
+def parts_row(player: str) -> str:
+    """The player's row of the findings' table of parts of the levels, and of own kills."""
+    scores = _scores(player)
+    four = named_tasks(split="train4")
+    cells = (
+        _mean(scores, lambda name: [task for task in named_tasks(name, level=1) if task not in four]),
+        _mean(scores, lambda name: named_tasks(name, split="gate")),
+        _mean(scores, lambda name: [task for task in _test_tasks(name) if task.level == 2]),
+        _mean(_scores(player, _OWN_KILLS), _test_tasks),
+    )
+    return f"| {player} | {' | '.join(cell.text for cell in cells)} |"
 
 
 def level_row(player: str) -> str:
@@ -55,4 +96,5 @@ def _draw() -> None:
 
 
 if __name__ == "__main__":
+    print(*map(level_row, PLAYERS), *map(parts_row, PLAYERS), sep="\n")
     _draw()

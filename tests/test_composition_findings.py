@@ -3,12 +3,13 @@
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 
 from gvz.evaluation.episode_log import read_rows
 from gvz.evaluation.statistics import difference
 from gvz.evaluation.zoo import run_directory
 from gvz.reports.scores import agent_scores, estimate, estimate_groups
-from gvz.tasks import parse_task, scenario_named, scenarios
+from gvz.tasks import Task, named_tasks, parse_task, scenario_named, scenarios
 from tests.score_tables import ROOT, WORDS, means, of_first_seed, results_of, rows_of, score_cells, task_sets
 
 
@@ -113,7 +114,34 @@ def test_the_findings_say_what_further_seeds_of_compositions_gave_with_more_time
     assert f"and {on_level_4} after three times the time, with three seeds." in WORDS
     percent, interval = on_test.split(" ", 1)
     readme = " ".join((ROOT / "README.md").read_text().split())
-    assert f"for 45 minutes, they have {percent}% {interval} (three seeds)." in readme
+    assert f"for 45 minutes, they have {percent}% {interval} (three seeds); " in readme
+
+
+def test_the_pages_say_how_near_the_test_tasks_are_to_compositions():
+    sets = {name: [set(task.attributes) for task in named_tasks(name, split="compositions")] for name in scenarios()}
+    test = named_tasks(split="test")
+    assert not set(test) & set(named_tasks(split="compositions"))
+
+    def near(task: Task) -> bool:
+        mine = set(task.attributes)
+        return any(len(mine - one) <= 1 and len(one - mine) <= 1 for one in sets[task.scenario.id])
+
+    parts = [task.id for task in test if any(set(task.attributes) < one for one in sets[task.scenario.id])]
+    assert f"attributes of {len(parts)} of the {len(test)} test tasks stand together in one of them" in WORDS
+    assert f"and {sum(map(near, test))} of the {len(test)} become one if one" in WORDS
+    benchmark, readme = (" ".join((ROOT / page).read_text().split()) for page in ("docs/BENCHMARK.md", "README.md"))
+    assert f"but {len(parts)} of the {len(test)} are a part of one, and {sum(map(near, test))} become one" in benchmark
+    assert f"{len(parts)} of the {len(test)} test tasks are a part of such a combination." in readme
+
+    def scores(folder: str) -> list[str]:
+        """On these tasks, and on the others."""
+        mine = results_of(folder).episodes.filter(agent="rainbow_segmented").filter(pl.col("task").is_in([*ids]))
+        return [f"{part['normalized_score'].mean():.1f}" for part in (mine.filter(is_part), mine.filter(~is_part))]
+
+    ids, is_part = [task.id for task in test], pl.col("task").is_in(parts)
+    some, others = scores("general_compositions_long")
+    assert f"With three seeds the {len(parts)} have {some} and the other nine {others};" in WORDS
+    assert "eight tasks have {} and {} after 5,400 seconds (means over tasks).".format(*scores("general")) in WORDS
 
 
 def test_the_findings_say_how_long_agents_of_compositions_learned():

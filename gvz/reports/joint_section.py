@@ -63,7 +63,11 @@ def _level_table(by_level: Mapping[str, Sequence[Cell]]) -> Table:
         caption="All named tasks by level, percent of the upper bound: mean over the scenarios.",
         columns=("agent", *(f"level {level}" for level in LEVELS)),
         rows=tuple((words(agent), *cells) for agent, cells in by_level.items()),
-        notes=("- : not evaluated on all named tasks of this level.",),
+        notes=(
+            "Most tasks of level 0 and 1 are training tasks, half of those of level 2 are gate tasks. Levels 3 and 4 "
+            "are test tasks.",
+            "- : not evaluated on all named tasks of this level.",
+        ),
     )
 
 
