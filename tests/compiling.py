@@ -4,6 +4,8 @@ Programs of tests that are marked isa are compiled as users have them; others wi
 """
 
 import os
+from collections.abc import Callable, Hashable
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -23,8 +25,6 @@ def _known(option: str) -> bool:
 
 LITTLE = {name: False for name in ("xla_cpu_use_fusion_emitters",) if _known(name)}
 """beside jax_disable_most_optimizations: a large program compiles in less than half of the time and runs as fast"""
-TRAINING = {"xla_backend_optimization_level": 0, **LITTLE}
-"""of a loop that runs for seconds"""
 MUCH = {"xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes": False, **dict.fromkeys(LITTLE, True)}
 """of a small program that runs for seconds"""
 
@@ -44,6 +44,18 @@ def optimize(much: bool) -> None:
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(not much))
     little = () if much else (f"--{name}={value}".lower() for name, value in LITTLE.items())
     os.environ["XLA_FLAGS"] = " ".join((_flags, *little)).strip()
+
+
+@cache
+def training_loop(train: Callable[..., Any], training: Hashable) -> Callable[..., Any]:
+    """`train(training, ...)` as one program, a loop that runs for seconds.
+
+    Without optimization where no instruction set is asked for: one seed takes two thirds of the time. It is XLA's
+    optimized code that differs between instruction sets.
+    """
+    asked_for = "xla_cpu_max_isa" in os.environ.get("XLA_FLAGS", "")
+    options = {} if asked_for else {"xla_backend_optimization_level": 0, **LITTLE}
+    return jax.jit(partial(train, training), compiler_options=options)
 
 
 def _get_compile_options(*args: Any, env_options_overrides: dict[str, Any] | None = None, **kwargs: Any) -> Any:

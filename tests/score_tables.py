@@ -53,6 +53,11 @@ def means(of_agents: Mapping[str, Scores]) -> list[str]:
     return [estimate_groups(group, mean_over_scenarios).text for group in groups]
 
 
+def in_words(numbers: list[str]) -> str:
+    """Numbers, one for each scenario, as a sentence lists them."""
+    return f"{', '.join(numbers[:-1])} and {numbers[-1]}"
+
+
 def of_first_seed(episodes: polars.DataFrame) -> polars.DataFrame:
     """Those of the first training seed that each scenario has."""
     return episodes.filter(polars.col("run_seed") == polars.col("run_seed").min().over("scenario"))

@@ -10,7 +10,7 @@ from gvz.evaluation.statistics import difference
 from gvz.evaluation.zoo import run_directory
 from gvz.reports.scores import agent_scores, estimate, estimate_groups
 from gvz.tasks import Task, named_tasks, parse_task, scenario_named, scenarios
-from tests.score_tables import ROOT, WORDS, means, of_first_seed, results_of, rows_of, score_cells, task_sets
+from tests.score_tables import ROOT, WORDS, in_words, means, of_first_seed, results_of, rows_of, score_cells, task_sets
 
 
 def test_the_findings_say_what_compositions_of_attributes_gave():
@@ -73,11 +73,6 @@ def test_the_findings_say_what_compositions_gave_with_more_time():
 
     assert f"the test tasks gain {gains(2)} points" in WORDS
     assert f"and level 4 gains {gains(3)}." in WORDS
-
-
-def in_words(numbers: list[str]) -> str:
-    """Of the scenarios, as a sentence lists them."""
-    return f"{', '.join(numbers[:-1])} and {numbers[-1]}"
 
 
 def test_the_findings_say_what_three_seeds_of_compositions_have_beside_eight_tasks_with_twice_the_time():

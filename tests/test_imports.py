@@ -79,10 +79,15 @@ def test_imports_point_down(module: str, file: Path):
 @pytest.mark.parametrize(
     ("statement", "forbidden"),
     [
-        ("import gvz", ("jax", "vizdoom", "cv2")),
+        ("import gvz", ("gymnasium", "numpy", "jax", "vizdoom", "cv2")),
         ("import gvz.launch", ("jax", "vizdoom", "orbax", "flax")),
         ("import gvz.env, gvz.tasks", ("jax", "flax", "orbax", "tyro")),
         ("import gvz.tasks; gvz.tasks.all_scenarios()", ("numpy", "cv2", "jax")),
+        (
+            "from gvz.wad.acs import compile_acs; from gvz.wad.stock import stock_textures;"
+            "compile_acs('script 1 OPEN { }'); stock_textures()",
+            ("vizdoom", "jax", "omg", "cv2"),
+        ),
         ("import gvz.cli, gvz.run.train, gvz.experiments.schedule", ("ray", "gvz.cluster.wire")),
     ],
 )

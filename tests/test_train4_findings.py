@@ -8,7 +8,7 @@ import pytest
 from gvz.evaluation.statistics import difference, mean_over_scenarios
 from gvz.reports.scores import Scores, agent_scores, estimate_groups
 from gvz.tasks import scenario_named, scenarios
-from tests.score_tables import ROOT, WORDS, results_of, rows_of, score_cells, task_sets
+from tests.score_tables import ROOT, WORDS, in_words, results_of, rows_of, score_cells, task_sets
 
 AGENTS = {
     "4 tasks": ("general_train4", "rainbow_segmented+train4_network"),
@@ -16,10 +16,6 @@ AGENTS = {
 }
 LONGER = ("defend_the_center", "health_gathering", "seek_and_kill")
 STEPS = "general_train4{}/runs/**/metrics.jsonl.gz"
-
-
-def in_words(numbers: list[str]) -> str:
-    return f"{', '.join(numbers[:-1])} and {numbers[-1]}"
 
 
 @pytest.fixture(scope="module")

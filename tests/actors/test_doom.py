@@ -11,7 +11,7 @@ import msgpack
 import numpy as np
 import psutil
 import pytest
-from watched_pool import segments
+from watched_pool import gather, segments
 
 from actors.config import ActorsConfig
 from actors.inline import InlinePool
@@ -19,7 +19,7 @@ from actors.pool import PoolConfig
 from actors.process_pool import ProcessPool
 from gvz.core import janitor
 from gvz.core.env_config import SIGHT_CLASSES, SIGHT_COLUMNS, EnvConfig
-from gvz.transport.messages import EpisodeStats, Fault, Message, StepBlock
+from gvz.transport.messages import EpisodeStats, Fault, Message
 
 pytestmark = pytest.mark.engine
 
@@ -46,12 +46,6 @@ def config(work_dir: Path, *, num_actors: int, second_task: str = "fuzzy_enemies
         actors=ActorsConfig(),
         work_dir=work_dir,
     )
-
-
-def gather(blocks: list[StepBlock]) -> tuple[np.ndarray, np.ndarray]:
-    steps = np.concatenate([block.steps for block in blocks])
-    steps["sequence"] = 0
-    return steps, np.concatenate([block.frames for block in blocks])
 
 
 def test_a_resumed_game_goes_on_bit_for_bit(tmp_path: Path):

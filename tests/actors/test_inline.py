@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 from fake_env import FRAME_SHAPE, Checker, config, export_act
-from watched_pool import segments
+from watched_pool import gather, segments
 
 from actors.inline import InlinePool
 from actors.loop import derive_seed
@@ -44,13 +44,6 @@ def hashing_policy(num_games: int) -> bytes:
 
 def params(version: int) -> tuple[np.ndarray, ParamsHeader]:
     return np.full(3, version, np.float32), ParamsHeader(version=version, num_updates=version, epsilon=1.0)
-
-
-def gather(blocks: list[StepBlock]) -> tuple[np.ndarray, np.ndarray]:
-    """(steps without their sequence numbers, frames) of several blocks."""
-    steps = np.concatenate([block.steps for block in blocks])
-    steps["sequence"] = 0
-    return steps, np.concatenate([block.frames for block in blocks])
 
 
 @pytest.mark.parametrize("end", ["terminated", "truncated"])

@@ -5,12 +5,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 from fake_env import Checker
 
 from actors.pool import PoolConfig
 from actors.process_pool import ProcessPool
 from gvz.core import janitor
-from gvz.transport.messages import EpisodeStats, Fault, Message
+from gvz.transport.messages import EpisodeStats, Fault, Message, StepBlock
 from gvz.transport.ring import WriterState
 from tests.waiting import wait_until
 
@@ -52,6 +53,13 @@ class Run:
         """Until every actor waits for space in its ring; nothing is drained."""
         full = WriterState.WAITING_FOR_SPACE
         wait_until(lambda: {s.state for s in self.pool.writer_statuses()} == {full}, "full rings", DEADLINE_S)
+
+
+def gather(blocks: list[StepBlock]) -> tuple[np.ndarray, np.ndarray]:
+    """(steps without their sequence numbers, frames) of several blocks."""
+    steps = np.concatenate([block.steps for block in blocks])
+    steps["sequence"] = 0
+    return steps, np.concatenate([block.frames for block in blocks])
 
 
 def segments() -> dict[int, int]:

@@ -2,7 +2,6 @@
 
 import json
 import os
-from pathlib import Path
 
 import pytest
 
@@ -13,6 +12,7 @@ from gvz.experiments.base import experiments
 from gvz.experiments.costs import Rates, read_rates
 from gvz.experiments.plan import Plan, write_plan
 from gvz.run.machine import cpu_model
+from tests.reports.conftest import write_rows
 
 RUN = "rainbow_4task/defend_the_center/train4/seed_1111"
 CORES = len(os.sched_getaffinity(0))
@@ -24,10 +24,12 @@ def results(tmp_path, monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     monkeypatch.chdir(tmp_path)
     run = tmp_path / "results" / "runs" / RUN
-    write(run / "starts.jsonl", {"cpu": cpu_model(), "cores": CORES})
+    write_rows(run / "starts.jsonl", [{"cpu": cpu_model(), "cores": CORES}])
     rates = [0.0, 9.0, 10.0, 11.0]
-    write(run / "metrics.jsonl", *({"num_updates": n, "learner/updates_per_s": rate} for n, rate in enumerate(rates)))
-    write(run / "evaluation.jsonl", *({"length_steps": 1500} for _ in range(8)))
+    write_rows(
+        run / "metrics.jsonl", [{"num_updates": n, "learner/updates_per_s": rate} for n, rate in enumerate(rates)]
+    )
+    write_rows(run / "evaluation.jsonl", [{"length_steps": 1500} for _ in range(8)])
     log = inventory.log_file(tmp_path / "results", RUN)
     log.parent.mkdir(parents=True)
     log.write_text(
@@ -36,11 +38,6 @@ def results(tmp_path, monkeypatch):
         f"# 2026-11-22 12:11:00 python -m gvz.cli evaluate {run}\n{inventory.END_MARK}0 after 8 s\n"
     )
     return tmp_path / "results"
-
-
-def write(file: Path, *rows: dict) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text("".join(json.dumps({"schema": 1, **row}) + "\n" for row in rows))
 
 
 def test_list_names_every_experiment_with_its_question(capsys):
@@ -89,8 +86,8 @@ def test_jobs_side_by_side_take_as_long_as_the_slot_that_ends_last(results, caps
 
 def test_a_gate_s_hours_follow_from_its_processor_time_and_its_variants_have_rates_of_their_own(results, capsys):
     fast = results / "runs" / "rainbow_4task+decisions_16" / "dodge_projectiles" / "train4" / "seed_1111"
-    write(fast / "starts.jsonl", {"cpu": cpu_model(), "cores": CORES})
-    write(fast / "metrics.jsonl", {"num_updates": 1, "learner/updates_per_s": 7.0})
+    write_rows(fast / "starts.jsonl", [{"cpu": cpu_model(), "cores": CORES}])
+    write_rows(fast / "metrics.jsonl", [{"num_updates": 1, "learner/updates_per_s": 7.0}])
     assert main(["experiment", "plan", "gate_reuse", "--jobs", "1", "--results", str(results)]) == 0
     out = capsys.readouterr().out
     assert "rainbow_4task+decisions_16: 7.00 updates/s" in out
@@ -162,11 +159,13 @@ def test_a_run_of_the_trainer_counts_and_one_of_another_machine_or_with_other_co
     assert read_rates(results, "rainbow_4task", 1, CORES) == Rates(updates_per_s=10.0, evaluation_steps_per_s=1000.0)
     unknown = Rates(updates_per_s=None, evaluation_steps_per_s=None)
     assert read_rates(results, "rainbow_4task", 1, CORES + 1) == unknown
-    write(results / "runs" / RUN / "starts.jsonl", {"cpu": "another", "cores": CORES})
+    write_rows(results / "runs" / RUN / "starts.jsonl", [{"cpu": "another", "cores": CORES}])
     assert read_rates(results, "rainbow_4task", 1, CORES) == unknown
     own = tmp_path / "runs" / "rainbow_4task" / "seed_7"
-    write(own / "starts.jsonl", {"cpu": cpu_model(), "cores": CORES})
-    write(own / "metrics.jsonl", {"num_updates": 1, "learner/updates_per_s": 7.0}, {"learner/updates_per_s": "x"})
+    write_rows(own / "starts.jsonl", [{"cpu": cpu_model(), "cores": CORES}])
+    write_rows(
+        own / "metrics.jsonl", [{"num_updates": 1, "learner/updates_per_s": 7.0}, {"learner/updates_per_s": "x"}]
+    )
     assert read_rates(results, "rainbow_4task", 1, CORES) == Rates(updates_per_s=7.0, evaluation_steps_per_s=None)
     assert read_rates(results, "rainbow_4task", 0.001, CORES) == unknown, "its networks are other ones"
 

@@ -18,6 +18,7 @@ def softmax(x):
 
 def convolve(x, kernel, bias, stride):
     """Valid convolution of [B, H, W, C] with [k, k, C, F]: one product for every position."""
+    x, kernel = np.asarray(x, np.float64), np.asarray(kernel, np.float64)
     k = kernel.shape[0]
     rows, columns = ((size - k) // stride + 1 for size in x.shape[1:3])
     out = np.zeros((len(x), rows, columns, kernel.shape[-1]))

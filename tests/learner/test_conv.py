@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from learner.conv import Conv, conv2d
+from tests.learner.reference import convolve
 
 # (image, channels, kernel, stride, features): the thesis's three layers, and shapes that do not divide evenly
 LAYERS = [
@@ -20,20 +21,8 @@ LAYERS = [
 ]
 
 
-def oracle(x: np.ndarray, kernel: np.ndarray, stride: int) -> np.ndarray:
-    """The defining sum, in float64."""
-    k = kernel.shape[0]
-    out_h, out_w = ((n - k) // stride + 1 for n in x.shape[1:3])
-    y = np.zeros((len(x), out_h, out_w, kernel.shape[3]))
-    for i in range(out_h):
-        for j in range(out_w):
-            window = x[:, i * stride : i * stride + k, j * stride : j * stride + k].astype(np.float64)
-            y[:, i, j] = np.tensordot(window, kernel.astype(np.float64), axes=3)
-    return y
-
-
 def gradients(x: np.ndarray, kernel: np.ndarray, stride: int, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of the sum of g times `oracle`, into x and into the kernel: one window after the other, in float64."""
+    """Of the sum of g times `convolve`, into x and into the kernel: one window after the other, in float64."""
     dx, dkernel = np.zeros(x.shape), np.zeros(kernel.shape)
     k = len(kernel)
     for i, j in np.ndindex(*g.shape[1:3]):
@@ -49,7 +38,7 @@ def test_forms_agree_to_float32_rounding_forward_and_backward(layer: tuple[int, 
     rng = np.random.default_rng(0)
     x = rng.normal(size=(2, size, size, channels)).astype(np.float32)
     kernel = rng.normal(size=(k, k, channels, features)).astype(np.float32)
-    wanted = oracle(x, kernel, stride)
+    wanted = convolve(x, kernel, 0, stride)
     g = rng.normal(size=wanted.shape).astype(np.float32)
 
     @jax.jit
@@ -82,7 +71,7 @@ def test_shifted_and_its_gradients_equal_the_defining_sums(
     rng = np.random.default_rng(size * 1000 + k * 100 + stride)
     x = rng.normal(size=(1, size, size + 2, channels)).astype(np.float32)
     kernel = rng.normal(size=(k, k, channels, features)).astype(np.float32)
-    wanted = oracle(x, kernel, stride)
+    wanted = convolve(x, kernel, 0, stride)
     g = rng.normal(size=wanted.shape).astype(np.float32)
 
     @jax.jit
@@ -103,7 +92,7 @@ def test_paired_equals_the_defining_sum_for_any_number_of_images(num_images: int
     x = rng.normal(size=(num_images, 9, 11, 3)).astype(np.float32)
     kernel = rng.normal(size=(4, 4, 3, 5)).astype(np.float32)
     y = jax.jit(conv2d, static_argnums=(2, 3))(x, kernel, 2, "paired")
-    np.testing.assert_allclose(y, oracle(x, kernel, 2), atol=1e-4)
+    np.testing.assert_allclose(y, convolve(x, kernel, 0, 2), atol=1e-4)
 
 
 def test_every_form_has_the_same_parameters():

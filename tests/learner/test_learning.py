@@ -8,10 +8,8 @@ XLA's optimization, and held in all 60 runs; each test has the worst value of th
 AMD EPYC of model 17, jax 0.10.2).
 """
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -130,18 +128,8 @@ class Training:
         return self.config.epsilon_start + progress * (self.config.epsilon_end - self.config.epsilon_start)
 
     def __call__(self, seed: int) -> Trained:
-        params, returns = compiled(self)(jax.random.key(seed))
+        params, returns = compiling.training_loop(train, self)(jax.random.key(seed))
         return Trained(self.agent, params, np.asarray(returns))
-
-
-@cache
-def compiled(training: Training) -> Callable[[Array], tuple[Any, Array]]:
-    """Without optimization where no instruction set is asked for: one seed takes two thirds of the time.
-
-    It is XLA's optimized code that differs between instruction sets.
-    """
-    plain = {} if "xla_cpu_max_isa" in os.environ.get("XLA_FLAGS", "") else compiling.TRAINING
-    return jax.jit(partial(train, training), compiler_options=plain)
 
 
 def train(training: Training, key: Array) -> tuple[Any, Array]:

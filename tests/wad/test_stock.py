@@ -1,8 +1,6 @@
 """What is read from the installed engine."""
 
 import importlib.util
-import subprocess
-import sys
 
 import pytest
 
@@ -42,13 +40,3 @@ def test_without_the_engine_the_error_says_what_to_install(monkeypatch: pytest.M
         engine_directory()
     monkeypatch.undo()
     assert engine_directory().is_dir()
-
-
-def test_compiling_a_script_loads_neither_the_engine_nor_jax():
-    program = (
-        "import sys; from gvz.wad.acs import compile_acs; from gvz.wad.stock import stock_textures;"
-        "compile_acs('script 1 OPEN { }'); stock_textures();"
-        "print([m for m in sys.modules if m.split('.')[0] in ('vizdoom', 'jax', 'omg', 'cv2')])"
-    )
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
-    assert result.stdout.strip() == "[]"
