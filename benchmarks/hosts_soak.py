@@ -66,7 +66,7 @@ def soak(options: HostsSoak, cluster: "RayCluster", console: Console) -> dict[st
         samples: list[dict[str, float]] = []
         kills: list[float] = []
         try:
-            run.wait_for_updates(20)
+            run.wait_for_updates()
             console.print(f"warm; {options.minutes:g} minutes of kills begin")
             begin = time.time()
             for now in ticks(options.minutes * 60, options.sample_s):

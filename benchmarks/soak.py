@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -36,6 +37,8 @@ SCHEMA = 1
 """of all records in DIRECTORY, also those of the fuzzing"""
 DIRECTORY = record.ROOT / "results" / "reliability"
 _START_TIMEOUT_S, _STOP_TIMEOUT_S, _CLEARED_S = 900.0, 120.0, 60.0
+_FIRST_UPDATES = 20
+"""gradient steps after which a run is warm"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +66,7 @@ class Watched:
 
     def __init__(self, directory: Path, flags: Sequence[str], environment: Mapping[str, str]):
         self.directory = directory
-        self._before = _shared("ViZDoom")
+        self._before = _shared()
         words = ["--config", "rainbow_4task.py", "--run-dir", str(directory), "--log.period-updates", "5", *flags]
         self.command = [sys.executable, "-m", "gvz.launch", *words]
         self._output = (directory.parent / "output.log").open("w+b")
@@ -82,13 +85,15 @@ class Watched:
         self._output.seek(0)
         return self._output.read().decode(errors="replace")[-4000:]
 
-    def wait_for_updates(self, count: int) -> None:
-        """Waits until metrics.jsonl is past warm-up and `count` updates."""
+    def wait_for_updates(self) -> None:
+        """Waits until metrics.jsonl is past warm-up and the first updates."""
         deadline = time.monotonic() + _START_TIMEOUT_S
-        while not (rows := self.metrics()) or rows[-1]["num_updates"] < count:
+        while not (rows := self.metrics()) or rows[-1]["num_updates"] < _FIRST_UPDATES:
             self.check()
             if time.monotonic() > deadline:
-                raise TimeoutError(f"soak: no {count} updates within {_START_TIMEOUT_S:.0f} s; {self.output()}")
+                raise TimeoutError(
+                    f"soak: no {_FIRST_UPDATES} updates within {_START_TIMEOUT_S:.0f} s; {self.output()}"
+                )
             time.sleep(0.5)
 
     def check(self) -> None:
@@ -126,7 +131,7 @@ class Watched:
 
     def shared_memory(self) -> set[str]:
         """Files of engines in /dev/shm that are newer than the run."""
-        return _shared("ViZDoom") - self._before
+        return _shared() - self._before
 
     def left_behind(self) -> list[str]:
         """Files of the ended run in /dev/shm that no process has mapped.
@@ -149,7 +154,7 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
         kills: list[float] = []
         stretches: list[dict[str, Any]] = []
         try:
-            run.wait_for_updates(20)
+            run.wait_for_updates()
             console.print(f"warm; {options.minutes:g} minutes of kills begin")
             begin = time.time()
             for kind, seconds in _plan(options):
@@ -182,7 +187,7 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
             "kills": kills,
             "stretches": [{k: v if k == "kind" else round(v, 3) for k, v in s.items()} for s in stretches],
             "samples": {name: [sample[name] for sample in samples] for name in samples[0]},
-            "faults": _count(fault["kind"] for fault in faults),
+            "faults": dict(Counter(fault["kind"] for fault in faults)),
             "restarts": int(rows[-1]["actors/restarts"]),
             "updates": rows[-1]["num_updates"],
             "exit_code": code,
@@ -212,9 +217,9 @@ def kill_ratios(made: dict[str, Any]) -> list[float]:
     ]
 
 
-def _shared(prefix: str) -> set[str]:
-    """Names of files in /dev/shm."""
-    return {file.name for file in janitor.SHM_DIR.iterdir() if file.name.startswith(prefix)}
+def _shared() -> set[str]:
+    """Names of engines' files in /dev/shm."""
+    return {file.name for file in janitor.SHM_DIR.iterdir() if file.name.startswith("ViZDoom")}
 
 
 def _unmapped(names: set[str]) -> list[str]:
@@ -257,13 +262,6 @@ def _rate(rows: Sequence[dict[str, Any]], begin: float, stretch: dict[str, Any])
             f"soak: a stretch has {len(mine)} rows of metrics, want 2 or more; make the stretches longer"
         )
     return (mine[-1]["num_updates"] - mine[0]["num_updates"]) / (mine[-1]["time_s"] - mine[0]["time_s"])
-
-
-def _count(kinds: Iterator[str]) -> dict[str, int]:
-    counts: dict[str, int] = {}
-    for kind in kinds:
-        counts[kind] = counts.get(kind, 0) + 1
-    return counts
 
 
 def words_of(options: Any) -> list[str]:
