@@ -26,6 +26,7 @@ from gvz.core import janitor
 from gvz.core.errors import ConfigError, EngineError
 from gvz.engine import process as engine_process
 from gvz.engine import queue_locks
+from gvz.wad.lumps import MAP_NAME
 
 if TYPE_CHECKING:
     from vizdoom import DoomGame, GameState
@@ -52,8 +53,6 @@ class EngineConfig:
     """names of vizdoom.Button, in the order in which `step` takes them"""
     variables: tuple[str, ...]
     """names of vizdoom.GameVariable, in the order of `state.game_variables`"""
-    map_name: str = "MAP01"
-    """the lump of the first map"""
     width: int = 256
     """width of the rendered screen"""
     height: int = 144
@@ -145,7 +144,7 @@ class Engine:
         (self._directory / _MAP_FILE).write_bytes(map_wad)
         if not self._loads_maps:
             self._loads_maps = True
-            self._game.send_game_command(f"set {_MAP_VARIABLE} {self.config.map_name}")
+            self._game.send_game_command(f"set {_MAP_VARIABLE} {MAP_NAME}")
             self._game.set_doom_map(f"${_MAP_VARIABLE}")  # the map that it is on
             self._game.send_game_command(f"set {_MAP_VARIABLE} file:{_MAP_FILE}")  # in its working directory
 
@@ -279,7 +278,7 @@ def _make_game(config: EngineConfig) -> "DoomGame":
     # explicit: by default ViZDoom would load a doom2.wad from the working directory
     game.set_doom_game_path(str(Path(vizdoom.root_path, "freedoom2.wad")))
     game.set_doom_scenario_path(str(config.wad.resolve()))
-    game.set_doom_map(config.map_name)
+    game.set_doom_map(MAP_NAME)
     game.set_doom_skill(3)
     game.set_available_buttons([_member(vizdoom.Button, name) for name in config.buttons])
     game.set_available_game_variables([_member(vizdoom.GameVariable, name) for name in config.variables])

@@ -19,7 +19,7 @@ from gvz.core import janitor
 from gvz.core.errors import EngineError, WadError
 from gvz.engine.engine import Engine, EngineConfig
 from gvz.engine.process import log_tail, one_of
-from gvz.wad.lumps import read_wad
+from gvz.wad.lumps import MAP_NAME, read_wad
 from gvz.wad.stock import engine_directory
 
 _FAULTS = re.compile(
@@ -36,7 +36,7 @@ _TICS = 70
 _NUM_PLACES = 8
 
 
-def probe_wad(wad: Path, map_name: str = "MAP01", timeout_s: float = _TIMEOUT_S) -> str:
+def probe_wad(wad: Path, timeout_s: float = _TIMEOUT_S) -> str:
     """Starts an engine on a scenario file, plays two seconds of its map and returns the engine's log.
 
     Raises:
@@ -46,11 +46,11 @@ def probe_wad(wad: Path, map_name: str = "MAP01", timeout_s: float = _TIMEOUT_S)
         lumps = [lump.name for lump in read_wad(wad.read_bytes())]
     except (OSError, WadError) as error:
         raise EngineError(f"{wad}: not a scenario file: {error}") from error
-    if map_name not in lumps:
-        raise EngineError(f"{wad}: no map {map_name}, only {', '.join(lumps[:8])}; the engine would play another one")
+    if MAP_NAME not in lumps:
+        raise EngineError(f"{wad}: no map {MAP_NAME}, only {', '.join(lumps[:8])}; the engine would play another one")
     with janitor.temporary_directory() as directory:
         log = directory / "engine.log"
-        arguments = (os.getpid(), wad, map_name, log, timeout_s)
+        arguments = (os.getpid(), wad, log, timeout_s)
         command = [sys.executable, "-m", "gvz.engine.probe", *map(str, arguments)]
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
@@ -105,16 +105,14 @@ def ensure_loads(wad: Path) -> None:
                 marker.touch()
 
 
-def _main(parent_pid: int, wad: str, map_name: str, log: str, timeout_s: float, alone: bool) -> None:
+def _main(parent_pid: int, wad: str, log: str, timeout_s: float, alone: bool) -> None:
     janitor.die_with_parent(parent_pid)
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_CPU, (int(timeout_s) + 1, int(timeout_s) + 1))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     if alone:
         _become_engine(Path(wad).resolve(), Path(log).parent)
-    config = EngineConfig(
-        wad=Path(wad), map_name=map_name, buttons=(), variables=(), log=Path(log), step_timeout_s=timeout_s / 4
-    )
+    config = EngineConfig(wad=Path(wad), buttons=(), variables=(), log=Path(log), step_timeout_s=timeout_s / 4)
     engine = Engine(config)
     try:
         engine.new_episode(seed=0)
@@ -135,5 +133,5 @@ def _become_engine(wad: Path, directory: Path) -> NoReturn:
 
 
 if __name__ == "__main__":
-    parent, file, name, output, limit, *rest = sys.argv[1:]
-    _main(int(parent), file, name, output, float(limit), alone=rest == ["alone"])
+    parent, file, output, limit, *rest = sys.argv[1:]
+    _main(int(parent), file, output, float(limit), alone=rest == ["alone"])

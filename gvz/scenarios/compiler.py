@@ -30,12 +30,10 @@ from gvz.scenarios.map_set import MapSet
 from gvz.scenarios.severity import graded, in_force, is_whole
 from gvz.wad.acs import compile_acs
 from gvz.wad.decorate import declared_actors, declared_numbers, used_sprites
-from gvz.wad.lumps import read_maps, read_wad, write_map_wad
+from gvz.wad.lumps import MAP_NAME, read_maps, read_wad, write_map_wad
 from gvz.wad.stock import scenario_wad, stock_editor_numbers, stock_sprites, stock_textures
 from gvz.wad.textures import blended, check_textures
 from gvz.wad.udmf import UdmfMap, is_inside, make_thing, parse_textmap, write_textmap
-
-MAP_NAME = "MAP01"
 
 _NUMBER = re.compile(r"(?<![\w.-])(?:[0-9]+\.[0-9]+|[0-9]{7,})(?![\w.])")
 """a fixed-point number or a large integer in a script"""

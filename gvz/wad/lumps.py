@@ -14,6 +14,8 @@ from gvz.core.errors import WadError
 
 HEADER = struct.Struct("<4sii")
 ENTRY = struct.Struct("<ii8s")
+MAP_NAME = "MAP01"
+"""the map that is played of every scenario file"""
 _NAME = re.compile(r"[!-~]{1,8}")
 
 
@@ -113,9 +115,8 @@ def write_map_wad(
     scripts: str,
     decorate: str = "",
     textures: str = "",
-    map_name: str = "MAP01",
 ) -> bytes:
-    """Writes a WAD with one map; the same arguments give the same bytes.
+    """Writes a WAD with one map, MAP_NAME; the same arguments give the same bytes.
 
     There are no nodes (ZNODES): the engine builds them in a few milliseconds, and outdated nodes would be wrong.
 
@@ -125,14 +126,13 @@ def write_map_wad(
         scripts: their source, for a reader who opens the map in an editor; the engine does not read it.
         decorate: actor definitions; no lump if empty.
         textures: definitions of textures; no lump if empty.
-        map_name: name of the map.
 
     Raises:
-        WadError: a text has a character outside Latin-1, or `map_name` is not a lump name.
+        WadError: a text has a character outside Latin-1.
     """
     lumps = [
         *(Lump(name, _encode(name, text)) for name, text in (("DECORATE", decorate), ("TEXTURES", textures)) if text),
-        Lump(map_name, b""),
+        Lump(MAP_NAME, b""),
         Lump("TEXTMAP", _encode("TEXTMAP", textmap)),
         Lump("BEHAVIOR", behavior),
         Lump("SCRIPTS", _encode("SCRIPTS", scripts)),

@@ -64,9 +64,13 @@ def test_the_place_of_a_file_is_no_complaint(tmp_path: Path):
     assert "adding" in probe_wad(Path(shutil.copy(STOCK_WAD, place)))
 
 
-def test_a_file_without_the_map_is_an_error():
-    with pytest.raises(EngineError, match="no map MAP77, only DECORATE, MAP01"):
-        probe_wad(STOCK_WAD, "MAP77")
+def test_a_file_without_the_map_is_an_error(tmp_path: Path):
+    wad = tmp_path / "other.wad"
+    names = {"MAP01": "MAP77"}
+    lumps = [Lump(names.get(lump.name, lump.name), lump.data) for lump in read_wad(STOCK_WAD.read_bytes())]
+    wad.write_bytes(write_wad(lumps))
+    with pytest.raises(EngineError, match=r"other\.wad: no map MAP01, only DECORATE, MAP77"):
+        probe_wad(wad)
 
 
 @pytest.mark.parametrize(("content", "message"), [(b"nonsense", "want b'IWAD' or b'PWAD'"), (None, "No such file")])

@@ -17,8 +17,9 @@ from typing import Any
 import vizdoom
 
 from gvz.scenarios.base import BOOKKEEPING
-from gvz.scenarios.compiler import MAP_NAME, build_wad, compile_task, map_source
+from gvz.scenarios.compiler import build_wad, compile_task, map_source
 from gvz.tasks import parse_task
+from gvz.wad.lumps import MAP_NAME
 
 PROBE = """
 global int 41:health; global int 42:speed; global int 43:render_style; global int 44:scale_x; global int 45:scale_y;

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from gvz.scenarios.base import Uniform
-from gvz.scenarios.compiler import MAP_NAME, map_source, task_content
+from gvz.scenarios.compiler import map_source, task_content
 from gvz.tasks import named_tasks, parse_task
-from gvz.wad.lumps import read_maps, read_wad
+from gvz.wad.lumps import MAP_NAME, read_maps, read_wad
 from gvz.wad.stock import engine_directory
 from gvz.wad.udmf import UdmfMap, parse_textmap
 

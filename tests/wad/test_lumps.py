@@ -117,8 +117,8 @@ def test_a_map_wad_has_its_lumps_in_the_fixed_order():
 
 
 def test_a_map_wad_has_no_lumps_for_empty_texts():
-    data = write_map_wad(textmap="t", behavior=b"b", scripts="s", map_name="E1M1")
-    assert [lump.name for lump in read_wad(data)] == ["E1M1", "TEXTMAP", "BEHAVIOR", "SCRIPTS", "ENDMAP"]
+    data = write_map_wad(textmap="t", behavior=b"b", scripts="s")
+    assert [lump.name for lump in read_wad(data)] == ["MAP01", "TEXTMAP", "BEHAVIOR", "SCRIPTS", "ENDMAP"]
 
 
 def test_a_character_beyond_latin_1_is_refused_by_line():
