@@ -40,7 +40,6 @@ _WEAPON_UP_TIC = 10
 """tic at which the weapon is ready: episodes with a weapon start there, as LevDoom's do"""
 _COUNTED = {"kills": "KILLCOUNT", "goals": "GOALS"}
 """metric -> the variable that counts it"""
-_SOLVED_EPISODES = 10
 _MAX_CRASHES = 3
 """crashes in a row, without a complete episode in between, after which the environment raises an error"""
 
@@ -373,11 +372,6 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
 def make_env(task_id: str, env_config: Mapping[str, Any], **options: Any) -> DoomEnv:
     """A DoomEnv from plain data: fields of EnvConfig, and options of DoomEnv. Actors call this."""
     return DoomEnv(task_id, **env_config, **options)
-
-
-def is_solved(solved_episodes: Sequence[bool]) -> bool:
-    """Whether a survival scenario is solved: the last ten episodes all reached the time-out (thesis 3.1)."""
-    return len(solved_episodes) >= _SOLVED_EPISODES and all(solved_episodes[-_SOLVED_EPISODES:])
 
 
 def _with_fields(config: EnvConfig, fields: Mapping[str, Any]) -> EnvConfig:

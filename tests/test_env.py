@@ -19,7 +19,7 @@ import gvz
 from gvz.actions import AXES_V1
 from gvz.core.errors import ConfigError, TaskError
 from gvz.engine.engine import Engine
-from gvz.env import DoomEnv, is_solved, make_env
+from gvz.env import DoomEnv, make_env
 from gvz.tasks import parse_task
 from tests.episodes import TURN, fingerprint, idle_to_the_end, play
 
@@ -191,13 +191,6 @@ def test_the_time_out_truncates_exactly_there_with_its_own_frame(frame_skip: int
     assert (observation != steps[-2][0]).any()
     np.testing.assert_array_equal(observation, cv2.resize(env.render(), (84, 84), interpolation=cv2.INTER_LINEAR))
     env.close()
-
-
-def test_ten_episodes_in_a_row_solve():
-    assert is_solved([True] * 10)
-    assert is_solved([False] + [True] * 10)
-    assert not is_solved([True] * 9)
-    assert not is_solved([True] * 10 + [False])
 
 
 def test_steps_outside_an_episode_are_refused(shared: DoomEnv):
