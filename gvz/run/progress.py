@@ -163,10 +163,20 @@ class _Lossy:
     def _lossy(self) -> Generator[None]:
         try:
             yield
-        except BrokenPipeError:  # nobody will ever read it, and Python writes what is left at the end of the process
-            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
-        except OSError:  # such as a full disk, which may have room again
-            pass
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                self._drop(for_good=isinstance(error, BrokenPipeError))  # else a full disk, which may have room again
+
+    def _drop(self, *, for_good: bool) -> None:
+        """Writes what is left to nowhere. Python would try once more at the end of the process, and fail."""
+        number = self._stream.fileno()
+        kept, nowhere = os.dup(number), os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, number)
+        self._stream.flush()
+        if not for_good:
+            os.dup2(kept, number)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def stderr_console() -> Console:

@@ -90,9 +90,11 @@ print("goes on")
 """
 
 
+@pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.mark.parametrize("where", ["pipe without a reader", "full disk", "closed"])
-def test_progress_that_nobody_can_see_stops_nothing(where):
-    """As in `gvz train 2>&1 | tee log`, of which Ctrl-C ends both."""
+def test_progress_that_nobody_can_see_stops_nothing(where, unbuffered):
+    """As in `gvz train 2>&1 | tee log`, of which Ctrl-C ends both. What Python keeps in a buffer, it writes at its end."""
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     with contextlib.ExitStack() as until_closed:
         if where == "full disk":
             stderr = until_closed.enter_context(Path("/dev/full").open("w"))
@@ -102,7 +104,9 @@ def test_progress_that_nobody_can_see_stops_nothing(where):
             until_closed.callback(os.close, stderr)
         closing = [] if where != "closed" else ["bash", "-c", 'exec "$@" 2>&-', "bash"]
         command = [*closing, sys.executable, "-c", SPEAKING]
-        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=stderr, text=True, timeout=120, check=False)
+        done = subprocess.run(
+            command, stdout=subprocess.PIPE, stderr=stderr, text=True, timeout=120, check=False, env=environment
+        )
     assert (done.returncode, done.stdout) == (0, "goes on\n")
 
 
