@@ -93,7 +93,7 @@ print("goes on")
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.mark.parametrize("where", ["pipe without a reader", "full disk", "closed"])
 def test_progress_that_nobody_can_see_stops_nothing(where, unbuffered):
-    """As in `gvz train 2>&1 | tee log`, of which Ctrl-C ends both. What Python keeps in a buffer, it writes at its end."""
+    """As in `gvz train 2>&1 | tee log`, of which Ctrl-C ends both. Python writes its buffer once more at its end."""
     environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     with contextlib.ExitStack() as until_closed:
         if where == "full disk":
