@@ -10,7 +10,7 @@ class TaskKpis:
 
     KPI_j is the mean of task j's last `kpi_window_episodes` scores (fewer at the start), and
     w_j = max_i KPI_i / KPI_j. Source: thesis eq. 4.19, 4.20. Differs: a weight is at most `kpi_max_weight` (the
-    thesis divides by zero for KPI 0), and all weights are 1 until every task has finished an episode.
+    thesis divides by zero for KPI 0). A task that has not finished an episode has weight 1, and no part in the maximum.
     """
 
     def __init__(self, num_tasks: int, config: LearnerConfig):
@@ -44,12 +44,12 @@ class TaskKpis:
     def weights(self) -> np.ndarray:
         """float32[num_tasks]: what a sample's loss is multiplied by; all 1 if `kpi_weighting` is off."""
         kpis = self.kpis()
-        ones = np.ones(len(kpis), np.float32)
-        if not self._config.kpi_weighting or np.isnan(kpis).any() or kpis.max() == 0:
-            return ones
-        bound = self._config.kpi_max_weight
+        best, bound = np.nanmax(kpis, initial=0.0), self._config.kpi_max_weight
+        if not self._config.kpi_weighting or best == 0:
+            return np.ones(len(kpis), np.float32)
+        kpis = np.nan_to_num(kpis, nan=best)
         # max / KPI >= bound is KPI <= max / bound: no division by a KPI of 0.
-        return np.where(kpis * bound <= kpis.max(), bound, kpis.max() / np.maximum(kpis, 1e-300)).astype(np.float32)
+        return np.where(kpis * bound <= best, bound, best / np.maximum(kpis, 1e-300)).astype(np.float32)
 
     def state(self) -> dict[str, np.ndarray]:
         """Copies of all that is remembered, for a checkpoint."""

@@ -196,11 +196,11 @@ class QNetwork(nn.Module):
         first, num_atoms = self.first_outputs, len(self.first_outputs)
         if not self.dueling:
             q = self._stream("q", x, first * self.num_actions, noise)
-            return q.reshape(-1, self.num_actions, num_atoms).astype(jnp.float32)
+            return q.reshape(-1, self.num_actions, num_atoms)
         value = self._stream("value", x, first, noise)[:, None, :]  # [B, 1, N]
         advantage = self._stream("advantage", x, (0.0,) * (self.num_actions * num_atoms), noise)
         advantage = advantage.reshape(-1, self.num_actions, num_atoms)  # [B, A, N]
-        return (value + advantage - advantage.mean(axis=1, keepdims=True)).astype(jnp.float32)
+        return value + advantage - advantage.mean(axis=1, keepdims=True)
 
     def _stream(self, name: str, x: Array, first: tuple[float, ...], noise: dict[str, Array]) -> Array:
         """Hidden layer, rectifier, output layer, which answers `first` until it has learnt."""
@@ -209,7 +209,8 @@ class QNetwork(nn.Module):
         h = hidden(x, noise.get(f"{name}_hidden"))
         if self.layer_norm:
             h = nn.LayerNorm(dtype=h.dtype, name=f"{name}_norm")(h)
-        return output(nn.relu(h), noise.get(f"{name}_output"))
+        # float32 whatever the activations: in bfloat16 action values of 8 to 16 would be multiples of 1/16
+        return output(nn.relu(h).astype(jnp.float32), noise.get(f"{name}_output"))
 
 
 @cache

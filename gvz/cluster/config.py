@@ -26,7 +26,8 @@ class ClusterConfig:
     """batches of a host that may be under way or wait for the learner; more hide a slow network, and make records
     older"""
     batch_records: int = 512
-    """step records of a batch; a host that plays slowly sends fewer"""
+    """step records of a batch; a host that plays slowly sends fewer. With an on-policy agent at most a rollout of the
+    host's games"""
     compress: bool = True
     """send frames compressed (zstd, level 1): two fifths of the bytes, for some 60 microseconds of processor time a
     frame of 84x84x3"""

@@ -14,6 +14,7 @@ from actors.inline import InlinePool
 from actors.placement import actor_cores, in_words
 from actors.pool import Pool, PoolConfig
 from actors.process_pool import ProcessPool
+from gvz.cluster.config import ClusterConfig
 from gvz.core.env_config import SIGHT_CLASSES, SIGHT_COLUMNS
 from gvz.core.errors import ConfigError
 from gvz.run.config import RunConfig, off_policy
@@ -54,7 +55,7 @@ class RunParts:
         if config.cluster.hosts:
             from gvz.cluster.pool import cluster_pool  # needs the extra `cluster`
 
-            return cluster_pool(self.pool_config, config.cluster, state)
+            return cluster_pool(self.pool_config, hosts_config(config), state)
         on_device = config.actors.inference == "device"
         return ProcessPool(self.pool_config, state, partial(DevicePolicy, self.learner.agent) if on_device else None)
 
@@ -151,9 +152,23 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
 def _transport_bytes(config: RunConfig, pool: PoolConfig) -> int:
     """What lies between the games and the learner in this machine's memory."""
     if config.cluster.hosts:
-        batch = config.cluster.batch_records * (pool.record_dtype.itemsize + math.prod(pool.frame_shape))
-        return config.cluster.hosts * (config.cluster.credits + 1) * batch
+        cluster = hosts_config(config)
+        batch = cluster.batch_records * (pool.record_dtype.itemsize + math.prod(pool.frame_shape))
+        return cluster.hosts * (cluster.credits + 1) * batch
     return 0 if config.mode == "sync" else pool.shared_memory_bytes()
+
+
+def hosts_config(config: RunConfig) -> ClusterConfig:
+    """The hosts' settings.
+
+    A batch is sorted by game. With more than a rollout of its host's games in it, an on-policy learner would have
+    rollouts of half of the games in turn.
+    """
+    cluster, learner = config.cluster, config.learner
+    if not isinstance(learner, OnPolicyConfig):
+        return cluster
+    of_a_rollout = config.num_lanes // cluster.hosts * learner.rollout_steps
+    return dataclasses.replace(cluster, batch_records=min(cluster.batch_records, of_a_rollout))
 
 
 def _on_hosts(config: RunConfig) -> str:

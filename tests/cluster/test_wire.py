@@ -1,5 +1,9 @@
 """Batches: what a host sends comes back whole, sorted by lane, and nothing else is taken for one."""
 
+import dataclasses
+from collections import deque
+from itertools import cycle
+
 import msgspec
 import numpy as np
 import pytest
@@ -8,8 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gvz.cluster import wire
+from gvz.cluster.config import ClusterConfig
 from gvz.core.errors import TransportError
+from gvz.run.assemble import hosts_config
+from gvz.run.config_files import load_config
 from gvz.transport.messages import Ready, StepBlock, Stop, step_dtype
+from learner.rollouts import Rollouts, RolloutSpec
 
 SHAPE = (6, 5, 3)
 HEADER = wire.BatchHeader(run_id="r", host=2, incarnation=1, number=7, actors_ready=3, waited_for_space_s=0.5)
@@ -40,6 +48,35 @@ def test_a_batch_comes_back_sorted_by_lane_and_in_order_within_one(compress, num
     assert batch.messages == [Ready(actor=1, pid=2), Stop()]
     assert (batch.header.host, batch.header.number, batch.header.waited_for_space_s) == (2, 7, 0.5)
     assert len(batch) == 200
+
+
+def test_each_rollout_has_a_window_of_every_game_of_two_hosts():
+    """A batch is sorted by game. With 300 records or more in it, rollouts had two windows of half of the games."""
+    config = dataclasses.replace(load_config("ppo_quick"), cluster=ClusterConfig(address="10.0.0.1:6379", hosts=2))
+    lanes, num_steps = config.num_lanes, config.learner.rollout_steps
+    size, history = hosts_config(config).batch_records, 4
+    spec = RolloutSpec(
+        num_lanes=lanes, capacity=lanes * (history + num_steps), frame_shape=SHAPE, num_tasks=lanes, stack_size=history
+    )
+    rollouts, begun, waiting, hosts = Rollouts(spec), np.zeros(lanes, bool), deque[StepBlock](), cycle((0, 1))
+    found = []
+    while len(found) < 8:
+        if not (allowed := rollouts.num_records_allowed()):
+            found.append(np.bincount(rollouts.take(0).windows.task.reshape(lanes, -1)[:, -1], minlength=lanes))
+            continue
+        if not waiting:
+            turn, game = np.divmod(np.arange(size), lanes // 2)
+            mine = next(hosts) * (lanes // 2) + game
+            made = block(mine.tolist())
+            made.steps["task"] = mine
+            made.steps["first"] = ~begun[mine] & (turn == 0)
+            begun[mine] = True
+            waiting.append(unpack(wire.pack(HEADER, [], [made], compress=False), size).block)
+        came = waiting.popleft()
+        rollouts.add([StepBlock(came.steps[:allowed], came.frames[:allowed])])
+        if len(came) > allowed:
+            waiting.append(StepBlock(came.steps[allowed:], came.frames[allowed:]))
+    assert all((of_games == 1).all() for of_games in found), found
 
 
 def test_a_batch_may_be_empty():

@@ -32,6 +32,13 @@ def plain_config(name: str) -> ValueConfig:
     return RAINBOW if name == "rainbow" else config
 
 
+def test_a_loss_of_sight_does_not_learn_from_frames_that_are_moved_aside():
+    replace(RAINBOW, sight_weight=0.1, augmentations=("shift",), sight_augmentations=("gamma", "vertical_shift"))
+    for fields in ({"augmentations": ("shift",)}, {"sight_augmentations": ("gamma", "shift")}):
+        with pytest.raises(ConfigError, match="sight_weight: got frames that `shift` moves aside"):
+            replace(RAINBOW, sight_weight=0.1, **fields)
+
+
 @pytest.fixture(scope="session")
 def agent_file(tmp_path_factory) -> Path:
     """The agent that docs/AGENTS.md writes, as a file."""

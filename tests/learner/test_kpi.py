@@ -16,8 +16,11 @@ def played(*episodes: tuple[int, float], config: LearnerConfig = CONFIG, num_tas
     return kpis
 
 
-def test_weights_are_one_until_every_task_has_an_episode():
-    np.testing.assert_array_equal(played((0, 5.0), (1, 1.0)).weights(), [1, 1, 1])
+def test_a_task_without_an_episode_has_weight_one_and_no_part_in_the_others():
+    """As with `curriculum.kind` level, whose harder tasks are not played for long."""
+    np.testing.assert_array_equal(played().weights(), [1, 1, 1])
+    np.testing.assert_array_equal(played((1, 5.0)).weights(), [1, 1, 1])
+    np.testing.assert_array_equal(played((0, 5.0), (1, 1.0)).weights(), [1, 5, 1])
 
 
 def test_weight_is_the_largest_kpi_over_the_own():

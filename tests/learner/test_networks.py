@@ -227,3 +227,13 @@ def test_bfloat16_activations_keep_float32_parameters_and_outputs():
     assert logits.dtype == jnp.float32
     np.testing.assert_allclose(logits, apply(params, obs), atol=0.05)
     assert float(jnp.abs(logits - apply(params, obs)).max()) > 0
+
+
+def test_large_values_from_bfloat16_activations_are_no_multiples_of_a_sixteenth():
+    """A sum in bfloat16 has 8 digits: between 8 and 16 they are 1/16 apart, more than actions are."""
+    config = replace(TINY, dueling=False, noisy="off", distributional=False, activation_dtype="bfloat16")
+    params, apply, obs = tiny(config)
+    params["params"]["q_output"]["bias"] = jnp.full_like(params["params"]["q_output"]["bias"], 12.0)
+    values = np.asarray(apply(params, obs))
+    assert ((values > 8) & (values < 16)).all()
+    assert (values != values.astype(jnp.bfloat16)).mean() > 0.5

@@ -73,6 +73,11 @@ class RainbowConfig(ValueConfig):
                 f"agent.sight_augmentations: got {' '.join(self.sight_augmentations)} without a loss that reads them; "
                 "set agent.sight_weight, such as 0.1"
             )
+        if self.learns_sight and "shift" in (self.sight_augmentations or self.augmentations):
+            raise ConfigError(
+                "agent.sight_weight: got frames that `shift` moves aside, while what is in sight of a column stays; "
+                "want agent.sight_augmentations without shift, such as vertical_shift"
+            )
         if self.v_min is not None and self.v_max is not None and not self.v_min < self.v_max:
             raise ConfigError(f"agent.v_min, v_max: got {self.v_min}, {self.v_max}, want v_min < v_max")
 
