@@ -55,7 +55,7 @@ def means(of_agents: Mapping[str, Scores]) -> list[str]:
 
 def in_words(numbers: list[str]) -> str:
     """Numbers, one for each scenario, as a sentence lists them."""
-    return f"{', '.join(numbers[:-1])} and {numbers[-1]}"
+    return " and ".join([*filter(None, [", ".join(numbers[:-1])]), numbers[-1]])
 
 
 def of_first_seed(episodes: polars.DataFrame) -> polars.DataFrame:

@@ -14,7 +14,7 @@ AGENTS = {
     "4 tasks": ("general_train4", "rainbow_segmented+train4_network"),
     "8 tasks": ("general_short", "rainbow_segmented"),
 }
-LONGER = ("defend_the_center", "health_gathering", "seek_and_kill")
+LONGER = ("health_gathering",)
 STEPS = "general_train4{}/runs/**/metrics.jsonl.gz"
 
 
@@ -92,12 +92,7 @@ def test_the_findings_say_what_six_times_the_time_gave_on_four_training_tasks(sc
         for name in LONGER
     ]
     assert f"with the same time: {in_words(less)}." in WORDS
-    unseen = (
-        "defend_the_center/gore+mossy_bricks",
-        "health_gathering/poison+resized_kits+shaded_kits",
-        "seek_and_kill/blue+shadows",
-    )
-    for task in unseen:
+    for task in ("health_gathering/poison+resized_kits+shaded_kits",):
         name, _, of_task = task.partition("/")
         short, four, eight = (
             np.mean([by_task[task].mean() for by_task in found.runs.values()])
@@ -105,7 +100,8 @@ def test_the_findings_say_what_six_times_the_time_gave_on_four_training_tasks(sc
         )
         assert f"`{of_task}` has {four:.0f} (after 900 seconds {short:.0f}, with eight tasks {eight:.0f})" in WORDS
     steps = sorted(rows_of(file)[-1]["num_updates"] for file in (ROOT / "results").glob(STEPS.format("_long")))
-    assert f"{steps[0]:,} to {steps[-1]:,} gradient steps, 50 episodes" in WORDS
+    assert f"training seed 1111; {steps[0]:,} gradient steps, 50 episodes" in WORDS
+    assert len(steps) == 1
 
 
 def test_the_findings_say_how_long_agents_of_four_training_tasks_learned():
