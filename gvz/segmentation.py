@@ -6,6 +6,7 @@ labels; whoever plays needs none.
 """
 
 import dataclasses
+import hashlib
 import shutil
 from collections.abc import Iterable
 from functools import cache
@@ -15,7 +16,7 @@ import cv2
 import numpy as np
 
 from gvz.core.env_config import LABEL_CLASSES, EnvConfig
-from gvz.core.errors import ConfigError, nearest
+from gvz.core.errors import ConfigError, ResumeError, nearest
 
 SEGMENTERS = Path(__file__).parent / "segmenters"
 KEPT_SEGMENTERS = "segmenters"
@@ -150,6 +151,31 @@ def keep_segmenters(scenarios: Iterable[str], config: EnvConfig, directory: Path
                 unfinished = kept.with_suffix(".unfinished")
                 shutil.copyfile(segmenter_file(scenario, config), unfinished)
                 unfinished.replace(kept)
+
+
+def kept_digests(directory: Path) -> dict[str, str]:
+    """Scenario -> digest of the network that `keep_segmenters` has put into a directory."""
+    return {file.stem: _digest(file) for file in sorted(directory.glob("*.onnx"))}
+
+
+def check_installed(scenarios: Iterable[str], config: EnvConfig, directory: Path) -> None:
+    """Refuses to go on with other networks than those that `keep_segmenters` has put into a directory.
+
+    Raises:
+        ResumeError: names the scenarios whose configured network is another one.
+    """
+    kept = kept_digests(directory)
+    changed = [name for name in scenarios if name in kept and kept[name] != _digest(segmenter_file(name, config))]
+    if changed:
+        raise ResumeError(
+            f"env.segmenter: the networks for {', '.join(changed)} that are installed are not those in {directory}, "
+            "with which the run has learned, and hosts use the installed ones; install the version that the run began "
+            "with, or give another --run-dir"
+        )
+
+
+def _digest(file: Path) -> str:
+    return hashlib.blake2b(file.read_bytes(), digest_size=8).hexdigest()
 
 
 def with_kept_segmenters(config: EnvConfig, directory: Path) -> EnvConfig:

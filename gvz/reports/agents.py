@@ -102,6 +102,7 @@ def pooled_runs(runs: Sequence[Run], agents: Mapping[str, str], evaluated: Mappi
             for run in of_agent
             if _is_of_a_set(run) and run.path in settings
         ]
+        problems += _of_other_networks(of_agent)
         for one, other in itertools.combinations(of_agent, 2):
             both = evaluated.get(str(one.path), set()) & evaluated.get(str(other.path), set())
             if one.seed == other.seed and one.tasks == other.tasks and both:
@@ -110,6 +111,20 @@ def pooled_runs(runs: Sequence[Run], agents: Mapping[str, str], evaluated: Mappi
                     "if they were of one run; leave one out"
                 )
     return problems
+
+
+def _of_other_networks(of_agent: Sequence[Run]) -> Iterator[str]:
+    """Runs that learned with another segmentation network than an earlier one of this agent, if both have noted it."""
+    first: dict[str, tuple[object, Run]] = {}
+    for run in of_agent:
+        networks = run.starts[-1].get("segmenters") if run.starts else None
+        for scenario, digest in networks.items() if isinstance(networks, dict) else ():
+            known, earlier = first.setdefault(scenario, (digest, run))
+            if known != digest:
+                yield (
+                    f"{run.path}: put together with {earlier.path}, which learned with another segmentation network of "
+                    f"{scenario}"
+                )
 
 
 def _is_of_a_set(run: Run) -> bool:

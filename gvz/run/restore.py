@@ -10,6 +10,7 @@ from gvz.core.errors import CheckpointError, GvzError
 from gvz.run import machine
 from gvz.run.group import Group
 from gvz.run.rundir import START_RECORDS, RunDir
+from gvz.segmentation import KEPT_SEGMENTERS, kept_digests
 from learner.checkpoint import Restored, restore_newest
 
 
@@ -44,7 +45,8 @@ def restore(run: RunDir, template: Any, group: Group, say: Callable[[str], None]
 def note_start(run: RunDir, restored: Restored | None) -> None:
     """Adds a row of this start to the records: from which update, when, and on what machine."""
     num_updates = 0 if restored is None else restored.num_updates
-    run.append(START_RECORDS, {"num_updates": num_updates, "time_s": time.time(), **machine.describe()})
+    networks = {"segmenters": found} if (found := kept_digests(run.path / KEPT_SEGMENTERS)) else {}
+    run.append(START_RECORDS, {"num_updates": num_updates, "time_s": time.time(), **machine.describe(), **networks})
 
 
 @contextlib.contextmanager

@@ -28,7 +28,7 @@ from gvz.run.restore import note_start, restore, state_checked
 from gvz.run.rundir import RunDir, disk_checked
 from gvz.run.saver import Saver, Snapshot
 from gvz.run.telemetry import Telemetry
-from gvz.segmentation import KEPT_SEGMENTERS, keep_segmenters, with_kept_segmenters
+from gvz.segmentation import KEPT_SEGMENTERS, check_installed, keep_segmenters, with_kept_segmenters
 from gvz.transport.messages import EpisodeStats, Fault, ParamsHeader
 from learner.checkpoint import Restored
 from learner.memory import keep_freed_memory
@@ -211,11 +211,15 @@ class Trainer:
 def with_own_segmenters(config: RunConfig, run: RunDir) -> RunConfig:
     """The configuration with the run's own copies of its segmentation networks. Other hosts have no copies; games there
     use the networks that are installed.
+
+    Raises:
+        ResumeError: those are not the run's.
     """
-    own = run.path / KEPT_SEGMENTERS
+    own, scenarios = run.path / KEPT_SEGMENTERS, [scenario.id for scenario in config.table.scenarios]
     with disk_checked(run.path):
-        keep_segmenters([scenario.id for scenario in config.table.scenarios], config.env, own)
+        keep_segmenters(scenarios, config.env, own)
     if config.cluster.hosts:
+        check_installed(scenarios, config.env, own)
         return config
     return dataclasses.replace(config, env=with_kept_segmenters(config.env, own))
 

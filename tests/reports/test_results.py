@@ -134,6 +134,23 @@ def test_runs_of_an_experiment_with_other_settings_are_put_together_and_named(sm
                             "discount 0.99")  # fmt: skip
 
 
+def test_seeds_that_learned_with_other_networks_are_named(small, tmp_path):
+    shutil.copytree(small, tmp_path / "r")
+    one = sorted((tmp_path / "r" / "runs" / "rainbow_4task" / "defend_the_center" / "train4").iterdir())[0]
+    for seed, digest in ((2222, "a"), (3333, "b")):
+        other = one.with_name(f"seed_{seed}")
+        shutil.copytree(one, other, dirs_exist_ok=True)
+        saved = json.loads((other / "config.json").read_text())
+        saved["config"]["seed"] = seed
+        (other / "config.json").write_text(json.dumps(saved))
+        write_rows(other / "starts.jsonl", [{"num_updates": 0, "segmenters": {"defend_the_center": digest}}])
+    (problem,) = read_results([tmp_path / "r"]).problems
+    assert problem == (
+        f"{one.with_name('seed_3333')}: put together with {one.with_name('seed_2222')}, which learned with another "
+        "segmentation network of defend_the_center"
+    )
+
+
 def test_a_seed_that_is_there_twice_is_named(copied, tmp_path):
     copied("a/run")
     copied("b/run")

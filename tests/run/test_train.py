@@ -1,5 +1,6 @@
 """The training loop in this process, on real Doom: what a resumed run goes on with, and the last row of its metrics."""
 
+import hashlib
 import re
 import signal
 from dataclasses import replace
@@ -13,6 +14,7 @@ from actors.config import ActorsConfig
 from gvz.cluster.config import ClusterConfig
 from gvz.core import records
 from gvz.core.env_config import EnvConfig
+from gvz.core.errors import ResumeError
 from gvz.core.stop import StopRequest
 from gvz.run.config import LogConfig, RunConfig
 from gvz.run.curriculum_config import CurriculumConfig
@@ -71,7 +73,12 @@ def test_a_run_keeps_the_network_of_its_segmented_frames_and_goes_on_with_it(tmp
         on_hosts = replace(
             config, cluster=ClusterConfig(address="127.0.0.1:6379", hosts=2), mode="async", replay=ReplayConfig()
         )
+        with pytest.raises(ResumeError, match="networks for defend_the_center that are installed are not those in"):
+            with_own_segmenters(on_hosts, run)
+        network.write_bytes(first)
         assert with_own_segmenters(on_hosts, run).env == env, "another host has no copies"
+    digests = [row["segmenters"] for row in records.read(path / "starts.jsonl")[0]]
+    assert digests == [{"defend_the_center": hashlib.blake2b(first, digest_size=8).hexdigest()}] * 2
 
 
 def test_actors_find_the_networks_of_a_run_whose_directory_is_relative(tmp_path, monkeypatch):
