@@ -10,11 +10,12 @@ import io
 import json
 import os
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
+from gvz.core.durable import fsync
 from gvz.core.errors import GvzError
 
 SCHEMA = 1
@@ -37,12 +38,14 @@ class Writer:
         self._file: io.FileIO | None = None
 
     def lock(self) -> bool:
-        """Makes this process the only one that may write, until it closes the file; False if another one is.
+        """Makes this process the only one that may write, until it closes the file; False if another one is, or has
+        just put another file in its place.
 
         Raises:
             OSError: the file cannot be opened.
         """
-        return lock(self._opened())
+        file = self._opened()
+        return lock(file) and os.path.samestat(os.fstat(file.fileno()), self._path.stat())
 
     def append(self, row: dict[str, Any]) -> None:
         """Adds a row.
@@ -199,6 +202,44 @@ def cut(path: Path, length: int, rest: Path) -> int:
         kept.flush()  # on a full disk this fails, and nothing is cut
         file.truncate(length)
     return num_bytes
+
+
+def split(path: Path, leaves: Callable[[dict[str, Any]], bool]) -> tuple[bytes, bytes]:
+    """The lines of a record file that stay in it, damaged ones among them, and the rows that leave it."""
+    parts = bytearray(), bytearray()
+    for line in path.read_bytes().splitlines(keepends=True):
+        try:
+            row = json.loads(line)
+        except (ValueError, RecursionError):
+            row = None
+        parts[isinstance(row, dict) and leaves(row)].extend(line)
+    return bytes(parts[0]), bytes(parts[1])
+
+
+def move_rows(path: Path, leaves: Callable[[dict[str, Any]], bool], rest: Path) -> None:
+    """Moves rows of a record file that this process has locked to the end of `rest`. After a power cut the file is the
+    old one or the new one, and no row is lost.
+
+    Raises:
+        OSError: the disk does not take them; the file is as it was.
+    """
+    stay, leave = split(path, leaves)
+    if not leave:
+        return
+    rest.parent.mkdir(exist_ok=True)
+    with rest.open("ab") as kept:
+        kept.write(leave if leave.endswith(b"\n") else leave + b"\n")
+    fsync(rest)
+    fsync(rest.parent)
+    temporary = path.with_name(f"{path.name}.tmp")
+    try:
+        temporary.write_bytes(stay)
+        fsync(temporary)
+        temporary.replace(path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+    fsync(path.parent)
 
 
 def cut_half_row(path: Path) -> bytes:

@@ -33,8 +33,8 @@ def restore(run: RunDir, template: Any, group: Group, say: Callable[[str], None]
                 "remove the link to begin a new run"
             )
         say(f"new run in {run.path}")
-        run.truncate_records(dict.fromkeys(run.record_lengths(), 0))
         run.discard_after(0)
+        run.truncate_records(dict.fromkeys(run.record_lengths(), 0))
         return None
     for damage in restored.damage:
         say(f"damaged checkpoint passed over: {damage}")
@@ -58,8 +58,8 @@ def state_checked(run: RunDir, restored: Restored | None) -> Generator[None]:
     """
     try:
         if restored is not None:
+            run.discard_after(restored.num_updates)  # first: where it is refused, a later start may read a newer one
             run.truncate_records(restored.host["records"])
-            run.discard_after(restored.num_updates)
         yield
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         if restored is None or isinstance(error, GvzError):

@@ -4,7 +4,7 @@
     segmenters/ (the networks of its segmented frames)  work/ (logs of the actors)
 
 The directory is private to its user. The lengths of its record files stand in every checkpoint: a resumed run moves to
-`discarded/` what a killed one wrote after its last checkpoint.
+`discarded/` what a killed one wrote after its last checkpoint, and evaluations of policies that are of no use to it.
 """
 
 import contextlib
@@ -27,6 +27,8 @@ from gvz.run.resume import changed_schedules, differences
 RECORD_FILES = ("metrics.jsonl", "episodes.jsonl", "faults.jsonl")
 START_RECORDS = "starts.jsonl"
 """A row for every start of the run: machine, versions, commit. Never cut back."""
+EVALUATION_RECORDS = "evaluation.jsonl"
+"""Where `gvz evaluate` writes, whose lock is its own."""
 
 
 class RunDir:
@@ -144,20 +146,42 @@ class RunDir:
             )
 
     def discard_after(self, num_updates: int) -> None:
-        """Moves policies and checkpoints of more gradient steps to `discarded/`: the run that goes on from there never
-        had them. A checkpoint that could not be read today might be read tomorrow, and is of another history then.
+        """Moves policies and checkpoints of more gradient steps to `discarded/`, and rows of their evaluation: the run
+        that goes on from there never had them, and may come to others of the same numbers. A checkpoint that could not
+        be read today might be read tomorrow, and is of another history then.
 
         Raises:
-            ResumeError: they cannot be moved.
+            ResumeError: they cannot be moved, or an evaluation is under way.
         """
         with disk_checked(self.path):
-            for folder in (self.path / "policies", self.checkpoints):
-                moved = self.path / "discarded" / folder.name
-                for steps in saved_steps(folder):
-                    if steps > num_updates:
-                        moved.mkdir(parents=True, exist_ok=True)
-                        shutil.rmtree(moved / str(steps), ignore_errors=True)
-                        (folder / str(steps)).rename(moved / str(steps))
+            folders = (self.path / "policies", self.checkpoints)
+            later = [folder / str(steps) for folder in folders for steps in saved_steps(folder) if steps > num_updates]
+            with self._discarding_evaluations(num_updates, policies_too=bool(later)):
+                for directory in later:
+                    moved = self.path / "discarded" / directory.parent.name
+                    moved.mkdir(parents=True, exist_ok=True)
+                    shutil.rmtree(moved / directory.name, ignore_errors=True)
+                    directory.rename(moved / directory.name)
+
+    @contextlib.contextmanager
+    def _discarding_evaluations(self, num_updates: int, *, policies_too: bool) -> Generator[None]:
+        """Moves the rows of later policies. Within it no evaluation begins."""
+
+        def is_later(row: dict[str, Any]) -> bool:
+            return isinstance(row.get("num_updates"), int) and row["num_updates"] > num_updates
+
+        file = (self.path / EVALUATION_RECORDS).resolve()  # of a link, the file itself is replaced
+        if not file.is_file() or not (policies_too or records.split(file, is_later)[1]):
+            yield
+            return
+        with file.open("r+b") as locked:
+            if not records.lock(locked):
+                raise ResumeError(
+                    f"{file} is being written by another process, and the run, which goes on from update "
+                    f"{num_updates}, discards later policies and their evaluation; wait until that process has ended"
+                )
+            records.move_rows(file, is_later, self.path / "discarded" / EVALUATION_RECORDS)
+            yield
 
     def close(self) -> None:
         """Closes the record files and releases the lock. Can be repeated.

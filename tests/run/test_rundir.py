@@ -71,6 +71,71 @@ def test_what_a_run_does_not_go_on_from_is_kept_apart(tmp_path, folder):
         assert moved == {"20": f"{folder}/20", "25": f"{folder}/25"}
 
 
+def evaluated(*num_updates: int) -> list[str]:
+    return [json.dumps({"schema": 1, "num_updates": n, "episode": n % 7}) + "\n" for n in num_updates]
+
+
+def test_evaluations_of_policies_that_a_run_never_had_are_kept_apart(tmp_path):
+    file, moved = tmp_path / "evaluation.jsonl", tmp_path / "discarded" / "evaluation.jsonl"
+    player = '{"schema": 1, "player": "random", "episode": 0}\n'
+    early, late, later = evaluated(10, 20, 30)
+    with RunDir(tmp_path) as run:
+        run.discard_after(10)
+        file.write_text(late + early + "no row\n" + player + later.rstrip())
+        run.discard_after(10)
+        assert file.read_text() == early + "no row\n" + player
+        assert moved.read_text() == late + later
+        run.discard_after(10)
+        file.write_text(early + later + early[:9])
+        run.discard_after(10)
+    assert file.read_text() == early + early[:9]
+    assert moved.read_text() == late + later + later
+    assert not (tmp_path / "evaluation.jsonl.tmp").exists()
+
+
+@pytest.mark.parametrize("left", ["policy", "rows"])
+def test_a_run_does_not_discard_what_is_being_evaluated(tmp_path, left):
+    (early,) = evaluated(10)
+    with RunDir(tmp_path) as run:
+        evaluation = records.Writer(tmp_path / "evaluation.jsonl")
+        assert evaluation.lock()
+        evaluation.append({"num_updates": 10, "episode": 3})
+        run.discard_after(10)  # there is nothing to discard
+        if left == "policy":
+            (tmp_path / "policies" / "20").mkdir(parents=True)
+        else:
+            evaluation.append({"num_updates": 20, "episode": 6})
+        with pytest.raises(ResumeError, match=r"evaluation.jsonl is being written by another process, .* update 10, "):
+            run.discard_after(10)
+        assert not (tmp_path / "discarded").exists()
+        evaluation.close()
+        run.discard_after(10)
+    assert (tmp_path / "evaluation.jsonl").read_text() == early
+    assert {p.name for p in (tmp_path / "discarded").iterdir()} == (
+        {"policies"} if left == "policy" else {"evaluation.jsonl"}
+    )
+
+
+def test_evaluations_stay_as_they_are_where_a_full_disk_cannot_take_the_discarded_ones(tmp_path):
+    text = "".join(evaluated(10, 20, 10, 10))
+    (tmp_path / "evaluation.jsonl").write_text(text)
+    with RunDir(tmp_path) as run:
+        for limit_bytes in (10, 60):  # for the discarded row, and for those that stay
+            with full_disk(limit_bytes), pytest.raises(ResumeError, match="File too large"):
+                run.discard_after(10)
+            assert (tmp_path / "evaluation.jsonl").read_text() == text
+            assert not (tmp_path / "evaluation.jsonl.tmp").exists()
+
+
+def test_a_record_file_that_was_replaced_before_it_was_locked_is_not_written_to(tmp_path):
+    writer = records.Writer(tmp_path / "evaluation.jsonl")
+    writer.append({"episode": 0})
+    (tmp_path / "new").write_text("")
+    (tmp_path / "new").replace(tmp_path / "evaluation.jsonl")
+    assert not writer.lock()
+    writer.close()
+
+
 def test_what_goes_by_the_length_of_a_run_is_said_when_that_changes(tmp_path):
     longer = dataclasses.replace(CONFIG.learner, total_updates=2 * CONFIG.learner.total_updates)
     with RunDir(tmp_path) as run:
