@@ -4,10 +4,11 @@
     segmenters/ (the networks of its segmented frames)  work/ (logs of the actors)
 
 The directory is private to its user. The lengths of its record files stand in every checkpoint: a resumed run moves to
-`discarded/` what a killed one wrote after its last checkpoint, and evaluations of policies that are of no use to it.
+`discarded/` what a killed one wrote after its last checkpoint, and the evaluation of policies that it never had.
 """
 
 import contextlib
+import errno
 import json
 import os
 import shutil
@@ -150,6 +151,8 @@ class RunDir:
         that goes on from there never had them, and may come to others of the same numbers. A checkpoint that could not
         be read today might be read tomorrow, and is of another history then.
 
+        A folder on another file system, as a link leads to, has a `discarded/` of its own.
+
         Raises:
             ResumeError: they cannot be moved, or an evaluation is under way.
         """
@@ -158,10 +161,12 @@ class RunDir:
             later = [folder / str(steps) for folder in folders for steps in saved_steps(folder) if steps > num_updates]
             with self._discarding_evaluations(num_updates, policies_too=bool(later)):
                 for directory in later:
-                    moved = self.path / "discarded" / directory.parent.name
-                    moved.mkdir(parents=True, exist_ok=True)
-                    shutil.rmtree(moved / directory.name, ignore_errors=True)
-                    directory.rename(moved / directory.name)
+                    try:
+                        _move_into(self.path / "discarded" / directory.parent.name, directory)
+                    except OSError as error:
+                        if error.errno != errno.EXDEV:
+                            raise
+                        _move_into(directory.parent / "discarded", directory)
 
     @contextlib.contextmanager
     def _discarding_evaluations(self, num_updates: int, *, policies_too: bool) -> Generator[None]:
@@ -223,6 +228,13 @@ def disk_checked(path: Path) -> Generator[None]:
         raise ResumeError(
             f"run directory {path}: {error.strerror}; mend this, or choose another with --run-dir"
         ) from error
+
+
+def _move_into(folder: Path, directory: Path) -> None:
+    """Renames a directory into `folder`; one of its name that is there is removed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(folder / directory.name, ignore_errors=True)
+    directory.rename(folder / directory.name)
 
 
 def move_aside(path: Path) -> Path | None:

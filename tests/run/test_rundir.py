@@ -5,12 +5,14 @@ import gzip
 import json
 import os
 import stat
+import tempfile
 from pathlib import Path
 
 import pytest
 
 import gvz
 from gvz.core import records
+from gvz.core.durable import saved_steps
 from gvz.core.errors import CheckpointError, ConfigError, GvzError, ResumeError
 from gvz.run.config_files import load_config
 from gvz.run.group import Alone
@@ -71,6 +73,26 @@ def test_what_a_run_does_not_go_on_from_is_kept_apart(tmp_path, folder):
         assert moved == {"20": f"{folder}/20", "25": f"{folder}/25"}
 
 
+@pytest.mark.parametrize("folder", ["policies", "checkpoints"])
+def test_what_a_run_does_not_go_on_from_stays_on_its_own_disk(tmp_path, folder):
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as name, RunDir(tmp_path) as run:
+        disk = Path(name)
+        if disk.stat().st_dev == tmp_path.stat().st_dev:
+            pytest.skip("temporary files are in /dev/shm, too")
+        (tmp_path / folder).symlink_to(disk)
+        for directory in ("10", "20", "25", "discarded/25"):
+            (disk / directory).mkdir(parents=True)
+            (disk / directory / "which").write_text(directory)
+        for _ in range(2):  # the second time there is nothing to do
+            run.discard_after(10)
+            assert {p.name for p in disk.iterdir()} == {"10", "discarded"}
+            assert saved_steps(tmp_path / folder) == [10]
+            assert {p.name: (p / "which").read_text() for p in (disk / "discarded").iterdir()} == {
+                "20": "20",
+                "25": "25",
+            }
+
+
 def evaluated(*num_updates: int) -> list[str]:
     return [json.dumps({"schema": 1, "num_updates": n, "episode": n % 7}) + "\n" for n in num_updates]
 
@@ -125,15 +147,6 @@ def test_evaluations_stay_as_they_are_where_a_full_disk_cannot_take_the_discarde
                 run.discard_after(10)
             assert (tmp_path / "evaluation.jsonl").read_text() == text
             assert not (tmp_path / "evaluation.jsonl.tmp").exists()
-
-
-def test_a_record_file_that_was_replaced_before_it_was_locked_is_not_written_to(tmp_path):
-    writer = records.Writer(tmp_path / "evaluation.jsonl")
-    writer.append({"episode": 0})
-    (tmp_path / "new").write_text("")
-    (tmp_path / "new").replace(tmp_path / "evaluation.jsonl")
-    assert not writer.lock()
-    writer.close()
 
 
 def test_what_goes_by_the_length_of_a_run_is_said_when_that_changes(tmp_path):
