@@ -191,6 +191,23 @@ def last_lines(path: Path, num_bytes: int = TAIL_BYTES) -> list[str]:
         return [line for line in file.read().decode(errors="replace").splitlines() if line.strip()]
 
 
+def newest_rows(path: Path) -> Iterator[dict[str, Any]]:
+    """The rows of a record file or of its compressed form, newest first, damaged ones left out: those of the file's end
+    alone, and some of them again; none without a file.
+    """
+    if not path.exists():
+        yield from reversed(read_stored(path)[0])
+        return
+    for num_bytes in (TAIL_BYTES, 2 * MAX_LINE_LENGTH):  # a row with many tasks is long
+        for line in reversed(last_lines(path, num_bytes)):
+            try:
+                row = json.loads(line)
+            except (ValueError, RecursionError):  # half-written, or no row of ours
+                continue
+            if isinstance(row, dict):
+                yield row
+
+
 def cut(path: Path, length: int, rest: Path) -> int:
     """Cuts a record file to `length` bytes and appends what stood behind them to `rest`; returns how many bytes."""
     if not path.exists() or path.stat().st_size <= length:

@@ -3,7 +3,6 @@
 RESULTS/runs/<run id>/  players/<player>.jsonl  logs/<job id>.log  plan.json
 """
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -109,16 +108,11 @@ def last_processor_s(directory: Path) -> float:
 
 
 def _last_number(directory: Path, field: str, kind: type[Number]) -> Number:
-    file = directory / "metrics.jsonl"
-    if not file.exists():  # it may be a finished run's, compressed
-        rows = (row for row in reversed(records.read_stored(file)[0]) if field in row)
-        return kind(next(rows, {field: kind()})[field])
-    for num_bytes in (records.TAIL_BYTES, 2 * records.MAX_LINE_LENGTH):  # a row with many tasks is long
-        for line in reversed(records.last_lines(file, num_bytes)):
-            try:
-                return kind(json.loads(line)[field])
-            except (ValueError, KeyError, TypeError, OverflowError, RecursionError):  # half-written, or no row of ours
-                continue
+    for row in records.newest_rows(directory / "metrics.jsonl"):
+        try:
+            return kind(row[field])
+        except (ValueError, KeyError, TypeError, OverflowError):  # no row of ours
+            continue
     return kind()
 
 

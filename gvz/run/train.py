@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from actors.pool import STOP_TIMEOUT_S
-from gvz.core import janitor
+from gvz.core import janitor, records
 from gvz.core.cache import xla_cache_directory
 from gvz.core.errors import CheckpointError, WaitTimeoutError, WorkerError
 from gvz.core.stop import StopRequest
@@ -103,6 +103,7 @@ class Trainer:
         last = "writing the last checkpoint" if self._saver.behind else "no new gradient steps to save"
         self._progress.say(f"{'stopping' if stop.requested else 'done'}: {last}")
         self._saver.save_last(self._group, self._record_row)
+        self._record_used_up_time()
 
     def close(self, *, abandon_save: bool = False) -> None:
         """Ends every actor, waits for the checkpoint (or abandons both), closes the records. Can be repeated."""
@@ -189,6 +190,17 @@ class Trainer:
             learner = self._learner
             self._monitor.log(self._pool.statistics(), learner.take_staleness(), learner.take_metrics())
 
+    def _record_used_up_time(self) -> None:
+        """The last row again, with the processor time of the counts, if these alone have the limit: what a run has used
+        is read from its rows. Earlier versions took the time of a checkpoint after that of its row.
+        """
+        limit_s, counts = self._config.max_processor_s, self._counts
+        if limit_s is None or counts.processor_s < limit_s:
+            return
+        row = next(records.newest_rows(self._run.path / "metrics.jsonl"), {})
+        if row.get("num_updates") == counts.updates and row.get("run/processor_s", 0.0) < limit_s:
+            self._run.append("metrics.jsonl", {**row, "run/processor_s": counts.processor_s})
+
     def _take_processor_time(self) -> None:
         """Never less than before: a child may have ended without being waited for."""
         self._counts.processor_s = max(self._counts.processor_s, machine.processor_s() - self._processor_start_s)
@@ -196,7 +208,8 @@ class Trainer:
     def _snapshot(self) -> Snapshot:
         """The whole state; raises NonFiniteError instead of saving numbers that went wrong."""
         self._learner.check_finite()
-        self._take_processor_time()
+        if self._counts.updates > self._counts.logged_updates:  # else it has that of its row, by which others know it
+            self._take_processor_time()
         host = {
             "counts": dataclasses.asdict(self._counts),
             "telemetry": self._telemetry.state(),

@@ -1,6 +1,7 @@
 """The training loop in this process, on real Doom: what a resumed run goes on with, and the last row of its metrics."""
 
 import hashlib
+import itertools
 import re
 import signal
 from dataclasses import replace
@@ -16,7 +17,8 @@ from gvz.core import records
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ResumeError
 from gvz.core.stop import StopRequest
-from gvz.run.config import LogConfig, RunConfig
+from gvz.run import machine
+from gvz.run.config import CheckpointConfig, LogConfig, RunConfig
 from gvz.run.curriculum_config import CurriculumConfig
 from gvz.run.rundir import RunDir
 from gvz.run.train import train, with_own_segmenters
@@ -105,6 +107,27 @@ def test_a_run_ends_when_its_processor_time_is_used_up_and_is_then_done_until_it
     assert logged_updates(tmp_path) == [20, 40]
     last = records.read(tmp_path / "metrics.jsonl")[0][-1]
     assert last["run/processor_s"] > row["run/processor_s"], "the time of all starts together"
+
+
+def test_a_run_has_used_up_its_processor_time_when_its_last_row_says_so(tmp_path, monkeypatch):
+    clock = itertools.count(0.0)
+    monkeypatch.setattr(machine, "processor_s", lambda: next(clock))  # a second passes between two looks
+    config = replace(DQN, checkpoint=CheckpointConfig(period_updates=20), max_processor_s=1.5)
+    file = tmp_path / "metrics.jsonl"
+    go_on(tmp_path, config, 60)
+    assert used_s(file) == [(20, 1.0), (40, 2.0)], "the checkpoint at 20 has the time of its row"
+    saved = msgpack.unpackb((tmp_path / "checkpoints" / "40" / "host.msgpack").read_bytes())
+    assert saved["counts"]["processor_s"] == 2.0
+    # an earlier version could end so: its row before the limit, its checkpoint after it
+    file.write_text(file.read_text().replace('"run/processor_s": 2.0', '"run/processor_s": 1.4'))
+    for _ in range(2):
+        go_on(tmp_path, config, 60)
+        assert used_s(file) == [(20, 1.0), (40, 1.4), (40, 2.0)]
+
+
+def used_s(file: Path) -> list[tuple[int, float]]:
+    """Gradient steps and processor time of every row of metrics."""
+    return [(row["num_updates"], row["run/processor_s"]) for row in records.read(file)[0]]
 
 
 def logged_updates(path: Path) -> list[int]:
