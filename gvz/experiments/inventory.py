@@ -37,6 +37,12 @@ class RunProgress:
     trained: bool
     missing: dict[int, int]
     """checkpoint -> evaluation episodes that are still to be played"""
+    absent: int
+    """planned checkpoints without a policy or an episode"""
+
+    def lacking(self, evaluation: Evaluation) -> int:
+        """Evaluation episodes that a trained run does not have, those of absent checkpoints among them."""
+        return sum(self.missing.values()) + self.absent * len(evaluation.tasks) * evaluation.episodes
 
 
 def run_directory(results: Path, run: TrainingRun) -> Path:
@@ -73,6 +79,7 @@ def run_progress(results: Path, run: TrainingRun, evaluation: Evaluation) -> Run
         processor_s=processor_s,
         trained=trained,
         missing={c: n for c, n in missing.items() if n},
+        absent=run.num_checkpoints - len(checkpoints),
     )
 
 

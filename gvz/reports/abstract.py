@@ -7,14 +7,18 @@ import numpy as np
 import polars as pl
 
 from gvz.evaluation.statistics import Estimate, difference
+from gvz.experiments.inventory import run_directory, run_progress
+from gvz.experiments.plan import Evaluation
 from gvz.reports.document import count
-from gvz.reports.results import Results
+from gvz.reports.results import PlannedExperiment, Results
 from gvz.reports.scenario_section import agents_of, played_tasks
 from gvz.reports.scores import Scores, agent_scores, estimate_groups
 from gvz.tasks import all_scenarios, named_tasks, scenario_named
 
 ENOUGH_SEEDS = 10
 """training seeds with which a 95% interval holds the true mean in some 90 of 100 cases (docs/REPORTS.md)"""
+MOST_NAMES = 3
+"""of runs in a sentence; the others are counted"""
 
 
 def what_was_run(results: Results) -> list[str]:
@@ -119,11 +123,32 @@ def caveats(results: Results) -> list[str]:
     unfinished = [run.id for run in results.runs if not run.ended]
     if unfinished:
         found.append(f"Not trained to the end (or without metrics): {', '.join(unfinished)}.")
-    there = {str(run.path) for run in results.runs}
     for asked in results.asked:
-        absent = [run.id for run in asked.experiment.runs() if str(asked.results / "runs" / run.id) not in there]
-        if absent:
-            found.append(
-                f"{asked.experiment.title}: {len(absent)} of {len(asked.experiment.runs())} runs are not there yet."
-            )
+        found += _incomplete(results, asked)
+    return found
+
+
+def _incomplete(results: Results, asked: PlannedExperiment) -> list[str]:
+    """Which of an experiment's runs are absent, and which of those that have ended lack evaluation episodes."""
+    experiment, planned = asked.experiment, asked.experiment.runs()
+    ended = {str(run.path): run.ended for run in results.runs}
+    absent, lacking, num_wanted = 0, {}, 0
+    for run in planned:
+        directory = str(run_directory(asked.results, run))
+        if directory not in ended:
+            absent += 1
+        elif ended[directory]:
+            evaluation = Evaluation(tasks=experiment.evaluation_tasks(run), episodes=experiment.episodes)
+            if num := run_progress(asked.results, run, evaluation).lacking(evaluation):
+                lacking[run.id] = num
+                num_wanted += len(evaluation.tasks) * evaluation.episodes * run.num_checkpoints
+    found = []
+    if absent:
+        found.append(f"{experiment.title}: {absent} of {len(planned)} runs are not there yet.")
+    if lacking:
+        more = f" and {len(lacking) - MOST_NAMES} more" if len(lacking) > MOST_NAMES else ""
+        found.append(
+            f"{experiment.title}: {len(lacking)} of {len(planned)} runs lack {sum(lacking.values()):,} of their "
+            f"{num_wanted:,} evaluation episodes: {', '.join(list(lacking)[:MOST_NAMES])}{more}."
+        )
     return found

@@ -53,7 +53,7 @@ def test_the_first_policy_at_or_after_a_checkpoint_stands_for_it(saved, standing
 def test_a_run_is_done_when_trained_and_every_episode_of_every_checkpoint_is_there(tmp_path):
     evaluation = Evaluation(tasks=("a", "b"), episodes=2)
     assert progress.run_progress(tmp_path, RUN, evaluation) == progress.RunProgress(
-        num_updates=0, processor_s=0.0, trained=False, missing={}
+        num_updates=0, processor_s=0.0, trained=False, missing={}, absent=3
     )
     directory = save_policies(tmp_path, 100, 200, 300)
     episodes = [(c, t, n) for c in (100, 200, 300) for t in "ab" for n in (0, 1)]
@@ -71,7 +71,10 @@ def test_a_run_is_done_when_trained_and_every_episode_of_every_checkpoint_is_the
 
 
 def test_a_run_with_a_limit_of_processor_time_is_trained_when_its_last_row_has_it_and_its_policy_stands(tmp_path):
-    run, evaluation = dataclasses.replace(RUN, max_processor_s=60.0), Evaluation(tasks=("a",), episodes=2)
+    run, evaluation = (
+        dataclasses.replace(RUN, max_processor_s=60.0, num_checkpoints=1),
+        Evaluation(tasks=("a",), episodes=2),
+    )
     directory = save_policies(tmp_path, 100, 180)
 
     def found(num_updates: int, processor_s: float) -> progress.RunProgress:
@@ -82,7 +85,7 @@ def test_a_run_with_a_limit_of_processor_time_is_trained_when_its_last_row_has_i
     assert not found(180, 59.9).trained
     assert not found(200, 60.1).trained, "its last policy is not saved yet"
     assert found(180, 60.1) == progress.RunProgress(
-        num_updates=180, processor_s=60.1, trained=True, missing={180: 2}
+        num_updates=180, processor_s=60.1, trained=True, missing={180: 2}, absent=0
     ), "only the newest policy is evaluated"
     save_policies(tmp_path, 300)
     assert found(180, 60.1).missing == {180: 2}, "the policy of 300 was saved without a checkpoint, and then discarded"

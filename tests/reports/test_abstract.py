@@ -2,13 +2,16 @@
 
 import json
 import re
+from pathlib import Path
 
+from gvz.experiments.inventory import run_directory
 from gvz.experiments.plan import Plan
 from gvz.reports.abstract import caveats, what_was_run, who_has_more
 from gvz.reports.results import read_results
 from gvz.tasks import named_tasks
 from tests.reports.conftest import evaluation_row, write_rows
 
+ROOT = Path(__file__).parents[2]
 OFFSETS = {1111: 0.0, 2222: 1.0, 3333: 2.0}
 
 
@@ -29,6 +32,33 @@ def test_trained_agents_first_then_the_best_beside_players(tmp_path, experiments
     assert scale == "Scale 0.2: budgets and episodes are shrunk; not comparable with published numbers."
     assert few_seeds.startswith("Fewer than 10 training seeds of dqn_quick, rainbow_quick: intervals over so few are ")
     assert "6 training runs of 2 agents (dqn_quick, rainbow_quick), 3 training seeds" in " ".join(what_was_run(results))
+
+
+def test_runs_that_lack_evaluation_episodes_are_named(tmp_path, experiments_writer):
+    plan = Plan.of("quick_comparison", scale=0.2)
+    experiments_writer(tmp_path, plan, lambda _: 50.0)
+    evaluations, cut = plan.evaluations(), [run for run in plan.runs() if run.config == "rainbow_quick"]
+    each = len(evaluations[cut[0].id].tasks) * evaluations[cut[0].id].episodes
+    for run in cut:
+        file = run_directory(tmp_path, run) / "evaluation.jsonl"
+        rows = [json.loads(line) for line in file.read_text().splitlines()]
+        write_rows(file, [row for row in rows if row["num_updates"] == run.checkpoints[0] and row["episode"] == 0])
+    lacking, wanted = 3 * (2 * each - len(evaluations[cut[0].id].tasks)), 3 * 2 * each
+    said = f"{plan.experiments()[0].title}: 3 of 6 runs lack {lacking} of their {wanted} evaluation episodes: "
+    assert caveats(read_results([tmp_path]))[-1] == said + ", ".join(run.id for run in cut) + "."
+    for run in plan.runs():
+        (run_directory(tmp_path, run) / "evaluation.jsonl").unlink()
+    (few, last) = caveats(read_results([tmp_path]))[-2:]
+    assert few.startswith("Fewer than 10 training seeds"), "no other caveat"
+    assert f"6 of 6 runs lack {2 * wanted:,} of their {2 * wanted:,} evaluation episodes" in last
+    assert last.endswith(f"{plan.runs()[2].id} and 3 more.")
+
+
+def test_committed_results_lack_no_evaluation_episodes():
+    for name in ("general_compositions", "general_on_policy", "quick_comparison"):
+        results = read_results([ROOT / "results" / name])
+        assert results.asked
+        assert not [one for one in caveats(results) if "lack" in one]
 
 
 def test_an_agent_whose_seeds_played_other_tasks_each_is_left_out(tmp_path):
