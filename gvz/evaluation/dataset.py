@@ -15,6 +15,7 @@ import polars as pl
 
 from gvz.core import records
 from gvz.core.errors import ConfigError, TaskError
+from gvz.core.files import files_below
 from gvz.evaluation.statistics import normalize
 from gvz.run.rundir import RECORD_FILES, START_RECORDS
 from gvz.tasks import Task, parse_task
@@ -162,7 +163,7 @@ def evaluation_files(paths: Iterable[Path | str]) -> list[Path]:
     for path in map(Path, paths):
         if not path.exists():
             raise ConfigError(f"{path}: no such file or directory; want record files or directories that hold some")
-        for file in [path] if path.is_file() else sorted(path.rglob("*.jsonl*")):
+        for file in [path] if path.is_file() else files_below(path, "*.jsonl*"):
             if path.is_file() or _may_be_evaluation(file.relative_to(path)):
                 found.setdefault(file.resolve(), file)
     return list(found.values())

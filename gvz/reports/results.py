@@ -10,6 +10,7 @@ from pathlib import Path
 import polars as pl
 
 from gvz.core.errors import ConfigError
+from gvz.core.files import files_below
 from gvz.evaluation.dataset import collect_evaluations
 from gvz.experiments.base import Experiment
 from gvz.experiments.plan import read_plan
@@ -53,20 +54,22 @@ def read_results(paths: Sequence[Path]) -> Results:
     runs: dict[Path, Run] = {}
     asked = []
     for path in paths:
-        for config in sorted(path.rglob("config.json")) if path.is_dir() else []:
+        for config in files_below(path, "config.json") if path.is_dir() else []:
             of_group = (config.resolve().parents[1] / "config.json").exists()  # a further learner process of that run
             if config.parent.resolve() not in runs and "discarded" not in config.parts and not of_group:
                 run, found = read_run(config, path)
                 problems += found
                 if run is not None:
                     runs[config.parent.resolve()] = run
-        for file in sorted(path.rglob("plan.json")) if path.is_dir() else []:
+        for file in files_below(path, "plan.json") if path.is_dir() else []:
             try:
                 plan = read_plan(file.parent)
             except ConfigError as error:
                 problems.append(f"{error}; its experiments are not in this report")
                 continue
-            assert plan is not None, "the file is there"
+            if plan is None:
+                problems.append(f"{file}: a link that leads nowhere; its experiments are not in this report")
+                continue
             asked += [
                 PlannedExperiment(results=file.parent, experiment=e, scale=plan.scale) for e in plan.experiments()
             ]

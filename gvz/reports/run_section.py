@@ -8,6 +8,7 @@ from typing import Any
 
 import polars as pl
 
+from gvz.core.files import files_below
 from gvz.evaluation.dataset import evaluation_files
 from gvz.reports.curves import SHARE_EPISODES, share_curve
 from gvz.reports.document import Block, Figure, Link, Section, Table, count, missing, words
@@ -149,7 +150,7 @@ def _links(results: Results, out: Path) -> Block:
     for run in results.runs:
         files += [file for name in ("config.json", "metrics", "episodes") for file in sorted(run.path.glob(f"{name}*"))]
     for path in results.paths:
-        files += [file for file in sorted(path.rglob("*")) if file.suffix in _VIDEOS] if path.is_dir() else []
+        files += [file for file in files_below(path, "*") if file.suffix in _VIDEOS] if path.is_dir() else []
     links = [Link(text=str(file), target=os.path.relpath(file.resolve(), out.resolve())) for file in files]
     text = "Every number above can be computed again from these files (see docs/REPORTS.md)."
     return Block(text=(text,), links=tuple(links))

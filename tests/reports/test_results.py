@@ -167,6 +167,33 @@ def test_a_report_can_be_made_inside_a_run_directory(copied, tmp_path, monkeypat
     assert run.id == "run"
 
 
+def test_runs_on_another_disk_are_read_through_links(small, tmp_path):
+    results = shutil.copytree(small, tmp_path / "results")
+    seed = results / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111"
+    (seed / "episode.mp4").touch()
+    before, plain = read_results([results]), run_sections(read_results([results]), tmp_path)[-1]
+    seed.rename(tmp_path / "elsewhere")
+    seed.symlink_to(tmp_path / "elsewhere")
+    (results / "runs").rename(tmp_path / "scratch")
+    (results / "runs").symlink_to(tmp_path / "scratch")
+    (results / "best").symlink_to(seed)
+    (tmp_path / "elsewhere" / "up").symlink_to(results)
+    after = read_results([results])
+    assert after.episodes.equals(before.episodes)
+    assert [run.path for run in after.runs] == [run.path for run in before.runs]
+    assert [run.id for run in after.runs] == [run.id for run in before.runs]
+    assert (after.agents, after.asked, after.problems) == (before.agents, before.asked, before.problems)
+    linked = run_sections(after, tmp_path)[-1]
+    assert [link.text for link in linked.blocks[0].links] == [link.text for link in plain.blocks[0].links]
+    assert str(seed / "episode.mp4") in {link.text for link in linked.blocks[0].links}
+
+
+def test_a_plan_that_is_a_broken_link_is_told_of(tmp_path):
+    (tmp_path / "plan.json").symlink_to(tmp_path / "nowhere")
+    (problem,) = read_results([tmp_path]).problems
+    assert problem.startswith(f"{tmp_path / 'plan.json'}: a link that leads nowhere")
+
+
 def test_episodes_of_another_base_seed_are_left_out_and_counted(tmp_path):
     rows = [
         evaluation_row("random", "seek_and_kill/default", n, score, base_seed=base_seed, seed=10 * base_seed + n)
