@@ -82,7 +82,8 @@ class RunJob:
 
     def other_settings(self) -> list[str]:
         """`field: as it is -> as the plan has it`, of a run that is trained: nobody else would see it."""
-        file = inventory.run_directory(self.results, self.run) / "config.json"
+        directory = inventory.run_directory(self.results, self.run)
+        file = directory / "config.json"
         if not file.exists() or not self._trained():
             return []
         try:
@@ -90,7 +91,11 @@ class RunJob:
         except (ValueError, OSError, RecursionError) as error:
             return [f"{file} cannot be read: {error}"]
         games = {"actors.num_actors": saved.num_actors, "actors.games_per_actor": saved.games_per_actor}
-        return differences(saved, with_settings(self.run.run_config, {**_settings(self.run, self.scale), **games}))
+        found = differences(saved, with_settings(self.run.run_config, {**_settings(self.run, self.scale), **games}))
+        limit_s = self.run.max_processor_s  # a resumed run may have another limit; what it has used up, it keeps
+        if limit_s not in (None, saved.max_processor_s) and inventory.last_processor_s(directory) >= limit_s:
+            found.append(f"max_processor_s: {saved.max_processor_s} -> {limit_s}")
+        return found
 
     def _trained(self) -> bool:
         return inventory.run_progress(self.results, self.run, self.evaluation).trained

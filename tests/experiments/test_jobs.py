@@ -54,6 +54,28 @@ def test_a_trained_run_with_other_settings_is_known(name, scale, tmp_path, monke
     assert "config.json cannot be read: " in job.other_settings()[0]
 
 
+@pytest.mark.parametrize(
+    ("saved", "used", "changed"),
+    [
+        (2_700.0, 2_701.0, ["max_processor_s: 2700.0 -> 900.0"]),
+        (None, 2_701.0, ["max_processor_s: None -> 900.0"]),
+        (900.0, 904.0, []),
+        (2_700.0, 500.0, []),  # it had all its gradient steps before
+        (400.0, 401.0, []),
+    ],
+)
+def test_a_trained_run_with_more_processor_time_is_known(saved, used, changed, tmp_path, monkeypatch):
+    monkeypatch.setattr(RunJob, "_trained", lambda _: True)
+    run = experiments()["general_short"].runs()[0]
+    job = RunJob(results=tmp_path, run=run, evaluation=EVALUATION, scale=1)
+    directory = progress.run_directory(tmp_path, run)
+    directory.mkdir(parents=True)
+    config = dataclasses.replace(parse(training_flags(run, 1)).run, max_processor_s=saved)
+    (directory / "config.json").write_text(json.dumps(config_to_dict(config)))
+    (directory / "metrics.jsonl").write_text(json.dumps({"num_updates": 9, progress.PROCESSOR_S: used}) + "\n")
+    assert job.other_settings() == changed
+
+
 def test_an_agent_and_an_encoder_in_files_are_given_to_the_evaluation(tmp_path):
     agent = tmp_path / "mine.py"
     (text,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "AGENTS.md").read_text(), flags=re.DOTALL)
