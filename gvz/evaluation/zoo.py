@@ -55,8 +55,7 @@ def run_directory(path: Path) -> Path:
     digest = hashlib.blake2b(file.read_bytes(), digest_size=8).hexdigest()
     unpacked = cache_directory() / "zoo" / digest / name
     try:
-        if not unpacked.exists():
-            _unpack(file, unpacked)
+        _unpack(file, unpacked)
     except OSError as error:
         raise ResourceError(
             f"cache {cache_directory()}: {error}; make it writable, or set GVZ_CACHE_DIR to a directory that is"
@@ -65,12 +64,33 @@ def run_directory(path: Path) -> Path:
 
 
 def _unpack(file: Path, directory: Path) -> None:
-    directory.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=directory.parent) as temporary, zipfile.ZipFile(file) as archive:
-        archive.extractall(Path(temporary) / directory.name)  # zipfile keeps every name inside
-        # another process may have been first; then its directory stays
-        with contextlib.suppress(OSError):
-            (Path(temporary) / directory.name).rename(directory)
+    """Unpacks what is not there: all of it, or files that were deleted since, as old ones in a cache are."""
+    with zipfile.ZipFile(file) as archive:
+        lost = [entry for entry in archive.infolist() if not _is_whole(directory / entry.filename, entry)]
+        if not lost:
+            return
+        directory.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=directory.parent) as temporary:
+            fresh = Path(temporary) / directory.name
+            archive.extractall(fresh, lost)  # zipfile keeps every name inside
+            if not directory.exists():
+                # another process may have been first; then its directory stays
+                with contextlib.suppress(OSError):
+                    fresh.rename(directory)
+                return
+            for path in sorted(fresh.rglob("*")):
+                there = directory / path.relative_to(fresh)
+                if path.is_dir():
+                    there.mkdir(exist_ok=True)
+                else:
+                    path.replace(there)
+
+
+def _is_whole(path: Path, entry: zipfile.ZipInfo) -> bool:
+    if entry.is_dir():
+        return path.is_dir()
+    own = path.name == EVALUATION  # episodes that the user played since are there, too
+    return path.is_file() and (own or path.stat().st_size == entry.file_size)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from contextlib import closing
 
 import numpy as np
@@ -64,6 +65,29 @@ def test_a_packed_policy_has_the_network_of_its_segmented_frames(tmp_path):
     assert trained_player(run_directory("zoo:two"), again, 20).identity == identity
     kept.write_bytes(kept.read_bytes() + b"another network")
     assert trained_player(packed, found, 20).identity != identity, "these would be episodes of another player"
+
+
+def test_files_that_the_cache_lost_are_unpacked_again(run):
+    pack(run, "one")
+    directory = run_directory("zoo:one")
+    before = {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+    played = directory / "evaluation.jsonl"
+    played.write_text('{"schema": 1}\n')
+    (directory / "episode.gif").touch()
+    for path in before:  # a purge of old files
+        if path != played:
+            path.unlink()
+    assert run_directory("zoo:one") == directory
+    assert played.read_text() == '{"schema": 1}\n', "what the user has played"
+    assert all(path.read_bytes() == content for path, content in before.items() if path != played)
+    shutil.rmtree(directory / "policies")
+    played.unlink()
+    (directory / "config.json").write_text("")
+    run_directory("zoo:one")
+    assert {path: path.read_bytes() for path in before} == before
+    assert (directory / "episode.gif").exists()
+    assert find_checkpoints(directory, ["newest"]) == [100]
+    assert [path.name for path in directory.parent.iterdir()] == ["one"]
 
 
 @pytest.mark.parametrize(("record", "most"), [("metrics.jsonl", 100), ("episodes.jsonl", 4_000)])
