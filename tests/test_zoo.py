@@ -86,7 +86,7 @@ def test_the_findings_say_what_the_agent_with_shifted_frames_has(tmp_path, monke
     directory = run_directory(Path("zoo:dodge_projectiles"))
     assert read_run_config(directory).agent.augmentations == ("shift",)
     means = scores_of(read_rows(directory / "evaluation.jsonl"), "dodge_projectiles")
-    said = f"It has {np.mean(means):.1f} on the test tasks, and {means[-1]:.0f} on `complete`."
+    said = f"That of the zoo has {np.mean(means):.1f} on the test tasks, and {means[-1]:.0f} on `complete`."
     assert said in WORDS
 
 
