@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from gvz.core import records
+from gvz.core.files import files_below
 from gvz.experiments import inventory
 from gvz.experiments.base import TrainingRun
 from gvz.experiments.plan import Evaluation
@@ -62,7 +63,7 @@ def read_rates(results: Path, agent: str, scale: float, num_cores: int) -> Rates
     folders = [planned / agent]
     if scale >= CHECK_BELOW and "+" not in agent:  # a check has other networks; the trainer has no runs of variants
         folders.append(load_config(agent).resolved_run_dir.parent)
-    starts = [file for folder in folders for file in folder.rglob(f"{START_RECORDS}*")]
+    starts = [file for folder in folders for file in files_below(folder, f"{START_RECORDS}*")]
     runs = [file.parent for file in starts if _is_of_this_machine(file, num_cores)]
     runs = sorted(runs, key=lambda run: run.stat().st_mtime)[-NEWEST_RUNS:]
     updates = [rate for run in runs for rate in _numbers(run / "metrics.jsonl", "learner/updates_per_s") if rate > 0]
