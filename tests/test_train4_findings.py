@@ -62,6 +62,17 @@ def test_the_findings_say_what_networks_of_four_training_tasks_find():
             for folder in ("train4", "")
         )
         assert list(four) == list(eight)
+        if name == "seek_and_kill":
+            pairs = [
+                f"{of[f'{name}/{task}']['enemy']:.2f}"
+                for task in ("blue+invulnerable", "obstacles+shadows")
+                for of in (four, eight)
+            ]
+            said = "invulnerable enemies are found with {}, not {}, and shadows among obstacles with {}, not {}."
+            assert said.format(*pairs) in WORDS
+        if name == "defend_the_center":
+            fuzzy = [f"{of['defend_the_center/fast_enemies+fuzzy_enemies']['enemy']:.2f}" for of in (four, eight)]
+            assert "fuzzy enemies are found with {}, not {}.".format(*fuzzy) in WORDS
         for task, found in four.items():
             for kind, value in found.items():
                 assert f"| `{task}` | {kind} | {value:.2f} | {eight[task][kind]:.2f} |" in WORDS
@@ -99,6 +110,15 @@ def test_the_findings_say_what_six_times_the_time_gave_on_four_training_tasks(sc
             for found in (scores[name, "4 tasks"], longer[name, "4 tasks"], longer[name, "8 tasks"])
         )
         assert f"`{of_task}` has {four:.0f} (after 900 seconds {short:.0f}, with eight tasks {eight:.0f})" in WORDS
+    (name,) = LONGER
+
+    def mean(of_agent: Scores, task: str) -> float:
+        return float(np.mean([by_task[task].mean() for by_task in of_agent.runs.values()]))
+
+    gained = {
+        task: mean(longer[name, "4 tasks"], task) - mean(scores[name, "4 tasks"], task) for task in task_sets(name)[2]
+    }
+    assert f"It gains most on `{max(gained, key=gained.__getitem__).partition('/')[2]}`." in WORDS
     steps = sorted(rows_of(file)[-1]["num_updates"] for file in (ROOT / "results").glob(STEPS.format("_long")))
     assert f"training seed 1111; {steps[0]:,} gradient steps, 50 episodes" in WORDS
     assert len(steps) == 1
