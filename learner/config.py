@@ -290,6 +290,9 @@ class OnPolicyConfig:
     """Adam"""
     max_grad_norm: Annotated[float | None, Range(1e-12, 1e12)] = 0.5
     """clip the global gradient norm"""
+    average_ema: Annotated[float | None, Range(0.0, 1.0)] = None
+    """share of itself that a moving average of the parameters keeps at a gradient step. Evaluation plays with the
+    average; default: no average"""
     devices: int = 1
     """always 1: several devices are for agents that learn from a replay"""
 

@@ -101,7 +101,8 @@ class OnPolicyLearner:
 
     @property
     def params(self) -> Params:
-        return self._state.params
+        average = self._state.average_params
+        return self._state.params if average is None else average
 
     def num_steps_allowed(self) -> int:
         return self._rollouts.num_records_allowed()

@@ -13,7 +13,7 @@ from learner.agents.base import OnPolicyAgent, Params, SampleLosses, Samples, Ta
 from learner.config import OnPolicyConfig
 from learner.rollouts import RolloutSpec, steps_of
 from learner.store import Store
-from learner.train_step import NonFinite, gradient_step, no_non_finite, no_sums
+from learner.train_step import NonFinite, averaged, gradient_step, no_non_finite, no_sums
 
 
 @jax.tree_util.register_dataclass
@@ -37,6 +37,8 @@ class OnPolicyState:
     """All that the learner remembers between updates, beside the windows."""
 
     params: Params
+    average_params: Params | None
+    """moving average of the parameters, if one is kept"""
     opt_state: optax.OptState
     key: PRNGKeyArray
     num_updates: Int[Array, ""]
@@ -71,6 +73,7 @@ def init(agent: OnPolicyAgent, spec: RolloutSpec, config: OnPolicyConfig, key: P
     )
     state = OnPolicyState(
         params=params,
+        average_params=None if config.average_ema is None else params,
         opt_state=optimizer(config).init(params),
         key=key_state,
         num_updates=jnp.int32(0),
@@ -124,7 +127,11 @@ def make_update(agent: OnPolicyAgent, spec: RolloutSpec, config: OnPolicyConfig)
             state, loss, losses, grad_norm = gradient_step(
                 state, optimizer(config), mean_loss, batch, batch.weight, hold_gradient=False
             )
-            return replace(state, metrics=_add_metrics(state.metrics, loss, losses, grad_norm, batch))
+            return replace(
+                state,
+                average_params=averaged(state.average_params, state.params, config.average_ema),
+                metrics=_add_metrics(state.metrics, loss, losses, grad_norm, batch),
+            )
 
         return jax.lax.fori_loop(0, num_updates, one, replace(state, key=key))
 

@@ -134,6 +134,13 @@ def init(
     return jax.tree.map(jnp.copy, state)  # donation refuses a buffer that stands in two places
 
 
+def averaged(average_params: Params | None, params: Params, ema: float | None) -> Params | None:
+    """The moving average of the parameters after a gradient step, if one is kept."""
+    if ema is None or average_params is None:
+        return None
+    return optax.incremental_update(params, average_params, 1 - ema)
+
+
 def make_train_step(
     agent: OffPolicyAgent,
     replay_spec: ReplaySpec,
@@ -195,9 +202,7 @@ def of_one_device(
         else:
             due = state.num_updates % learner_config.target_period_updates == 0
             target_params = _when(due, lambda _: state.params, state.target_params)
-        average_params = state.average_params
-        if (ema := learner_config.average_ema) is not None and average_params is not None:
-            average_params = optax.incremental_update(state.params, average_params, 1 - ema)
+        average_params = averaged(state.average_params, state.params, learner_config.average_ema)
         priority = jnp.where(jnp.isfinite(losses.priority), losses.priority, 0.0)
         replay_state = replay.update_priorities(replay_spec, replay_state, info.slots, priority, across)
         metrics = _add_metrics(state.metrics, loss, losses, grad_norm, info, batch.task, across)

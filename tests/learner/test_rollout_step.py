@@ -37,6 +37,7 @@ CONFIG = OnPolicyConfig(
     learning_rate=0.1,
     learning_rate_decay=True,
     max_grad_norm=0.25,
+    average_ema=0.8,
 )
 NAMES = ("easy", "hard")
 
@@ -108,7 +109,7 @@ class Float64Learner:
     """The same in float64 from the papers' equations; gradients by central differences of the loss."""
 
     def __init__(self, w: np.ndarray, windows: Store, loss):
-        self.w, self.num_updates = w.astype(np.float64), 0
+        self.w, self.average, self.num_updates = w.astype(np.float64), w.astype(np.float64), 0
         self.mean, self.square = np.zeros_like(self.w), np.zeros_like(self.w)
         self.loss = loss
         value = windows.extras[:, 0].astype(np.float64).reshape(L, W)
@@ -146,6 +147,7 @@ class Float64Learner:
         self.mean = 0.9 * self.mean + 0.1 * clipped  # Kingma and Ba 2015, Algorithm 1
         self.square = 0.999 * self.square + 0.001 * clipped**2
         self.w = self.w - rate * (self.mean / (1 - 0.9**k)) / (np.sqrt(self.square / (1 - 0.999**k)) + 1e-5)
+        self.average = 0.8 * self.average + 0.2 * self.w
         return losses, norm
 
 
@@ -197,6 +199,8 @@ def test_updates_are_those_of_the_equations_in_float64(name: str, loss, tmp_path
     state = compiled(agent)(state, windows, np.int32(2))
     seen += [oracle.update() for _ in range(2)]
     np.testing.assert_allclose(state.params["w"], oracle.w, rtol=1e-4, atol=2e-5)
+    np.testing.assert_allclose(state.average_params["w"], oracle.average, rtol=1e-4, atol=2e-5)
+    assert np.abs(oracle.average - oracle.w).max() > 0.01, "the average is another thing than the last parameters"
     assert int(state.num_updates) == 5
     norms = [norm for _, norm in seen]
     assert max(norms) > 0.25, "gradients are clipped"

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from actors.config import ActorsConfig
+from benchmarks.last_parameters import main, write_last_parameters
 from gvz.cluster.config import ClusterConfig
 from gvz.core import records
 from gvz.core.env_config import EnvConfig
@@ -176,7 +177,7 @@ def test_a_run_goes_on_bit_for_bit_within_a_stretch_of_noise(tmp_path):
 
 
 NETWORK = {"conv_channels": (4,), "conv_kernels": (8,), "conv_strides": (4,), "hidden_units": 16, "past_actions": 2}
-ON_POLICY = OnPolicyConfig(rollout_steps=12, num_epochs=2, num_minibatches=3)
+ON_POLICY = OnPolicyConfig(rollout_steps=12, num_epochs=2, num_minibatches=3, average_ema=0.9)
 """6 gradient steps for each rollout of 24 steps"""
 
 
@@ -190,6 +191,14 @@ def test_an_on_policy_run_goes_on_bit_for_bit_between_two_rollouts(tmp_path, age
     go_on(tmp_path / "cut", config, 36)
     whole, cut = (arrays_of(tmp_path / name / "checkpoints" / "36") for name in ("whole", "cut"))
     assert [name for name in whole if not np.array_equal(whole[name], cut[name])] == []
+    assert write_last_parameters(tmp_path / "whole", tmp_path / "last") == 36
+    for name, part in (("whole", "average_params"), ("last", "params")):
+        policy = arrays_of(tmp_path / name / "policies" / "36")
+        wanted = {
+            leaf.removeprefix(f"['learner'].{part}"): whole[leaf] for leaf in whole if f"['learner'].{part}[" in leaf
+        }
+        assert policy.keys() == wanted.keys()
+        assert all(np.array_equal(policy[leaf], wanted[leaf]) for leaf in policy)
     assert (tmp_path / "whole" / "episodes.jsonl").read_bytes() == (tmp_path / "cut" / "episodes.jsonl").read_bytes()
     rows, _ = records.read(tmp_path / "whole" / "metrics.jsonl")
     assert [row["num_updates"] for row in rows] == [24, 36], "at the end of the rollout in which the log period ends"
@@ -205,6 +214,21 @@ def test_an_on_policy_run_goes_on_bit_for_bit_between_two_rollouts(tmp_path, age
         assert row["rollout/age_max_versions"] == 1
         assert row["rollout/age_mean_versions"] < 0.2, "only a window's first action is of the parameters before"
         assert row["learner/loss"] == row["learner/loss"]
+
+
+def test_last_parameters_are_of_a_run_that_keeps_an_average(tmp_path, capsys):
+    """It has a whole checkpoint, and what is written is a new directory."""
+    for name, config in (("none", DQN), ("whole", replace(DQN, learner=replace(DQN.learner, average_ema=0.9)))):
+        with RunDir(tmp_path / name) as run:
+            run.write_config(config)
+    for name, out, message in (
+        ("missing", "new", "is not a run directory"),
+        ("none", "new", "it keeps no average (learner.average_ema)"),
+        ("whole", "none", "is already there"),
+        ("whole", "new", "holds no whole checkpoint"),
+    ):
+        assert main(tmp_path / name, tmp_path / out) == 2
+        assert message in capsys.readouterr().err
 
 
 def test_tensorboard_shows_the_rows_of_the_records_after_every_kind_of_stop(tmp_path):
