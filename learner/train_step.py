@@ -136,9 +136,7 @@ def init(
 
 def averaged(average_params: Params | None, params: Params, ema: float | None) -> Params | None:
     """The moving average of the parameters after a gradient step, if one is kept."""
-    if ema is None or average_params is None:
-        return None
-    return optax.incremental_update(params, average_params, 1 - ema)
+    return None if ema is None or average_params is None else optax.incremental_update(params, average_params, 1 - ema)
 
 
 def make_train_step(
