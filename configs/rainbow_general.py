@@ -1,4 +1,4 @@
-"""Rainbow for tasks that it has not seen, on two CPU cores: settings that gates have chosen so far (docs/FINDINGS.md).
+"""Rainbow for tasks that it has not seen, on two CPU cores: settings most of which gates chose (docs/FINDINGS.md).
 
 Against `rainbow_quick`: the eight training tasks of a scenario, a replay twice as large, and at most 500,000 gradient
 steps; in Seek and Kill a tenth of the reward for walking, and shots that cost nothing. Stop it when you like, or set

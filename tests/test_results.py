@@ -4,8 +4,10 @@ import json
 import re
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import polars
 import pytest
 
 from gvz.evaluation.statistics import bootstrap, bootstrap_runs
@@ -14,8 +16,8 @@ from gvz.reports.experiment_section import result_table
 from gvz.reports.joint_section import joint_sections
 from gvz.reports.results import read_results
 from gvz.reports.scores import agent_scores, estimate
-from gvz.tasks import TaskSet, named_tasks, scenarios
-from tests.score_tables import PAGE, ROOT, metrics_of, results_of, rows_of
+from gvz.tasks import LEVELS, Task, TaskSet, named_tasks, scenarios
+from tests.score_tables import PAGE, ROOT, WORDS, metrics_of, results_of, rows_of
 
 
 def test_the_quick_runs_are_better_than_chance_on_the_same_episodes():
@@ -60,6 +62,34 @@ def test_the_quick_comparison_says_what_its_records_give():
         assert said[-1] == round(np.mean([row["normalized_score"] for row in final if row["task"] in test_tasks]), 1)
 
 
+def test_the_quick_comparison_says_what_a_player_that_looks_at_nothing_has_on_the_same_episodes():
+    folder, scenario = ROOT / "results" / "quick_comparison", "defend_the_center"
+    first = read_results([ROOT / "results" / "reference" / "sweep.jsonl.gz"]).episodes.filter(
+        polars.col("episode") < 25
+    )
+    sweep = first.filter(scenario=scenario).to_dicts()
+
+    def mean(rows: list[dict[str, Any]], tasks: list[Task]) -> float:
+        ids = {task.id for task in tasks}
+        return np.mean([row["normalized_score"] for row in rows if row["task"] in ids])
+
+    levels = [named_tasks(scenario, level=level) for level in LEVELS]
+    train, test = (named_tasks(scenario, split=split) for split in ("train4", "test"))
+    readme, words = (folder / "README.md").read_text(), " ".join((folder / "README.md").read_text().split())
+    assert f"| sweep | {' | '.join(f'{mean(sweep, tasks):.1f}' for tasks in (*levels, test))} |" in readme
+    assert f"On the four training tasks the sweep has {mean(sweep, train):.1f}." in words
+    better = {}
+    for config, said in (
+        ("rainbow_quick", "Rainbow has {}, {} and {} there with"),
+        ("dqn_quick", "DQN {}, {} and {}."),
+    ):
+        runs = [rows_of(file) for file in sorted(folder.glob(f"runs/{config}/*/*/*/evaluation.jsonl.gz"))]
+        final = [[row for row in rows if row["num_updates"] == 20_000] for rows in runs]
+        assert said.format(*(f"{mean(rows, train):.1f}" for rows in final)) in words
+        better[config] = [sum(mean(rows, tasks) > mean(sweep, tasks) for rows in final) for tasks in (train, test)]
+    assert better == {"rainbow_quick": [3, 0], "dqn_quick": [1, 0]}
+
+
 def test_the_gap_of_procedural_maps_is_what_its_records_give():
     folder, kept = ROOT / "results" / "procedural_gap", ([], [])
     readme, page = (folder / "README.md").read_text(), (ROOT / "docs" / "BENCHMARK.md").read_text()
@@ -95,6 +125,12 @@ def test_the_joint_run_says_what_its_records_give():
         assert f"| {title} each, {episodes} episodes a task | {cells} |" in readme
     report = (folder / "report" / "report.md").read_text()
     assert "P_norm, 43.6 [42.8, 44.4]" in readme
+    alone = {}
+    for name in ("defend_the_center", "seek_and_kill"):
+        scores = agent_scores(results_of("general_short").episodes.filter(scenario=name), "rainbow_general")
+        alone[name] = estimate(scores, [task.id for task in named_tasks(name, split="train4")]).text.split()[0]
+    said = "(`rainbow_general`, eight training tasks) have {defend_the_center} and {seek_and_kill} on the same tasks"
+    assert said.format(**alone) in WORDS
     assert "| rainbow_all | 47.7 [46.8, 48.8] | 41.4 [40.2, 42.7] |" in report
 
 
@@ -217,7 +253,7 @@ def test_the_readme_says_how_fast_the_records_are():
         f"{updates['Tianshou']:.1f}, Dopamine's {updates['Dopamine']:.1f} |"
     ) in readme
     assert row("actors", "") in readme
-    assert row("actors_tuned", ", tuned engine") in readme
+    assert row("actors_tuned", "; here with the tuned engine, others with their own") in readme
 
 
 def test_pages_say_what_a_gpu_gave():
