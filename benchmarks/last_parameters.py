@@ -6,7 +6,6 @@
 An average (`learner.average_ema`) changes evaluation alone, so the two compare what it gives within one training run.
 """
 
-import contextlib
 import dataclasses
 import shutil
 import sys
@@ -17,26 +16,29 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from gvz.core.durable import saved_steps
-from gvz.core.errors import CheckpointError, ConfigError, GvzError
-from gvz.evaluation.trained import read_run_config
+from gvz.core.errors import ConfigError, GvzError
+from gvz.core.registry import NO_OWN_FILES, OwnFiles
+from gvz.evaluation.trained import find_checkpoint, read_run_config
 from gvz.run.assemble import assemble
-from gvz.run.rundir import RunDir
+from gvz.run.rundir import RunDir, disk_checked
 from gvz.segmentation import KEPT_SEGMENTERS
 from learner import checkpoint
 
 
-def write_last_parameters(run_dir: Path, out: Path) -> int:
-    """Writes a run directory with the policy of the run's newest whole checkpoint; returns its gradient steps.
+def write_last_parameters(run_dir: Path, out: Path, own_files: OwnFiles = NO_OWN_FILES) -> int:
+    """Writes a run directory with the last parameters of the run's newest policy; returns its gradient steps.
 
     Args:
         run_dir: a run that keeps an average.
-        out: a directory that is not there yet.
+        out: a directory that is not there yet. If writing fails, it is removed.
+        own_files: as for `read_run_config`.
 
     Raises:
-        ConfigError: there is no such run, it keeps no average, or `out` is there. CheckpointError: damaged, or none.
+        ConfigError: there is no such run or policy, it keeps no average, or `out` is there.
+        CheckpointError: the whole checkpoint of that policy is missing or damaged.
+        ResumeError: the disk does not take it.
     """
-    config = read_run_config(run_dir)
+    config = read_run_config(run_dir, own_files)
     if config.learner.average_ema is None:
         raise ConfigError(
             f"{run_dir}: its policies have the last parameters: it keeps no average (learner.average_ema)"
@@ -47,28 +49,37 @@ def write_last_parameters(run_dir: Path, out: Path) -> int:
         parts = assemble(config, Path(work))
     acting = jax.ShapeDtypeStruct((parts.pool_config.num_params,), jnp.float32)
     template = {**parts.learner.array_shapes(), "acting": acting}
-    checkpoints = run_dir / "checkpoints"
-    if not (steps := saved_steps(checkpoints)):
-        raise CheckpointError(f"{checkpoints}: holds no whole checkpoint")
-    arrays, _ = checkpoint.read(checkpoints / str(steps[-1]), template)
-    with contextlib.closing(RunDir(out)) as made:
-        if (run_dir / KEPT_SEGMENTERS).exists():
-            shutil.copytree(run_dir / KEPT_SEGMENTERS, out / KEPT_SEGMENTERS)
-        made.write_config(dataclasses.replace(config, name=f"{config.name}+last_parameters", run_dir=None))
-        policy = out / "policies" / str(steps[-1])
-        checkpoint.write(policy, arrays["learner"].params, {"num_updates": steps[-1]})
-    return steps[-1]
+    num_updates = find_checkpoint(run_dir, "newest")
+    arrays, _ = checkpoint.read(run_dir / "checkpoints" / str(num_updates), template)
+    try:
+        with disk_checked(out), RunDir(out) as made:
+            if (run_dir / KEPT_SEGMENTERS).exists():
+                shutil.copytree(run_dir / KEPT_SEGMENTERS, out / KEPT_SEGMENTERS)
+            made.write_config(dataclasses.replace(config, name=f"{config.name}+last_parameters", run_dir=None))
+            policy = out / "policies" / str(num_updates)
+            checkpoint.write(policy, arrays["learner"].params, {"num_updates": num_updates})
+    except BaseException:
+        shutil.rmtree(out, ignore_errors=True)
+        raise
+    return num_updates
 
 
-def main(run_dir: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path]) -> int:
+def main(
+    run_dir: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
+    agent: Path | None = None,
+    encoder: Path | None = None,
+) -> int:
     """Write a run directory whose policy has the parameters of the run's last gradient step.
 
     Args:
         run_dir: directory of a run with learner.average_ema.
         out: the new directory.
+        agent: the Python file of the run's agent, if it is in a file of its own: this executes it.
+        encoder: likewise, of its encoder.
     """
     try:
-        num_updates = write_last_parameters(run_dir, out)
+        num_updates = write_last_parameters(run_dir, out, OwnFiles(agent, encoder))
     except GvzError as error:
         print(f"last_parameters: {error}", file=sys.stderr)
         return 2

@@ -217,7 +217,7 @@ def test_an_on_policy_run_goes_on_bit_for_bit_between_two_rollouts(tmp_path, age
 
 
 def test_last_parameters_are_of_a_run_that_keeps_an_average(tmp_path, capsys):
-    """It has a whole checkpoint, and what is written is a new directory."""
+    """It has a policy with its whole checkpoint, and what is written is a new directory."""
     for name, config in (("none", DQN), ("whole", replace(DQN, learner=replace(DQN.learner, average_ema=0.9)))):
         with RunDir(tmp_path / name) as run:
             run.write_config(config)
@@ -225,7 +225,7 @@ def test_last_parameters_are_of_a_run_that_keeps_an_average(tmp_path, capsys):
         ("missing", "new", "is not a run directory"),
         ("none", "new", "it keeps no average (learner.average_ema)"),
         ("whole", "none", "is already there"),
-        ("whole", "new", "holds no whole checkpoint"),
+        ("whole", "new", "holds no policy"),
     ):
         assert main(tmp_path / name, tmp_path / out) == 2
         assert message in capsys.readouterr().err
