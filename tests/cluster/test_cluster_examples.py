@@ -68,6 +68,7 @@ def test_the_kubernetes_cluster_asks_for_a_token_shares_results_and_has_shared_m
     assert (cluster["apiVersion"], cluster["kind"]) == ("ray.io/v1", "RayCluster")
     spec = cluster["spec"]
     assert spec["authOptions"] == {"mode": "token"}
+    assert f"ray=={spec['rayVersion']}" in (EXAMPLES.parents[1] / "requirements.lock").read_text().splitlines()
     groups = [spec["headGroupSpec"], *spec["workerGroupSpecs"]]
     assert all(isinstance(value, str) for group in groups for value in group["rayStartParams"].values())
     for pod in (group["template"]["spec"] for group in groups):
@@ -78,3 +79,22 @@ def test_the_kubernetes_cluster_asks_for_a_token_shares_results_and_has_shared_m
         volumes = {volume["name"]: volume for volume in pod["volumes"]}
         assert volumes[mounts["/dev/shm"]]["emptyDir"]["medium"] == "Memory"
         assert volumes[mounts["/results"]]["persistentVolumeClaim"]["claimName"] == claim["metadata"]["name"]
+
+
+def test_the_kubernetes_pods_have_probes_that_need_no_dashboard_agent():
+    """KubeRay adds those that are missing, and asks the agent for HTTP, which plain `ray` does not have."""
+    spec = list(yaml.safe_load_all((EXAMPLES / "kuberay.yaml").read_text()))[1]["spec"]
+    (head,) = spec["headGroupSpec"]["template"]["spec"]["containers"]
+    (worker,) = spec["workerGroupSpecs"][0]["template"]["spec"]["containers"]
+    for probe in ("readinessProbe", "livenessProbe"):
+        assert head[probe]["tcpSocket"] == {"port": head["ports"][0]["containerPort"]}
+        assert worker[probe]["exec"] == worker["livenessProbe"]["exec"]
+    *shell, asked = worker["livenessProbe"]["exec"]["command"]
+    for name, code in (("raylet", 0), ("rayle", 1)):
+        named = ["bash", "-c", f"echo {name} >/proc/$$/comm && echo ready && read -r"]
+        with subprocess.Popen(named, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"ready\n"
+            of_it = asked.replace("[0-9]*", str(process.pid))  # other tests have nodes, too
+            assert subprocess.run([*shell, of_it], timeout=60, check=False).returncode == code
+            process.kill()
