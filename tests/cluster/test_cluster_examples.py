@@ -31,6 +31,30 @@ def test_a_job_is_requeued_and_told_of_its_end_in_time(script):
     assert all(option.startswith("--") for option in options)
 
 
+@pytest.mark.parametrize(
+    ("of_its_name", "all_of_it", "head_ip"),
+    [
+        ("10.0.0.7", "172.17.0.1 10.0.0.7 ", "10.0.0.7"),
+        ("127.0.1.1", "10.0.0.7 172.17.0.1 fd00::7 ", "10.0.0.7"),
+        ("::1 127.0.1.1", "fd00::7 10.0.0.7 ", "10.0.0.7"),
+    ],
+)
+def test_the_head_of_a_ray_cluster_in_slurm_has_an_address_that_other_nodes_reach(
+    of_its_name, all_of_it, head_ip, tmp_path
+):
+    lines = (EXAMPLES / "slurm_ray.sbatch").read_text().split("head_ip=", 1)[1].split("\naddress=", 1)[0]
+    for name, does in (
+        ("srun", 'shift 3; exec "$@"'),
+        ("hostname", f'[ "$1" = --ip-address ] && echo "{of_its_name}" || echo "{all_of_it}"'),
+    ):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{does}\n")
+        (tmp_path / name).chmod(0o700)
+    script = f'set -euo pipefail\nhead_host=n1\nhead_ip={lines}\necho "$head_ip"'
+    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    done = subprocess.run(["bash", "-c", script], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == f"{head_ip}\n"
+
+
 @pytest.mark.e2e
 @pytest.mark.engine
 @pytest.mark.slow

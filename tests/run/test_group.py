@@ -272,6 +272,37 @@ def test_a_coordinator_that_is_public_or_unknown_is_refused_before_anything_list
         WithoutDevices(replace(CONFIG, group=group), lambda _: None)
 
 
+@pytest.mark.parametrize(
+    ("own", "coordinator", "message"),
+    [
+        ("8.8.8.8", "127.0.0.1", r"8\.8\.8\.8 is a public address; .*, which /etc/hosts can give to doom7"),
+        (
+            "127.0.1.1",
+            "10.0.0.1",
+            r"got 127\.0\.1\.1, where .*; change the line of doom7 in /etc/hosts, or begin group",
+        ),
+    ],
+)
+def test_an_own_host_name_that_is_public_or_of_this_machine_alone_is_refused(own, coordinator, message, monkeypatch):
+    """JAX's transport of gradients listens at its address, and sends the others there."""
+    named(own, monkeypatch)
+    group = GroupConfig(num_processes=2, process_id=0, coordinator=f"{coordinator}:1")
+    with pytest.raises(ConfigError, match=rf"^group: own host name 'doom7': {message}"):
+        WithoutDevices(replace(CONFIG, group=group), lambda _: None)
+
+
+def test_debians_address_of_an_own_host_name_is_good_enough_on_one_machine(monkeypatch):
+    named("127.0.1.1", monkeypatch)
+    for group in joined(2):
+        group._opened.close()
+
+
+def named(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """This machine's name has this address."""
+    monkeypatch.setattr(socket, "gethostname", lambda: "doom7")
+    monkeypatch.setattr("gvz.run.group.resolve", lambda host, _: address if host == "doom7" else host)
+
+
 def test_a_fresh_start_of_a_group_is_refused(tmp_path, capsys):
     group = "--group.num-processes 2 --group.process-id 0 --group.coordinator 127.0.0.1:1".split()
     assert main(["--fresh", "--run-dir", str(tmp_path), *group]) == 2
