@@ -1,12 +1,14 @@
 """A job's command on a node of a cluster: its cores, environment and process. No Ray here: Ray carries the calls."""
 
 import os
+import random
 import socket
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
+from actors.placement import idle_cores
 from gvz.core import janitor, records
 from gvz.experiments.process import LocalProcess
 
@@ -59,12 +61,14 @@ class JobHost:
 def hold_cores(count: int) -> tuple[tuple[int, ...], list[IO[str]]]:
     """Cores of this machine that no other job of this user holds, and their locks, which last as long as they are open.
 
-    All cores, without locks, where too few are free: Ray was told of more cores than there are, or somebody holds them.
+    Idle cores go first, and chance says which: containers see the same cores, but not each other's locks. All cores,
+    without locks, where too few are free: Ray was told of more cores than there are, or somebody holds them.
     """
-    allowed = sorted(os.sched_getaffinity(0))
+    allowed, idle = sorted(os.sched_getaffinity(0)), idle_cores()
+    first = random.randrange(len(allowed))
     cores: list[int] = []
     locks: list[IO[str]] = []
-    for core in allowed:
+    for core in sorted(allowed[first:] + allowed[:first], key=lambda core: core not in idle):
         lock = (janitor.runtime_dir() / f"core-{core}.lock").open("w")
         if len(cores) < count and records.lock(lock):
             cores.append(core)

@@ -31,7 +31,7 @@ def measure(config: RunConfig) -> Costs:
     Raises:
         GvzError: the run does not fit this machine, or its actor does not start.
     """
-    actors = dataclasses.replace(config.actors, num_actors=1)
+    actors = dataclasses.replace(config.actors, num_actors=1, inference="actors")  # those of hosts act by themselves
     replay = dataclasses.replace(off_policy(config)[1], capacity=50_000)
     small = dataclasses.replace(config, mode="async", actors=actors, replay=replay)
     with tempfile.TemporaryDirectory(prefix="gvz-measure-") as directory:

@@ -66,6 +66,8 @@ class PlanCluster:
             print(json.dumps({**dataclasses.asdict(answer), "first": answer.first, "costs": dataclasses.asdict(costs)}))
         else:
             print("\n".join(_lines(ask, answer, costs)))
+            if config.actors.inference == "device":
+                print(f"{'note':15} hosts play only with --actors.inference actors; {self.config} has device")
         return 0
 
     def _cluster(self, config: "RunConfig") -> "Cluster":

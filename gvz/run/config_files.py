@@ -164,6 +164,11 @@ def config_from_dict(saved: Any, own_files: OwnFiles = NO_OWN_FILES) -> RunConfi
             plain = {**plain, "actors": {**actors, **numbers}}
         case _:
             pass
+    match plain:  # an earlier version let one process have these; they had no effect
+        case {"group": {"num_processes": 1} as group}:
+            plain = {**plain, "group": {**group, "process_id": None, "coordinator": None}}
+        case _:
+            pass
     config = build_config(plain, "config", kind)
     if resolved.tasks != (tasks := config.table.ids):
         raise ConfigError(f"resolved.tasks: got {list(resolved.tasks)}, but the configuration has {list(tasks)}")

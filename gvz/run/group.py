@@ -7,7 +7,9 @@ and all stop before the same step.
 """
 
 import contextlib
+import ipaddress
 import signal
+import socket
 from collections.abc import Callable, Generator
 from typing import Any, Protocol
 
@@ -103,12 +105,15 @@ class Several:
         """Waits for the other processes, and makes their devices known to each other. Before any other use of jax.
 
         Raises:
-            ConfigError: the coordinator is public or unknown, or the processes differ in their configuration or their
-            versions. WaitTimeoutError: some do not come.
+            ConfigError: the coordinator or this machine's own address is public or unknown, others cannot reach that
+            address, or the processes differ in their configuration or their versions. WaitTimeoutError: some do not
+            come.
         """
         group = config.group
         host, port = group.address
-        require_private(resolve(host, "group.coordinator"), "group.coordinator", _PRIVATE)
+        coordinator = resolve(host, "group.coordinator")
+        require_private(coordinator, "group.coordinator", _PRIVATE)
+        _check_own_address(coordinator)
         self._process, self._num_processes = group.own_id, group.num_processes
         say(f"learner process {self._process} of {self._num_processes}: waiting for the others at {host}:{port}")
         hello: dict[str, Any] = {"config": _settings(config), "versions": machine.versions(_MUST_AGREE)}
@@ -222,6 +227,22 @@ def join(config: RunConfig, say: Callable[[str], None]) -> Group:
         ConfigError, WaitTimeoutError: as `Several`.
     """
     return Alone() if config.group.num_processes == 1 else Several(config, say)
+
+
+def _check_own_address(coordinator: str) -> None:
+    """Refuses a machine whose own name has an address where the others cannot or must not come: JAX's transport of
+    gradients between CPUs listens there, and tells the others so.
+    """
+    name = socket.gethostname()
+    where = f"group: own host name {name!r}"
+    own = resolve(name, where)
+    require_private(own, where, f"{_PRIVATE}, which /etc/hosts can give to {name}")
+    if ipaddress.ip_address(own).is_loopback and not ipaddress.ip_address(coordinator).is_loopback:
+        raise ConfigError(
+            f"{where}: got {own}, where other machines find only themselves, want an address of a private network; "
+            f"change the line of {name} in /etc/hosts, or begin group.coordinator with 127.0.0.1 if all processes are "
+            "on this machine"
+        )
 
 
 def _settings(config: RunConfig) -> dict[str, str]:

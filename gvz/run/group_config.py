@@ -27,6 +27,12 @@ class GroupConfig:
     def __post_init__(self) -> None:
         check_ranges("group", self)
         if self.num_processes == 1:
+            for name in ("process_id", "coordinator"):
+                if (got := getattr(self, name)) is not None:
+                    raise ConfigError(
+                        f"group.{name}: got {got} without other processes, want none; group.num_processes says how "
+                        "many there are"
+                    )
             return
         host, _, port = (self.coordinator or "").rpartition(":")
         if not host or not port.isdecimal() or not 0 < int(port) < 2**16:

@@ -7,6 +7,7 @@ waits for the device between log periods but a checkpoint, and a publication to 
 
 import contextlib
 import dataclasses
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -223,13 +224,15 @@ class Trainer:
 
 def with_own_segmenters(config: RunConfig, run: RunDir) -> RunConfig:
     """The configuration with the run's own copies of its segmentation networks. Other hosts have no copies; games there
-    use the networks that are installed.
+    use the networks that are installed. Copies of a start that ended before the run had a configuration are replaced.
 
     Raises:
         ResumeError: those are not the run's.
     """
     own, scenarios = run.path / KEPT_SEGMENTERS, [scenario.id for scenario in config.table.scenarios]
     with disk_checked(run.path):
+        if own.exists() and not (run.path / "config.json").exists():
+            shutil.rmtree(own)
         keep_segmenters(scenarios, config.env, own)
     if config.cluster.hosts:
         check_installed(scenarios, config.env, own)

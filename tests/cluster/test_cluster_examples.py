@@ -31,6 +31,30 @@ def test_a_job_is_requeued_and_told_of_its_end_in_time(script):
     assert all(option.startswith("--") for option in options)
 
 
+@pytest.mark.parametrize(
+    ("of_its_name", "all_of_it", "head_ip"),
+    [
+        ("10.0.0.7", "172.17.0.1 10.0.0.7 ", "10.0.0.7"),
+        ("127.0.1.1", "10.0.0.7 172.17.0.1 fd00::7 ", "10.0.0.7"),
+        ("::1 127.0.1.1", "fd00::7 10.0.0.7 ", "10.0.0.7"),
+    ],
+)
+def test_the_head_of_a_ray_cluster_in_slurm_has_an_address_that_other_nodes_reach(
+    of_its_name, all_of_it, head_ip, tmp_path
+):
+    lines = (EXAMPLES / "slurm_ray.sbatch").read_text().split("head_ip=", 1)[1].split("\naddress=", 1)[0]
+    for name, does in (
+        ("srun", 'shift 3; exec "$@"'),
+        ("hostname", f'[ "$1" = --ip-address ] && echo "{of_its_name}" || echo "{all_of_it}"'),
+    ):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{does}\n")
+        (tmp_path / name).chmod(0o700)
+    script = f'set -euo pipefail\nhead_host=n1\nhead_ip={lines}\necho "$head_ip"'
+    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    done = subprocess.run(["bash", "-c", script], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == f"{head_ip}\n"
+
+
 @pytest.mark.e2e
 @pytest.mark.engine
 @pytest.mark.slow
@@ -68,6 +92,7 @@ def test_the_kubernetes_cluster_asks_for_a_token_shares_results_and_has_shared_m
     assert (cluster["apiVersion"], cluster["kind"]) == ("ray.io/v1", "RayCluster")
     spec = cluster["spec"]
     assert spec["authOptions"] == {"mode": "token"}
+    assert f"ray=={spec['rayVersion']}" in (EXAMPLES.parents[1] / "requirements.lock").read_text().splitlines()
     groups = [spec["headGroupSpec"], *spec["workerGroupSpecs"]]
     assert all(isinstance(value, str) for group in groups for value in group["rayStartParams"].values())
     for pod in (group["template"]["spec"] for group in groups):
@@ -78,3 +103,22 @@ def test_the_kubernetes_cluster_asks_for_a_token_shares_results_and_has_shared_m
         volumes = {volume["name"]: volume for volume in pod["volumes"]}
         assert volumes[mounts["/dev/shm"]]["emptyDir"]["medium"] == "Memory"
         assert volumes[mounts["/results"]]["persistentVolumeClaim"]["claimName"] == claim["metadata"]["name"]
+
+
+def test_the_kubernetes_pods_have_probes_that_need_no_dashboard_agent():
+    """KubeRay adds those that are missing, and asks the agent for HTTP, which plain `ray` does not have."""
+    spec = list(yaml.safe_load_all((EXAMPLES / "kuberay.yaml").read_text()))[1]["spec"]
+    (head,) = spec["headGroupSpec"]["template"]["spec"]["containers"]
+    (worker,) = spec["workerGroupSpecs"][0]["template"]["spec"]["containers"]
+    for probe in ("readinessProbe", "livenessProbe"):
+        assert head[probe]["tcpSocket"] == {"port": head["ports"][0]["containerPort"]}
+        assert worker[probe]["exec"] == worker["livenessProbe"]["exec"]
+    *shell, asked = worker["livenessProbe"]["exec"]["command"]
+    for name, code in (("raylet", 0), ("rayle", 1)):
+        named = ["bash", "-c", f"echo {name} >/proc/$$/comm && echo ready && read -r"]
+        with subprocess.Popen(named, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"ready\n"
+            of_it = asked.replace("[0-9]*", str(process.pid))  # other tests have nodes, too
+            assert subprocess.run([*shell, of_it], timeout=60, check=False).returncode == code
+            process.kill()

@@ -7,8 +7,11 @@ from pathlib import Path
 import pytest
 
 from gvz import cli
+from gvz.cluster import measure
 from gvz.cluster.plan import RECORDED, Cluster, Costs, capacity
 from gvz.core.errors import ConfigError
+from gvz.run.config import RunConfig
+from gvz.run.config_files import load_config
 
 ROOT = Path(__file__).parents[2]
 FRAME = 84 * 84 * 3
@@ -130,11 +133,22 @@ def test_the_command_prints_the_plan_and_where_its_constants_are_from(capsys):
     assert row["limits"]["actors"] == pytest.approx(64 / (RECORDED.decision_s + RECORDED.pack_s))
 
 
+def test_actors_of_a_plan_act_by_themselves_as_those_of_hosts_have_to(capsys, monkeypatch):
+    """Where the device acts, a decision of an actor has no network."""
+    assert cli.main("cluster plan --hosts 4 --cores 16 --config rainbow_general_gpu".split()) == 0
+    assert "hosts play only with --actors.inference actors; rainbow_general_gpu has device" in capsys.readouterr().out
+
+    def assembled(config: RunConfig, _: Path) -> None:
+        raise ConfigError(f"measured with {config.actors.inference}")
+
+    monkeypatch.setattr(measure, "assemble", assembled)
+    with pytest.raises(ConfigError, match="measured with actors"):
+        measure.measure(load_config("rainbow_general_gpu"))
+
+
 @pytest.mark.e2e
 @pytest.mark.engine
 def test_this_machine_can_be_measured_instead(capsys, monkeypatch):
-    from gvz.cluster import measure
-
     monkeypatch.setattr(measure, "PLAY_S", 3.0)
     flags = ["cluster", "plan", "--hosts", "2", "--cores", "2", "--config", "dqn_quick", "--measure", "--json"]
     assert cli.main(flags) == 0

@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from gvz.cluster import ray_jobs
+from gvz.cluster import job_host, ray_jobs
 from gvz.cluster.job_host import hold_cores
 from gvz.cluster.ray_jobs import Share
 from gvz.core import records
@@ -211,14 +211,32 @@ def test_a_core_has_one_holder_and_too_few_free_cores_are_none(monkeypatch, tmp_
     monkeypatch.setenv("GVZ_RUNTIME_DIR", str(tmp_path))
     allowed = sorted(os.sched_getaffinity(0))
     first, locks = hold_cores(1)
-    assert first == tuple(allowed[:1])
+    assert len(first) == 1
     assert hold_cores(len(allowed)) == (tuple(allowed), [])
     for lock in locks:
         lock.close()
     every, locks = hold_cores(len(allowed))
-    assert (every, len(locks)) == (tuple(allowed), len(allowed))
+    assert (sorted(every), len(locks)) == (allowed, len(allowed))
     for lock in locks:
         lock.close()
+
+
+def test_a_job_takes_idle_cores_and_not_those_that_every_container_would_take(monkeypatch, tmp_path):
+    """Containers of one machine see all its cores, but each its own locks alone."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(16)))
+    monkeypatch.setattr(job_host, "idle_cores", lambda: list(range(4, 12)))
+    taken = set()
+    for container in range(20):
+        (tmp_path / f"{container}").mkdir(mode=0o700)
+        monkeypatch.setenv("GVZ_RUNTIME_DIR", str(tmp_path / f"{container}"))
+        held = [hold_cores(4) for _ in range(3)]
+        first, second, third = (set(cores) for cores, _ in held)
+        assert first | second == set(range(4, 12))
+        assert len(third - first - second) == 4, "busy ones where no others are free"
+        taken.add(frozenset(first))
+        for lock in (lock for _, locks in held for lock in locks):
+            lock.close()
+    assert len(taken) > 1
 
 
 def test_a_head_that_is_gone_is_named(monkeypatch):

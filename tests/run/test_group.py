@@ -231,6 +231,15 @@ def test_a_group_that_is_not_whole_is_refused(values, message, monkeypatch):
         GroupConfig(num_processes=2, **values)
 
 
+@pytest.mark.parametrize(("name", "value"), [("process_id", 1), ("coordinator", "10.0.0.1:9876")])
+def test_an_option_of_a_group_without_a_number_of_processes_is_refused(name, value):
+    with pytest.raises(ConfigError, match=rf"group\.{name}: got {value} without other .*; group\.num_processes says"):
+        GroupConfig(**{name: value})
+    saved = config_to_dict(CONFIG)
+    saved["config"]["group"][name] = value  # as an earlier version wrote it
+    assert config_from_dict(saved).group == GroupConfig()
+
+
 def test_slurm_says_which_process_this_is_and_each_has_a_directory_and_games_of_its_own(monkeypatch):
     monkeypatch.setenv("SLURM_PROCID", "1")
     config = replace(CONFIG, group=GroupConfig(num_processes=2, coordinator="here:1"))
@@ -270,6 +279,37 @@ def test_a_coordinator_that_is_public_or_unknown_is_refused_before_anything_list
     group = GroupConfig(num_processes=2, process_id=0, coordinator=f"{host}:1")
     with pytest.raises(ConfigError, match=rf"group\.coordinator: {message}"):
         WithoutDevices(replace(CONFIG, group=group), lambda _: None)
+
+
+@pytest.mark.parametrize(
+    ("own", "coordinator", "message"),
+    [
+        ("8.8.8.8", "127.0.0.1", r"8\.8\.8\.8 is a public address; .*, which /etc/hosts can give to doom7"),
+        (
+            "127.0.1.1",
+            "10.0.0.1",
+            r"got 127\.0\.1\.1, where .*; change the line of doom7 in /etc/hosts, or begin group",
+        ),
+    ],
+)
+def test_an_own_host_name_that_is_public_or_of_this_machine_alone_is_refused(own, coordinator, message, monkeypatch):
+    """JAX's transport of gradients listens at its address, and sends the others there."""
+    named(own, monkeypatch)
+    group = GroupConfig(num_processes=2, process_id=0, coordinator=f"{coordinator}:1")
+    with pytest.raises(ConfigError, match=rf"^group: own host name 'doom7': {message}"):
+        WithoutDevices(replace(CONFIG, group=group), lambda _: None)
+
+
+def test_debians_address_of_an_own_host_name_is_good_enough_on_one_machine(monkeypatch):
+    named("127.0.1.1", monkeypatch)
+    for group in joined(2):
+        group._opened.close()
+
+
+def named(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """This machine's name has this address."""
+    monkeypatch.setattr(socket, "gethostname", lambda: "doom7")
+    monkeypatch.setattr("gvz.run.group.resolve", lambda host, _: address if host == "doom7" else host)
 
 
 def test_a_fresh_start_of_a_group_is_refused(tmp_path, capsys):

@@ -16,7 +16,7 @@ from benchmarks.last_parameters import main, write_last_parameters
 from gvz.cluster.config import ClusterConfig
 from gvz.core import records
 from gvz.core.env_config import EnvConfig
-from gvz.core.errors import ResumeError
+from gvz.core.errors import ConfigError, ResumeError
 from gvz.core.stop import StopRequest
 from gvz.run import machine
 from gvz.run.config import CheckpointConfig, LogConfig, RunConfig
@@ -82,6 +82,19 @@ def test_a_run_keeps_the_network_of_its_segmented_frames_and_goes_on_with_it(tmp
         assert with_own_segmenters(on_hosts, run).env == env, "another host has no copies"
     digests = [row["segmenters"] for row in records.read(path / "starts.jsonl")[0]]
     assert digests == [{"defend_the_center": hashlib.blake2b(first, digest_size=8).hexdigest()}] * 2
+
+
+def test_networks_of_a_first_start_that_was_refused_do_not_stay(tmp_path):
+    """A run learns with networks from when it has a configuration on."""
+    path = tmp_path / "run"
+    (tmp_path / "bad.onnx").write_text("no network")
+    good = write_network(tmp_path / "good.onnx")
+    env = EnvConfig(frames="segmented", segmenter=str(tmp_path / "bad.onnx"), frame_height=24, frame_width=32)
+    with pytest.raises(ConfigError, match="is no segmentation network"):
+        go_on(path, replace(DQN, env=env), 20)
+    with RunDir(path) as run:
+        with_own_segmenters(replace(DQN, env=replace(env, segmenter=str(good))), run)
+    assert (path / "segmenters" / "defend_the_center.onnx").read_bytes() == good.read_bytes()
 
 
 def test_actors_find_the_networks_of_a_run_whose_directory_is_relative(tmp_path, monkeypatch):
