@@ -59,8 +59,8 @@ def agents_of_runs(runs: Sequence[Run], evaluated: Mapping[object, set[str]]) ->
 def _telling_settings(runs: Sequence[Run]) -> dict[Path, list[str]]:
     """ "agent.discount 0.5": settings in which runs of one name on the same tasks differ, of each of these runs.
 
-    Left out are settings that change nothing (`gvz.run.resume`), numbers of actors and games, and those that the other
-    run lacks: it is of an older version.
+    Left out are settings that change nothing (`gvz.run.resume`), and numbers of actors and games. A run of an older
+    version lacks some settings: those of the others are compared without it.
     """
     alike: dict[tuple[str, tuple[str, ...]], list[Run]] = {}
     for run in runs:
@@ -68,11 +68,11 @@ def _telling_settings(runs: Sequence[Run]) -> dict[Path, list[str]]:
     found: dict[Path, list[str]] = {}
     for group in alike.values():
         values = [dict(_settings(run.config, run.scenarios)) for run in group]
-        for name in values[0]:
-            own = [of_run.get(name) for of_run in values]
-            if None not in own and len(set(own)) > 1:
-                for run, value in zip(group, own, strict=True):
-                    found.setdefault(run.path, []).append(f"{name} {value}")
+        for name in dict.fromkeys(name for of_run in values for name in of_run):
+            own = {run.path: of_run[name] for run, of_run in zip(group, values, strict=True) if name in of_run}
+            if len(set(own.values())) > 1:
+                for path, value in own.items():
+                    found.setdefault(path, []).append(f"{name} {value}")
     return found
 
 

@@ -4,6 +4,7 @@ import gzip
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 import pytest
@@ -99,12 +100,12 @@ def test_agents_of_different_maps_that_played_the_same_are_not_one(tmp_path, exp
 def copied(small, tmp_path):
     """Copies a run to `tmp_path / name`, with other settings."""
 
-    def copy(name: str, **settings: dict) -> None:
+    def copy(name: str, **settings: Any) -> None:
         source = small / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111"
         shutil.copytree(source, tmp_path / name)
         saved = json.loads((tmp_path / name / "config.json").read_text())
         for field, values in settings.items():
-            saved["config"][field] |= values
+            saved["config"][field] = saved["config"][field] | values if isinstance(values, dict) else values
         (tmp_path / name / "config.json").write_text(json.dumps(saved))
 
     return copy
@@ -119,6 +120,19 @@ def test_runs_of_one_configuration_with_other_settings_are_several_agents(copied
         str(tmp_path / "b" / "run"): "rainbow_4task (agent.discount 0.99)",
     }
     assert not results.problems
+
+
+def test_a_run_that_lacks_a_setting_hides_no_difference_between_others(copied, tmp_path):
+    for seed, discount in enumerate((0.5, 0.9, None)):
+        copied(f"r/{seed}", seed=seed, agent={"discount": discount})
+    file = tmp_path / "r" / "2" / "config.json"
+    file.write_text(file.read_text().replace('"discount": null, ', ""))
+    agents = read_results([tmp_path / "r"]).agents
+    assert [agents[str(tmp_path / "r" / str(seed))] for seed in range(3)] == [
+        "rainbow_4task (agent.discount 0.5)",
+        "rainbow_4task (agent.discount 0.9)",
+        "rainbow_4task",
+    ]
 
 
 def test_runs_of_an_experiment_with_other_settings_are_put_together_and_named(small, tmp_path):
