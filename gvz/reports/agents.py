@@ -91,7 +91,7 @@ def _settings(config: Mapping[str, Any], scenarios: Sequence[str], prefix: str =
 
 
 def pooled_runs(runs: Sequence[Run], agents: Mapping[str, str], evaluated: Mapping[object, set[str]]) -> list[str]:
-    """What a reader would not expect to be put together: an agent's runs of other settings, and of one seed."""
+    """What a reader would not expect to be put together: runs of other settings or budgets, and of one seed."""
     settings, problems = _telling_settings(runs), []
     by_agent: dict[str, list[Run]] = {}
     for run in runs:
@@ -103,6 +103,7 @@ def pooled_runs(runs: Sequence[Run], agents: Mapping[str, str], evaluated: Mappi
             if _is_of_a_set(run) and run.path in settings
         ]
         problems += _of_other_networks(of_agent)
+        problems += _of_other_budgets(of_agent)
         for one, other in itertools.combinations(of_agent, 2):
             both = evaluated.get(str(one.path), set()) & evaluated.get(str(other.path), set())
             if one.seed == other.seed and one.tasks == other.tasks and both:
@@ -125,6 +126,15 @@ def _of_other_networks(of_agent: Sequence[Run]) -> Iterator[str]:
                     f"{run.path}: put together with {earlier.path}, which learned with another segmentation network of "
                     f"{scenario}"
                 )
+
+
+def _of_other_budgets(of_agent: Sequence[Run]) -> Iterator[str]:
+    """Runs that may train for longer or shorter than the first one of this agent in the same scenarios."""
+    first: dict[tuple[str, ...], Run] = {}
+    for run in of_agent:
+        one = first.setdefault(run.scenarios, run)
+        if run.budget != one.budget:
+            yield f"{run.path}: put together with {one.path}, which has another budget: {one.budget}, not {run.budget}"
 
 
 def _is_of_a_set(run: Run) -> bool:

@@ -165,6 +165,19 @@ def test_seeds_that_learned_with_other_networks_are_named(small, tmp_path):
     )
 
 
+def test_seeds_of_other_budgets_are_named(copied, tmp_path):
+    copied("r/1", seed=1, max_processor_s=900.0)
+    copied("r/2", seed=2, max_processor_s=5400.0)
+    copied("r/3", seed=3, max_processor_s=900.0)
+    results = read_results([tmp_path / "r"])
+    assert set(results.agents.values()) == {"rainbow_4task"}
+    (problem,) = results.problems
+    assert problem == (
+        f"{tmp_path / 'r' / '2'}: put together with {tmp_path / 'r' / '1'}, which has another budget: 900 seconds of "
+        "processor time, at most 20 gradient steps, not 5,400 seconds of processor time, at most 20 gradient steps"
+    )
+
+
 def test_a_seed_that_is_there_twice_is_named(copied, tmp_path):
     copied("a/run")
     copied("b/run")
