@@ -24,7 +24,8 @@ _TELL_NOTHING = ("seed", "scenario", "training_set", "tasks", "actors.num_actors
 def agents_of_runs(runs: Sequence[Run], evaluated: Mapping[object, set[str]]) -> dict[str, str]:
     """Run directory -> agent: the configuration's name, and what it was trained on where that tells agents apart.
 
-    Runs that were each trained on one task, and were evaluated on no common one, are one agent (EACH).
+    Runs that were each trained on one task, and were evaluated on no common one, are one agent (EACH). Runs of several
+    scenarios are one agent unless one of them was evaluated where another one was trained.
 
     Args:
         runs: of any configurations.
@@ -45,14 +46,28 @@ def agents_of_runs(runs: Sequence[Run], evaluated: Mapping[object, set[str]]) ->
         return EACH if apart and len(played) > 2 else run.training  # more than default and one other
 
     trainings = {name: {training(run) for run in runs if run.name == name} for name in {run.name for run in runs}}
-    settings = _telling_settings(runs)
+    settings, away = _telling_settings(runs), _names_away(runs, evaluated)
     words = {
-        run.path: [training(run)] * (len(trainings[run.name]) > 1)
+        run.path: [f"trained in {' and '.join(run.scenarios)}"] * (run.name in away)
+        + [training(run)] * (len(trainings[run.name]) > 1)
         + settings.get(run.path, []) * (not _is_of_a_set(run))
         for run in runs
     }
     return {
         str(run.path): f"{run.name} ({', '.join(words[run.path])})" if words[run.path] else run.name for run in runs
+    }
+
+
+def _names_away(runs: Sequence[Run], evaluated: Mapping[object, set[str]]) -> set[str]:
+    """Names of runs of which one was evaluated in a scenario that it was not trained in, but another one was."""
+    trained_in: dict[str, set[str]] = {}
+    for run in runs:
+        trained_in.setdefault(run.name, set()).update(run.scenarios)
+    return {
+        run.name
+        for run in runs
+        for task in evaluated.get(str(run.path), set())
+        if (scenario := task.partition("/")[0]) in trained_in[run.name] and scenario not in run.scenarios
     }
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from gvz.core.errors import ConfigError
 from gvz.experiments.base import experiment_named
+from gvz.experiments.inventory import run_directory
 from gvz.experiments.plan import Plan
 from gvz.reports.agents import EACH
 from gvz.reports.results import read_results
@@ -120,6 +121,19 @@ def test_runs_of_one_configuration_with_other_settings_are_several_agents(copied
         str(tmp_path / "b" / "run"): "rainbow_4task (agent.discount 0.99)",
     }
     assert not results.problems
+
+
+def test_runs_that_played_where_others_were_trained_are_agents_of_their_own(tmp_path, experiments_writer):
+    plan = Plan.of("general_on_policy", scale=0.0001, scenarios=("defend_the_center", "health_gathering"))
+    experiments_writer(tmp_path, plan, lambda _: 50.0)
+    one, other = (run_directory(tmp_path, run) for run in plan.runs())
+    assert set(read_results([tmp_path]).agents.values()) == {"ppo_segmented"}
+    rows = [json.loads(line) for line in (other / "evaluation.jsonl").read_text().splitlines()]
+    write_rows(one / "away.jsonl", [{**row, "params": "1"} for row in rows])
+    assert read_results([tmp_path]).agents == {
+        str(one): "ppo_segmented (trained in defend_the_center)",
+        str(other): "ppo_segmented (trained in health_gathering)",
+    }
 
 
 def test_a_run_that_lacks_a_setting_hides_no_difference_between_others(copied, tmp_path):
