@@ -169,9 +169,17 @@ def with_agents(episodes: pl.DataFrame, agents: dict[str, str]) -> pl.DataFrame:
 
 
 def _other_rules() -> list[pl.Expr]:
-    """ " (levdoom)" for rows of an agent that played by several rules, for each kind of rule; else nothing."""
+    """ " (levdoom)" for rows of an agent that played by several rules, for each kind of rule; else nothing.
+
+    A profile is another game with another upper bound: where there are several, every agent has its own in its name.
+    """
+
+    def several(rule: str) -> pl.Expr:
+        num_rules = pl.col(rule).drop_nulls().n_unique()
+        return (num_rules if rule == "profile" else num_rules.over("agent")) > 1
+
     return [
-        pl.when(pl.col(rule).drop_nulls().n_unique().over("agent") > 1)
+        pl.when(several(rule))
         .then(pl.format(text, pl.col(rule).cast(pl.String).fill_null("unknown " + rule)))
         .otherwise(pl.lit(""))
         for rule, text in (("profile", " ({})"), ("action_set", " ({})"), ("frame_skip", " (frame_skip {})"))

@@ -180,7 +180,9 @@ def gap_table(
     results: Results, scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task]
 ) -> Table | None:
     """How much lower agents score on other tasks than on their training tasks, and on levels 2 to 4 than on 0 and 1."""
-    trained_on = {results.agents[str(r.path)]: r.tasks for r in results.runs if scenario.id in r.scenarios}
+    tasks_of = {str(run.path): run.tasks for run in results.runs if scenario.id in run.scenarios}
+    who_played = results.episodes.select("agent", "run_dir").unique(maintain_order=True)
+    trained_on = {agent: tasks_of[directory] for agent, directory in who_played.iter_rows() if directory in tasks_of}
     test = [task.id for task in named_tasks(scenario.id, split="test")]
     named = _named(scenario, tasks)
     low, high = [t.id for t in named if t.level <= 1], [t.id for t in named if t.level >= 2]
@@ -265,9 +267,14 @@ def _learning(results: Results, scenario: Scenario, out: Path) -> list[Figure]:
 
 
 def _chance(results: Results, tasks: Sequence[str]) -> dict[str, float]:
-    """Mean score of the random player on these tasks, if it played them all."""
-    rows = pick(results.episodes.filter(pl.col("task").is_in(tasks), player="random")).get(None, {})
-    return {"random": float(np.mean([np.mean(rows[task]) for task in tasks]))} if rows.keys() >= set(tasks) else {}
+    """Mean score of the random player on these tasks, by each of its rules with which it played them all."""
+    rows = results.episodes.filter(pl.col("task").is_in(tasks), player="random")
+    scores = {str(agent): pick(of_agent).get(None, {}) for (agent,), of_agent in sorted(rows.group_by("agent"))}
+    return {
+        agent: float(np.mean([np.mean(by_task[task]) for task in tasks]))
+        for agent, by_task in scores.items()
+        if by_task.keys() >= set(tasks)
+    }
 
 
 def _evaluation(

@@ -78,9 +78,16 @@ def test_an_agent_that_played_by_several_rules_is_several(tmp_path):
     task = "defend_the_center/default"
     rows = [evaluation_row(who, task, 0, 50.0, profile=rules) for who in ("a", "b") for rules in ("thesis", "levdoom")]
     write_rows(tmp_path / "rows.jsonl", rows[:3])
-    assert set(read_results([tmp_path]).episodes["agent"]) == {"a (thesis)", "a (levdoom)", "b"}
+    assert set(read_results([tmp_path]).episodes["agent"]) == {"a (thesis)", "a (levdoom)", "b (thesis)"}
     write_rows(tmp_path / "rows.jsonl", [{**rows[2], "frame_skip": skip} for skip in (4, 8)])
     assert set(read_results([tmp_path]).episodes["agent"]) == {"b (frame_skip 4)", "b (frame_skip 8)"}
+
+
+def test_agents_that_played_different_profiles_are_not_compared_without_a_word(tmp_path):
+    task = "defend_the_center/default"
+    rows = [evaluation_row(who, task, 0, 50.0, profile=rules) for who, rules in (("a", "thesis"), ("b", "levdoom"))]
+    write_rows(tmp_path / "rows.jsonl", rows)
+    assert set(read_results([tmp_path]).episodes["agent"]) == {"a (thesis)", "b (levdoom)"}
 
 
 def test_players_that_observe_other_than_the_screen_have_it_in_their_names(tmp_path):
