@@ -74,6 +74,18 @@ def test_a_record_file_may_hold_several_runs_each_with_its_last_checkpoint(tmp_p
     assert len(final) == 6
 
 
+def test_an_earlier_checkpoint_in_a_file_elsewhere_is_no_final_one(a_run, tmp_path):
+    """As `gvz evaluate RUN --checkpoints N --out FILE` writes it."""
+    rows = [json.loads(line) for line in (a_run / "evaluation.jsonl").read_text().splitlines()]
+    newest = max(row["num_updates"] for row in rows)
+    for directory, earlier in ((a_run, False), (tmp_path / "elsewhere", True)):
+        kept = [row for row in rows if (row["num_updates"] < newest) == earlier]
+        write_rows(directory / "evaluation.jsonl", kept)
+    episodes = read_results([a_run, tmp_path / "elsewhere"]).episodes
+    assert episodes.select(pl.col("num_updates").n_unique()).item() == 2
+    assert set(episodes.filter("final")["num_updates"]) == {newest}
+
+
 def test_an_agent_that_played_by_several_rules_is_several(tmp_path):
     task = "defend_the_center/default"
     rows = [evaluation_row(who, task, 0, 50.0, profile=rules) for who in ("a", "b") for rules in ("thesis", "levdoom")]
