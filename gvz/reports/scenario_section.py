@@ -12,7 +12,7 @@ from gvz.evaluation.dataset import REWARD_PREFIX
 from gvz.evaluation.statistics import Statistic, generalization_gap, interquartile_mean, mean, median, solved
 from gvz.reports.agents import ONE_RUN
 from gvz.reports.attribute_tables import attribute_figure, attribute_tables
-from gvz.reports.curves import learning_curve, level_curves
+from gvz.reports.curves import checkpoints_of_runs, learning_curve, level_curves, usual_tasks
 from gvz.reports.document import Block, Cell, Figure, Section, Table, count, missing, words
 from gvz.reports.draw import draw_curves, draw_heat_map, draw_histogram, draw_rewards
 from gvz.reports.experiment_section import what_id
@@ -286,9 +286,9 @@ def _evaluation(
     figures = []
     for agent in agents:
         rows = episodes.filter(agent=agent)
-        if rows["num_updates"].n_unique() < 2:
+        if max(checkpoints_of_runs(rows)) < 2:
             continue
         caption = f"{scenario.title}, {agent}: evaluation of every checkpoint by level, with 95% interval."
-        curves = level_curves(rows, rows["task"].unique(maintain_order=True).to_list())
+        curves = level_curves(rows, usual_tasks(rows))
         figures.append(draw_curves(out, f"evaluation_{scenario.id}_{what_id(agent)}", agent, curves, caption))
     return figures
