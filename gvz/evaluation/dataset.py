@@ -123,6 +123,10 @@ def collect_evaluations(paths: Iterable[Path | str]) -> tuple[pl.DataFrame, list
         frames.append(frame)
         problems += found
     together = pl.concat(frames, how="diagonal")
+    outside = pl.col("trained_on").is_null() & pl.col("params").is_not_null()
+    seen_before = pl.int_range(pl.len()).over(_IDENTITY) > 0
+    together, homeless = _at_home(together.filter(~(outside & seen_before)))
+    problems += homeless
     unlike = together.filter(pl.col("params").is_null()).group_by("run_dir", *_IDENTITY, maintain_order=True)
     for player, num_episodes in _sizes(unlike.agg(_NUM_RESULTS)):
         problems.append(
@@ -130,9 +134,6 @@ def collect_evaluations(paths: Iterable[Path | str]) -> tuple[pl.DataFrame, list
             "two players have this name, or two versions of one; give each a name of its own"
         )
     together = together.unique(("run_dir", *_IDENTITY), keep="first", maintain_order=True)
-    outside = pl.col("trained_on").is_null() & pl.col("params").is_not_null()
-    seen_before = pl.int_range(pl.len()).over(_IDENTITY) > 0
-    together = together.filter(~(outside & seen_before))
     policies = together.drop_nulls("params").group_by("run_dir", "player", "num_updates", maintain_order=True)
     for run_dir, player, _, num_policies in policies.agg(pl.col("params").n_unique()).iter_rows():
         if num_policies > 1:
@@ -141,6 +142,28 @@ def collect_evaluations(paths: Iterable[Path | str]) -> tuple[pl.DataFrame, list
                 "they were of one; leave out the records of the others"
             )
     return together, problems
+
+
+def _at_home(rows: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
+    """Gives rows outside run directories the directory of their run; says of which runs there are several."""
+    astray = rows.filter(pl.col("trained_on").is_null())["run_dir"].drop_nulls().unique()
+    outside = pl.col("run_dir").is_in([one for one in astray if not (Path(one) / "config.json").is_file()])
+    known = rows.drop_nulls("trained_on").group_by("run", "run_seed", maintain_order=True)
+    homes = known.agg(home=pl.col("run_dir").unique(maintain_order=True), their_tasks=pl.col("trained_on").first())
+    rows = rows.join(homes, on=["run", "run_seed"], how="left", maintain_order="left")
+    num_homes = pl.col("home").list.len()
+    several = rows.filter(outside, num_homes > 1).select("run_dir", "run", "run_seed", num=num_homes)
+    problems = [
+        f"{run_dir}: has episodes of {run}, training seed {seed}, of which there are {num} run directories; they are "
+        "taken for those of another run; put their file into the directory of theirs"
+        for run_dir, run, seed, num in several.unique(maintain_order=True).iter_rows()
+    ]
+    found = outside & (num_homes == 1)
+    rows = rows.with_columns(
+        run_dir=pl.when(found).then(pl.col("home").list.first()).otherwise("run_dir"),
+        trained_on=pl.when(found).then("their_tasks").otherwise("trained_on"),
+    )
+    return rows.drop("home", "their_tasks"), problems
 
 
 def _sizes(found: pl.DataFrame) -> list[tuple[str, int]]:

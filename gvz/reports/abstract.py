@@ -12,11 +12,13 @@ from gvz.experiments.plan import Evaluation
 from gvz.reports.document import count
 from gvz.reports.results import PlannedExperiment, Results
 from gvz.reports.scenario_section import agents_of, played_tasks
-from gvz.reports.scores import Scores, agent_scores, estimate_groups
+from gvz.reports.scores import Scores, agent_scores, estimate_groups, redraw
 from gvz.tasks import all_scenarios, named_tasks, scenario_named
 
 ENOUGH_SEEDS = 10
 """training seeds with which a 95% interval holds the true mean in some 90 of 100 cases (docs/REPORTS.md)"""
+ENOUGH_EPISODES = 10
+"""of a task, for an interval over episodes"""
 MOST_NAMES = 3
 """of runs in a sentence; the others are counted"""
 
@@ -51,14 +53,15 @@ def what_was_run(results: Results) -> list[str]:
 def who_has_more(results: Results) -> list[str]:
     """For each scenario the trained agents in order, each compared with the next on the tasks that all of them played;
     then the best of them with the players that do not learn. Agents without a seed that played all of these are left
-    out.
+    out and named.
     """
     sentences = []
     for name in all_scenarios():
         episodes = results.episodes.filter(scenario=name).drop_nulls("normalized_score")
         scores = {agent: agent_scores(episodes, agent) for agent in agents_of(episodes)}
         tasks = _common_tasks(name, episodes, scores)
-        scores = {agent: one for agent, one in scores.items() if one.complete_seeds(tasks)}
+        left_out = [agent for agent, one in scores.items() if not one.complete_seeds(tasks)]
+        scores = {agent: one for agent, one in scores.items() if agent not in left_out}
         if len(scores) < 2 or not tasks:
             continue
         means = {
@@ -71,14 +74,19 @@ def who_has_more(results: Results) -> list[str]:
         pairs += [(learners[0], player) for player in players] if learners else []
         compared = [_comparison(scores, one, other, tasks) for one, other in pairs]
         over = f"{scenario_named(name).title}, {_described(name, tasks)}"
-        sentences.append(f"{over}: {'; '.join(compared)}.")
+        without = f" Left out, because they lack some of these tasks: {', '.join(left_out)}." if left_out else ""
+        sentences.append(f"{over}: {'; '.join(compared)}.{without}")
     return sentences
 
 
 def _common_tasks(scenario: str, episodes: pl.DataFrame, scores: dict[str, Scores]) -> list[str]:
-    """The test tasks if all agents have them, else all the tasks that all agents have."""
+    """The test tasks if two agents have them, among them a trained one if there are any; else all the tasks that all
+    agents have.
+    """
     test = [task.id for task in named_tasks(scenario, split="test")]
-    if all(one.complete_seeds(test) for one in scores.values()):
+    trained = set(episodes.drop_nulls("run")["agent"])
+    have_test = {agent for agent, one in scores.items() if one.complete_seeds(test)}
+    if len(have_test) > 1 and (not trained or trained & have_test):
         return test
     return [task.id for task in played_tasks(episodes) if all(one.complete_seeds([task.id]) for one in scores.values())]
 
@@ -92,6 +100,8 @@ def _described(scenario: str, tasks: Sequence[str]) -> str:
 
 
 def _comparison(scores: dict[str, Scores], one: str, other: str, tasks: Sequence[str]) -> str:
+    if single := [agent for agent in (one, other) if _has_single_episodes(scores[agent], tasks)]:
+        return f"{one} and {other} cannot be compared ({' and '.join(single)}: one episode of a task)"
     gain = estimate_groups([(scores[one], tasks), (scores[other], tasks)], difference).estimate
     assert gain is not None, "all have these tasks"
     if gain.low <= 0 <= gain.high:
@@ -100,6 +110,12 @@ def _comparison(scores: dict[str, Scores], one: str, other: str, tasks: Sequence
         gain = Estimate(value=-gain.value, low=-gain.high, high=-gain.low)
         return f"{one} has {gain} points fewer than {other}"
     return f"{one} has {gain} points more than {other}"
+
+
+def _has_single_episodes(scores: Scores, tasks: Sequence[str]) -> bool:
+    """Its interval would be over episodes, but there is no more than one of a task."""
+    fewest = min(len(cell) for run in scores.cells(tasks) for cell in run)
+    return fewest < 2 and redraw(scores, tasks) == "episodes"
 
 
 def caveats(results: Results) -> list[str]:
@@ -119,6 +135,14 @@ def caveats(results: Results) -> list[str]:
         found.append(
             f"Fewer than {ENOUGH_SEEDS} training seeds of {', '.join(few)}: intervals over so few are too short, and "
             "differences between agents may be differences between seeds."
+        )
+    by_cell = (
+        results.episodes.filter("final").drop_nulls("normalized_score").group_by("agent", "run_seed", "task").len()
+    )
+    if few := sorted(set(by_cell.filter(pl.col("len") < ENOUGH_EPISODES)["agent"])):
+        found.append(
+            f"Fewer than {ENOUGH_EPISODES} evaluation episodes of some task by {', '.join(few)}: intervals over so few "
+            "are too short."
         )
     unfinished = [run.id for run in results.runs if not run.ended]
     if unfinished:

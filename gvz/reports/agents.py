@@ -24,7 +24,8 @@ _TELL_NOTHING = ("seed", "scenario", "training_set", "tasks", "actors.num_actors
 def agents_of_runs(runs: Sequence[Run], evaluated: Mapping[object, set[str]]) -> dict[str, str]:
     """Run directory -> agent: the configuration's name, and what it was trained on where that tells agents apart.
 
-    Runs that were each trained on one task, and were evaluated on no common one, are one agent (EACH).
+    Runs that were each trained on one task, and were evaluated on no common one, are one agent (EACH). Runs of several
+    scenarios are one agent unless one of them was evaluated where another one was trained.
 
     Args:
         runs: of any configurations.
@@ -45,9 +46,10 @@ def agents_of_runs(runs: Sequence[Run], evaluated: Mapping[object, set[str]]) ->
         return EACH if apart and len(played) > 2 else run.training  # more than default and one other
 
     trainings = {name: {training(run) for run in runs if run.name == name} for name in {run.name for run in runs}}
-    settings = _telling_settings(runs)
+    settings, away = _telling_settings(runs), _names_away(runs, evaluated)
     words = {
-        run.path: [training(run)] * (len(trainings[run.name]) > 1)
+        run.path: [f"trained in {' and '.join(run.scenarios)}"] * (run.name in away)
+        + [training(run)] * (len(trainings[run.name]) > 1)
         + settings.get(run.path, []) * (not _is_of_a_set(run))
         for run in runs
     }
@@ -56,11 +58,24 @@ def agents_of_runs(runs: Sequence[Run], evaluated: Mapping[object, set[str]]) ->
     }
 
 
+def _names_away(runs: Sequence[Run], evaluated: Mapping[object, set[str]]) -> set[str]:
+    """Names of runs of which one was evaluated in a scenario that it was not trained in, but another one was."""
+    trained_in: dict[str, set[str]] = {}
+    for run in runs:
+        trained_in.setdefault(run.name, set()).update(run.scenarios)
+    return {
+        run.name
+        for run in runs
+        for task in evaluated.get(str(run.path), set())
+        if (scenario := task.partition("/")[0]) in trained_in[run.name] and scenario not in run.scenarios
+    }
+
+
 def _telling_settings(runs: Sequence[Run]) -> dict[Path, list[str]]:
     """ "agent.discount 0.5": settings in which runs of one name on the same tasks differ, of each of these runs.
 
-    Left out are settings that change nothing (`gvz.run.resume`), numbers of actors and games, and those that the other
-    run lacks: it is of an older version.
+    Left out are settings that change nothing (`gvz.run.resume`), and numbers of actors and games. A run of an older
+    version lacks some settings: those of the others are compared without it.
     """
     alike: dict[tuple[str, tuple[str, ...]], list[Run]] = {}
     for run in runs:
@@ -68,11 +83,11 @@ def _telling_settings(runs: Sequence[Run]) -> dict[Path, list[str]]:
     found: dict[Path, list[str]] = {}
     for group in alike.values():
         values = [dict(_settings(run.config, run.scenarios)) for run in group]
-        for name in values[0]:
-            own = [of_run.get(name) for of_run in values]
-            if None not in own and len(set(own)) > 1:
-                for run, value in zip(group, own, strict=True):
-                    found.setdefault(run.path, []).append(f"{name} {value}")
+        for name in dict.fromkeys(name for of_run in values for name in of_run):
+            own = {run.path: of_run[name] for run, of_run in zip(group, values, strict=True) if name in of_run}
+            if len(set(own.values())) > 1:
+                for path, value in own.items():
+                    found.setdefault(path, []).append(f"{name} {value}")
     return found
 
 
@@ -91,7 +106,7 @@ def _settings(config: Mapping[str, Any], scenarios: Sequence[str], prefix: str =
 
 
 def pooled_runs(runs: Sequence[Run], agents: Mapping[str, str], evaluated: Mapping[object, set[str]]) -> list[str]:
-    """What a reader would not expect to be put together: an agent's runs of other settings, and of one seed."""
+    """What a reader would not expect to be put together: runs of other settings or budgets, and of one seed."""
     settings, problems = _telling_settings(runs), []
     by_agent: dict[str, list[Run]] = {}
     for run in runs:
@@ -103,6 +118,7 @@ def pooled_runs(runs: Sequence[Run], agents: Mapping[str, str], evaluated: Mappi
             if _is_of_a_set(run) and run.path in settings
         ]
         problems += _of_other_networks(of_agent)
+        problems += _of_other_budgets(of_agent)
         for one, other in itertools.combinations(of_agent, 2):
             both = evaluated.get(str(one.path), set()) & evaluated.get(str(other.path), set())
             if one.seed == other.seed and one.tasks == other.tasks and both:
@@ -127,6 +143,15 @@ def _of_other_networks(of_agent: Sequence[Run]) -> Iterator[str]:
                 )
 
 
+def _of_other_budgets(of_agent: Sequence[Run]) -> Iterator[str]:
+    """Runs that may train for longer or shorter than the first one of this agent in the same scenarios."""
+    first: dict[tuple[str, ...], Run] = {}
+    for run in of_agent:
+        one = first.setdefault(run.scenarios, run)
+        if run.budget != one.budget:
+            yield f"{run.path}: put together with {one.path}, which has another budget: {one.budget}, not {run.budget}"
+
+
 def _is_of_a_set(run: Run) -> bool:
     """An experiment has trained it on a training set, if only of one task."""
     return "/train" in run.id
@@ -144,9 +169,17 @@ def with_agents(episodes: pl.DataFrame, agents: dict[str, str]) -> pl.DataFrame:
 
 
 def _other_rules() -> list[pl.Expr]:
-    """ " (levdoom)" for rows of an agent that played by several rules, for each kind of rule; else nothing."""
+    """ " (levdoom)" for rows of an agent that played by several rules, for each kind of rule; else nothing.
+
+    A profile is another game with another upper bound: where there are several, every agent has its own in its name.
+    """
+
+    def several(rule: str) -> pl.Expr:
+        num_rules = pl.col(rule).drop_nulls().n_unique()
+        return (num_rules if rule == "profile" else num_rules.over("agent")) > 1
+
     return [
-        pl.when(pl.col(rule).drop_nulls().n_unique().over("agent") > 1)
+        pl.when(several(rule))
         .then(pl.format(text, pl.col(rule).cast(pl.String).fill_null("unknown " + rule)))
         .otherwise(pl.lit(""))
         for rule, text in (("profile", " ({})"), ("action_set", " ({})"), ("frame_skip", " (frame_skip {})"))

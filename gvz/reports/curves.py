@@ -1,5 +1,6 @@
 """Curves over gradient steps, as numbers: scores of training episodes and of evaluated checkpoints."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,6 +21,9 @@ SHARE_EPISODES = 200
 
 GRID_POINTS = 100
 """gradient steps at which learning curves of several runs are averaged"""
+
+_NTH = pl.col("num_updates").rank("dense").over(ONE_RUN)
+"""which of its run's evaluated checkpoints, the oldest first"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -99,16 +103,16 @@ def evaluation_curve(label: str, episodes: pl.DataFrame, tasks: Sequence[str]) -
     """Mean evaluation score of each checkpoint over tasks and training seeds, with its interval.
 
     Args:
-        episodes: rows of one agent; the n-th checkpoints of its runs are taken together.
+        episodes: rows of one agent. If its runs have equally many evaluated checkpoints, the n-th ones are taken
+            together, else those of equally many gradient steps.
         tasks: only these; a seed that lacks one of them at a checkpoint is left out there.
 
     Returns: the curve, or None if no checkpoint has all tasks.
     """
-    rows = episodes.filter(pl.col("task").is_in(tasks)).with_columns(
-        nth=pl.col("num_updates").rank("dense").over(ONE_RUN)
-    )
+    rows = episodes.filter(pl.col("task").is_in(tasks)).drop_nulls("num_updates")
+    alike = checkpoints_of_runs(rows).n_unique() == 1
     updates, estimates = [], []
-    for (_,), checkpoint in sorted(rows.drop_nulls("num_updates").group_by("nth")):
+    for (_,), checkpoint in sorted(rows.group_by(_NTH if alike else "num_updates")):
         runs = pick(checkpoint)
         scores = Scores(runs=runs, wanted_seeds=tuple(runs))
         if cells := scores.cells(tasks):
@@ -123,6 +127,22 @@ def evaluation_curve(label: str, episodes: pl.DataFrame, tasks: Sequence[str]) -
         low=np.array([e.low for e in estimates]),
         high=np.array([e.high for e in estimates]),
     )
+
+
+def checkpoints_of_runs(episodes: pl.DataFrame) -> pl.Series:
+    """How many evaluated checkpoints each run has."""
+    return episodes.group_by(ONE_RUN).agg(pl.col("num_updates").n_unique())["num_updates"]
+
+
+def usual_tasks(episodes: pl.DataFrame) -> list[str]:
+    """Of each level the tasks that the most of an agent's checkpoints have, if they have any of it.
+
+    A checkpoint that was evaluated on more tasks than the others does not make these incomplete.
+    """
+    by_checkpoint = episodes.group_by("level", "run_seed", nth=_NTH).agg(pl.col("task").unique().sort())
+    counts = Counter((level, tuple(tasks)) for level, tasks in by_checkpoint.select("level", "task").iter_rows())
+    usual = {level: tasks for (level, tasks), _ in sorted(counts.items(), key=lambda one: (one[1], len(one[0][1])))}
+    return [task for tasks in usual.values() for task in tasks]
 
 
 def level_curves(episodes: pl.DataFrame, tasks: Sequence[str]) -> list[Curve | None]:

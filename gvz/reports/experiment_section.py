@@ -30,7 +30,7 @@ from gvz.tasks import LEVELS, parse_task, scenario_named
 MAX_ID_LENGTH = 100
 """characters of a name in a file's name, which has at most 255"""
 _TABLE_OVER = {"gate": " on the gate tasks", "procedural": " on the maps of procedural-test"}
-"""what the caption of a table says, by `evaluate_on`"""
+"""what the caption of a table without levels says, by `evaluate_on`: the others are over test tasks"""
 
 
 def experiment_section(results: Results, asked: PlannedExperiment, out: Path) -> Section:
@@ -129,7 +129,7 @@ def result_table(results: Results, asked: PlannedExperiment, *, trained: bool = 
         }
         rows += _rows("P_norm: mean over scenarios", averages, numbers)
     others = " Rows in italics are published numbers; no number of ours uses them." if published else ""
-    over = " on the tasks of training" if trained else _TABLE_OVER.get(experiment.evaluate_on, "")
+    over = " on the tasks of training" if trained else _over(experiment)
     return Table(
         id=f"{experiment.name}_training" if trained else experiment.name,
         caption=f"{experiment.title}: percent of the upper bound{over} ({experiment.source}).{others}",
@@ -137,6 +137,13 @@ def result_table(results: Results, asked: PlannedExperiment, *, trained: bool = 
         rows=tuple(rows),
         notes=(interval_note(experiment),),
     )
+
+
+def _over(experiment: Experiment) -> str:
+    """What the experiment's tables are over, where their columns do not say it."""
+    if experiment.columns == "level":
+        return ""
+    return _TABLE_OVER.get(experiment.evaluate_on, " on the test tasks")
 
 
 def _rows(title: str, ours: Sequence[Cell], published: Mapping[str, Sequence[float]]) -> list[tuple[Cell, ...]]:
@@ -178,8 +185,8 @@ def aggregate_table(results: Results, asked: PlannedExperiment) -> Table:
         rows.append((words(column_title(experiment, column)), *cells))
     return Table(
         id=f"{experiment.name}_aggregates",
-        caption="All tasks of all scenarios together, percent of the upper bound: mean, interquartile mean and median "
-        "of the scores by task and seed.",
+        caption="The table's tasks of all scenarios together, percent of the upper bound: mean, interquartile mean and "
+        "median of the scores by task and seed.",
         columns=(experiment.columns, "mean", "IQM", "median"),
         rows=tuple(rows),
     )
@@ -203,8 +210,8 @@ def comparison_table(results: Results, asked: PlannedExperiment) -> Table:
             )
     return Table(
         id=f"{experiment.name}_comparisons",
-        caption="Difference of the means in points, and probability of improvement: that a run of the first beats one "
-        "of the second on a task, mean over tasks.",
+        caption=f"Difference of the means{_over(experiment)} in points, and probability of improvement: that a run of "
+        "the first beats one of the second on a task, mean over tasks.",
         columns=("scenario", "compared", "difference", "probability"),
         rows=tuple(rows),
     )

@@ -17,6 +17,10 @@ from gvz.reports.experiment_section import what_id
 from gvz.reports.results import Results
 from gvz.reports.runs import Run, training_time_s
 
+_SEVERAL_VALUES = (
+    "Where runs of one agent differ, the value of the most runs is the first. Scenarios stand beside another value if "
+    "none of their runs has the first."
+)
 _VIDEOS = (".mp4", ".gif", ".webp", ".webm")
 
 
@@ -117,21 +121,36 @@ def _hours(seconds: float) -> str:
 
 def _configurations(results: Results) -> Table:
     """Every field as a row, every agent as a column; without seeds and directories; rows that differ come first."""
-    configs: dict[str, dict[str, Any]] = {}
+    agents: dict[str, list[tuple[Run, dict[str, Any]]]] = {}
     for run in results.runs:
         flat = _flat(run.config)
         for name in ("seed", "run_dir", "tasks", "scenario", "training_set", "name"):
             flat.pop(name, None)
-        configs.setdefault(run.name, flat)
-    fields = list(dict.fromkeys(field for config in configs.values() for field in config))
-    rows = [(words(field), *(words(str(config.get(field, "-"))) for config in configs.values())) for field in fields]
+        agents.setdefault(results.agents[str(run.path)], []).append((run, flat))
+    fields = list(dict.fromkeys(field for of_agent in agents.values() for _, flat in of_agent for field in flat))
+    rows = [(words(field), *(words(_values(field, of_agent)) for of_agent in agents.values())) for field in fields]
     differ = [row for row in rows if len({cell.text for cell in row[1:]}) > 1]
     return Table(
         id="configurations",
-        caption="Configuration of each agent's first run" + (", what differs first." if len(configs) > 1 else "."),
-        columns=("field", *configs),
+        caption="Configuration of each agent" + (", what differs first." if len(agents) > 1 else "."),
+        columns=("field", *agents),
         rows=(*differ, *(row for row in rows if row not in differ)),
+        notes=(_SEVERAL_VALUES,) if any(len(of_agent) > 1 for of_agent in agents.values()) else (),
     )
+
+
+def _values(field: str, runs: Sequence[tuple[Run, dict[str, Any]]]) -> str:
+    """ "0.95; 0.98 (health_gathering)": the field's values in an agent's runs, that of the most runs first."""
+    found: dict[str, list[Run]] = {}
+    for run, flat in runs:
+        if field in flat:
+            found.setdefault(str(flat[field]), []).append(run)
+    texts, usual = [], set()
+    for value, of_value in sorted(found.items(), key=lambda pair: -len(pair[1])):
+        scenarios = dict.fromkeys(scenario for run in of_value for scenario in run.scenarios)
+        usual = usual or set(scenarios)
+        texts.append(value if usual & scenarios.keys() else f"{value} ({', '.join(scenarios)})")
+    return "; ".join(texts) if texts else "-"
 
 
 def _flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -62,6 +62,13 @@ class Run:
         return int(self.config["learner"]["total_updates"])
 
     @property
+    def budget(self) -> str:
+        """In words; older runs have no limit of processor time."""
+        limit_s, updates = self.config.get("max_processor_s"), f"{self.total_updates:,} gradient steps"
+        limited = isinstance(limit_s, int | float)
+        return f"{limit_s:,.4g} seconds of processor time, at most {updates}" if limited else updates
+
+    @property
     def processor_s(self) -> float | None:
         """Processor time of the run, seconds; None in records of older versions."""
         return None if self.metrics.is_empty() else self.metrics[PROCESSOR_S][-1]

@@ -12,7 +12,7 @@ from gvz.evaluation.dataset import REWARD_PREFIX
 from gvz.evaluation.statistics import Statistic, generalization_gap, interquartile_mean, mean, median, solved
 from gvz.reports.agents import ONE_RUN
 from gvz.reports.attribute_tables import attribute_figure, attribute_tables
-from gvz.reports.curves import learning_curve, level_curves
+from gvz.reports.curves import checkpoints_of_runs, learning_curve, level_curves, usual_tasks
 from gvz.reports.document import Block, Cell, Figure, Section, Table, count, missing, words
 from gvz.reports.draw import draw_curves, draw_heat_map, draw_histogram, draw_rewards
 from gvz.reports.experiment_section import what_id
@@ -180,7 +180,9 @@ def gap_table(
     results: Results, scenario: Scenario, scores: Mapping[str, Scores], tasks: Sequence[Task]
 ) -> Table | None:
     """How much lower agents score on other tasks than on their training tasks, and on levels 2 to 4 than on 0 and 1."""
-    trained_on = {results.agents[str(r.path)]: r.tasks for r in results.runs if scenario.id in r.scenarios}
+    tasks_of = {str(run.path): run.tasks for run in results.runs if scenario.id in run.scenarios}
+    who_played = results.episodes.select("agent", "run_dir").unique(maintain_order=True)
+    trained_on = {agent: tasks_of[directory] for agent, directory in who_played.iter_rows() if directory in tasks_of}
     test = [task.id for task in named_tasks(scenario.id, split="test")]
     named = _named(scenario, tasks)
     low, high = [t.id for t in named if t.level <= 1], [t.id for t in named if t.level >= 2]
@@ -265,9 +267,14 @@ def _learning(results: Results, scenario: Scenario, out: Path) -> list[Figure]:
 
 
 def _chance(results: Results, tasks: Sequence[str]) -> dict[str, float]:
-    """Mean score of the random player on these tasks, if it played them all."""
-    rows = pick(results.episodes.filter(pl.col("task").is_in(tasks), player="random")).get(None, {})
-    return {"random": float(np.mean([np.mean(rows[task]) for task in tasks]))} if rows.keys() >= set(tasks) else {}
+    """Mean score of the random player on these tasks, by each of its rules with which it played them all."""
+    rows = results.episodes.filter(pl.col("task").is_in(tasks), player="random")
+    scores = {str(agent): pick(of_agent).get(None, {}) for (agent,), of_agent in sorted(rows.group_by("agent"))}
+    return {
+        agent: float(np.mean([np.mean(by_task[task]) for task in tasks]))
+        for agent, by_task in scores.items()
+        if by_task.keys() >= set(tasks)
+    }
 
 
 def _evaluation(
@@ -279,9 +286,9 @@ def _evaluation(
     figures = []
     for agent in agents:
         rows = episodes.filter(agent=agent)
-        if rows["num_updates"].n_unique() < 2:
+        if max(checkpoints_of_runs(rows)) < 2:
             continue
         caption = f"{scenario.title}, {agent}: evaluation of every checkpoint by level, with 95% interval."
-        curves = level_curves(rows, rows["task"].unique(maintain_order=True).to_list())
+        curves = level_curves(rows, usual_tasks(rows))
         figures.append(draw_curves(out, f"evaluation_{scenario.id}_{what_id(agent)}", agent, curves, caption))
     return figures

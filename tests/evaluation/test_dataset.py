@@ -83,7 +83,19 @@ def test_episodes_of_a_run_are_there_once_with_those_of_a_file_elsewhere(tmp_pat
     (run_dir / "evaluation.jsonl").write_text(line(**policy))
     (tmp_path / "mine.jsonl").write_text(line(**policy) + line(**policy, episode=1))
     frame = read_evaluations(tmp_path / "mine.jsonl", run_dir).sort("episode")
-    assert frame.select("episode", "run_dir").rows() == [(0, str(run_dir)), (1, str(tmp_path))]
+    assert frame.select("episode", "run_dir", "trained_on").rows() == [(n, str(run_dir), [GORE]) for n in range(2)]
+
+
+def test_episodes_of_a_file_elsewhere_of_which_there_are_several_runs_are_told_of(tmp_path):
+    policy = {"player": "r/seed_1@9", "run": "r", "run_seed": 1, "num_updates": 9}
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").write_text(json.dumps({"resolved": {"tasks": [GORE]}}))
+        (tmp_path / name / "evaluation.jsonl").write_text(line(**policy, params=name))
+    (tmp_path / "mine.jsonl").write_text(line(**policy, params="a") + line(**policy, params="a", episode=1))
+    frame, (problem,) = collect_evaluations([tmp_path])
+    assert frame.filter(episode=1)["run_dir"].to_list() == [str(tmp_path)]
+    assert problem.startswith(f"{tmp_path}: has episodes of r, training seed 1, of which there are 2 run directories")
 
 
 def test_two_players_of_one_name_are_told_of(tmp_path):

@@ -4,6 +4,8 @@ import json
 import re
 from pathlib import Path
 
+import pytest
+
 from gvz.experiments.inventory import run_directory
 from gvz.experiments.plan import Plan
 from gvz.reports.abstract import caveats, what_was_run, who_has_more
@@ -28,9 +30,10 @@ def test_trained_agents_first_then_the_best_beside_players(tmp_path, experiments
     assert sentence.startswith("Defend the Center, mean of the 7 test tasks: rainbow_quick has 40.0 [")
     assert re.search(r"; rainbow_quick has 41\.0 \[.*\] points more than random[;.]", sentence)
     assert re.search(r"; rainbow_quick has 29\.0 \[2\d\.\d, 3\d\.\d\] points fewer than scripted[;.]", sentence)
-    scale, few_seeds = caveats(results)
+    scale, few_seeds, few_episodes = caveats(results)
     assert scale == "Scale 0.2: budgets and episodes are shrunk; not comparable with published numbers."
     assert few_seeds.startswith("Fewer than 10 training seeds of dqn_quick, rainbow_quick: intervals over so few are ")
+    assert few_episodes.startswith("Fewer than 10 evaluation episodes of some task by dqn_quick, idle, rainbow_quick, ")
     assert "6 training runs of 2 agents (dqn_quick, rainbow_quick), 3 training seeds" in " ".join(what_was_run(results))
 
 
@@ -49,7 +52,7 @@ def test_runs_that_lack_evaluation_episodes_are_named(tmp_path, experiments_writ
     for run in plan.runs():
         (run_directory(tmp_path, run) / "evaluation.jsonl").unlink()
     (few, last) = caveats(read_results([tmp_path]))[-2:]
-    assert few.startswith("Fewer than 10 training seeds"), "no other caveat"
+    assert few.startswith("Fewer than 10 evaluation episodes of some task by idle, random, scripted"), "no other caveat"
     assert f"6 of 6 runs lack {2 * wanted:,} of their {2 * wanted:,} evaluation episodes" in last
     assert last.endswith(f"{plan.runs()[2].id} and 3 more.")
 
@@ -68,13 +71,46 @@ def test_an_agent_whose_seeds_played_other_tasks_each_is_left_out(tmp_path):
         evaluation_row(f"{run}/{seed}", task, 0, 50.0, run=run, run_seed=seed, num_updates=9)
         for run, seed, task in trained
     ]
-    rows += [evaluation_row("random", task, 0, 20.0) for task in (gore, wall)]
+    rows += [evaluation_row("random", task, n, 20.0) for task in (gore, wall) for n in range(2)]
     write_rows(tmp_path / "rows.jsonl", rows)
     assert who_has_more(read_results([tmp_path])) == []
-    write_rows(tmp_path / "more.jsonl", [evaluation_row("idle", task, 0, 10.0) for task in (gore, wall)])
+    rows = [evaluation_row("idle", task, n, 10.0) for task in (gore, wall) for n in range(2)]
+    write_rows(tmp_path / "more.jsonl", rows)
     (sentence,) = who_has_more(read_results([tmp_path]))
     assert "random has 10.0" in sentence
-    assert " r " not in sentence
+    assert sentence.endswith(" Left out, because they lack some of these tasks: r.")
+    write_rows(tmp_path / "more.jsonl", rows[::2])
+    (sentence,) = who_has_more(read_results([tmp_path]))
+    assert "random and idle cannot be compared (idle: one episode of a task)" in sentence
+
+
+@pytest.mark.parametrize("stray", ["gore", "gore+mossy_bricks"])
+def test_a_stray_episode_leaves_the_comparison_on_the_test_tasks(tmp_path, stray):
+    test = [task.id for task in named_tasks("defend_the_center", split="test")]
+    rows = [
+        evaluation_row(player, task, n, score)
+        for player, score in (("a", 30.0), ("b", 20.0))
+        for task in test
+        for n in (0, 1)
+    ]
+    write_rows(tmp_path / "rows.jsonl", [*rows, evaluation_row("human", f"defend_the_center/{stray}", 0, 90.0)])
+    (sentence,) = who_has_more(read_results([tmp_path]))
+    assert sentence.startswith(
+        "Defend the Center, mean of the 7 test tasks: a has 10.0 [10.0, 10.0] points more than b."
+    )
+    assert sentence.endswith(" Left out, because they lack some of these tasks: human.")
+
+
+def test_trained_agents_without_the_test_tasks_are_compared_on_those_that_all_have(tmp_path):
+    test = [task.id for task in named_tasks("defend_the_center", split="test")]
+    gate = named_tasks("defend_the_center", split="gate")[0].id
+    rows = [evaluation_row(player, task, n, 20.0) for player in ("a", "b") for task in (*test, gate) for n in (0, 1)]
+    rows += [evaluation_row("r/1", gate, n, 50.0, run="r", run_seed=1, num_updates=9) for n in (0, 1)]
+    write_rows(tmp_path / "rows.jsonl", rows)
+    (sentence,) = who_has_more(read_results([tmp_path]))
+    assert sentence.startswith(
+        f"Defend the Center, {gate.partition('/')[2]}: r has 30.0 [30.0, 30.0] points more than "
+    )
 
 
 def test_what_cannot_be_told_apart_is_said(tmp_path):

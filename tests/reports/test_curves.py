@@ -6,7 +6,14 @@ import numpy as np
 import polars as pl
 import pytest
 
-from gvz.reports.curves import evaluation_curve, learning_curve, running_mean, share_curve
+from gvz.reports.curves import (
+    checkpoints_of_runs,
+    evaluation_curve,
+    learning_curve,
+    running_mean,
+    share_curve,
+    usual_tasks,
+)
 from gvz.reports.runs import Run
 
 
@@ -58,15 +65,40 @@ def test_without_episodes_of_a_task_there_is_no_curve():
     assert learning_curve("x", [], ["a/x"]) is None
 
 
+def evaluated(rows: list[tuple[int, int, str, float]]) -> pl.DataFrame:
+    """Episodes of one agent: training seed, gradient steps, task, score. The level is 0 for a/x, else 1."""
+    frame = pl.DataFrame(rows, ["run_seed", "num_updates", "task", "normalized_score"], orient="row")
+    return frame.with_columns(
+        run_dir=pl.format("r{}", "run_seed"),
+        run=pl.lit("r"),
+        scenario=pl.lit("a"),
+        level=(pl.col("task") != "a/x").cast(int),
+    )
+
+
 def test_an_evaluation_curve_takes_the_nth_checkpoints_together():
-    rows = [
-        ("r1", 1, updates, task, score) for updates, score in ((100, 10.0), (200, 30.0)) for task in ("a/x", "a/y")
-    ] + [("r2", 2, updates, task, score) for updates, score in ((110, 20.0), (200, 50.0)) for task in ("a/x", "a/y")]
-    frame = pl.DataFrame(rows, ["run_dir", "run_seed", "num_updates", "task", "normalized_score"], orient="row")
-    frame = frame.with_columns(run=pl.lit("r"), scenario=pl.lit("a"))
+    scores = {1: ((100, 10.0), (200, 30.0)), 2: ((110, 20.0), (200, 50.0))}
+    frame = evaluated(
+        [(seed, at, task, score) for seed, of in scores.items() for at, score in of for task in ("a/x", "a/y")]
+    )
     curve = evaluation_curve("r", frame, ["a/x", "a/y"])
     assert curve is not None
     assert curve.updates.tolist() == [105.0, 200.0]
     assert curve.values.tolist() == [15.0, 40.0]
     assert curve.low == pytest.approx([10.0, 30.0])
     assert evaluation_curve("r", frame, ["a/z"]) is None
+
+
+def test_runs_with_other_numbers_of_evaluated_checkpoints_meet_at_the_same_gradient_steps():
+    frame = evaluated([(1, 100, "a/x", 10.0), (1, 200, "a/x", 30.0), (2, 200, "a/x", 50.0)])
+    curve = evaluation_curve("r", frame, ["a/x"])
+    assert curve is not None
+    assert curve.updates.tolist() == [100.0, 200.0]
+    assert curve.values.tolist() == [10.0, 40.0]
+    assert checkpoints_of_runs(frame).sort().to_list() == [1, 2]
+
+
+def test_a_checkpoint_with_more_tasks_leaves_the_tasks_of_the_others():
+    rows = [(seed, updates, task, 10.0) for seed in (1, 2) for updates in (100, 200, 300) for task in ("a/x", "a/y")]
+    assert sorted(usual_tasks(evaluated([*rows, (1, 300, "a/z", 10.0)]))) == ["a/x", "a/y"]
+    assert sorted(usual_tasks(evaluated([*rows, (1, 400, "a/x", 10.0)]))) == ["a/x", "a/y"]

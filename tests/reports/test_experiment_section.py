@@ -33,6 +33,7 @@ def test_the_table_is_the_mean_over_test_tasks_and_seeds_of_the_last_checkpoints
     assert asked.experiment.table_checkpoints == 1
     table = result_table(compared, asked)
     assert table.columns == ("scenario", "numbers", "dqn_quick", "rainbow_quick")
+    assert "percent of the upper bound on the test tasks (" in table.caption
     ((scenario, whose, dqn, rainbow),) = table.rows
     assert (scenario.text, whose.text) == ("Defend the Center", "ours")
     assert (dqn.text, dqn.note) == ("23.0 [20.0, 26.0]", "")  # 20, 23, 26
@@ -41,7 +42,9 @@ def test_the_table_is_the_mean_over_test_tasks_and_seeds_of_the_last_checkpoints
 
 
 def test_the_difference_and_its_probability(compared):
-    ((_, which, gain, probability),) = comparison_table(compared, compared.asked[0]).rows
+    table = comparison_table(compared, compared.asked[0])
+    assert table.caption.startswith("Difference of the means on the test tasks in points, ")
+    ((_, which, gain, probability),) = table.rows
     assert which.text == "rainbow_quick against dqn_quick"
     assert gain.estimate is not None
     assert gain.estimate.value == 8.5
@@ -49,7 +52,9 @@ def test_the_difference_and_its_probability(compared):
 
 
 def test_aggregates_have_mean_iqm_and_median(compared):
-    dqn, _ = aggregate_table(compared, compared.asked[0]).rows
+    table = aggregate_table(compared, compared.asked[0])
+    assert table.caption.startswith("The table's tasks of all scenarios together, ")
+    dqn, _ = table.rows
     assert [cell.estimate.value for cell in dqn[1:] if cell.estimate] == [23.0, 23.0, 23.0]
 
 
@@ -107,6 +112,7 @@ def test_a_level_is_the_mean_of_its_tasks_each_trained_alone(tmp_path, experimen
     experiments_writer(tmp_path, plan, score, without=(alone,))
     results = read_results([tmp_path])
     table = result_table(results, results.asked[0])
+    assert "percent of the upper bound (" in table.caption
     ours, published = table.rows
     values = [round(cell.estimate.value, 2) for cell in ours[2:6] if cell.estimate]
     assert values == [80.0, round(70 + 4 / 7, 2), round(60 + 8 / 6, 2), round(50 + 8 / 3, 2)]

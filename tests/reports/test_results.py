@@ -4,12 +4,14 @@ import gzip
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 import pytest
 
 from gvz.core.errors import ConfigError
 from gvz.experiments.base import experiment_named
+from gvz.experiments.inventory import run_directory
 from gvz.experiments.plan import Plan
 from gvz.reports.agents import EACH
 from gvz.reports.results import read_results
@@ -72,13 +74,32 @@ def test_a_record_file_may_hold_several_runs_each_with_its_last_checkpoint(tmp_p
     assert len(final) == 6
 
 
+def test_an_earlier_checkpoint_in_a_file_elsewhere_is_no_final_one(a_run, tmp_path):
+    """As `gvz evaluate RUN --checkpoints N --out FILE` writes it."""
+    rows = [json.loads(line) for line in (a_run / "evaluation.jsonl").read_text().splitlines()]
+    newest = max(row["num_updates"] for row in rows)
+    for directory, earlier in ((a_run, False), (tmp_path / "elsewhere", True)):
+        kept = [row for row in rows if (row["num_updates"] < newest) == earlier]
+        write_rows(directory / "evaluation.jsonl", kept)
+    episodes = read_results([a_run, tmp_path / "elsewhere"]).episodes
+    assert episodes.select(pl.col("num_updates").n_unique()).item() == 2
+    assert set(episodes.filter("final")["num_updates"]) == {newest}
+
+
 def test_an_agent_that_played_by_several_rules_is_several(tmp_path):
     task = "defend_the_center/default"
     rows = [evaluation_row(who, task, 0, 50.0, profile=rules) for who in ("a", "b") for rules in ("thesis", "levdoom")]
     write_rows(tmp_path / "rows.jsonl", rows[:3])
-    assert set(read_results([tmp_path]).episodes["agent"]) == {"a (thesis)", "a (levdoom)", "b"}
+    assert set(read_results([tmp_path]).episodes["agent"]) == {"a (thesis)", "a (levdoom)", "b (thesis)"}
     write_rows(tmp_path / "rows.jsonl", [{**rows[2], "frame_skip": skip} for skip in (4, 8)])
     assert set(read_results([tmp_path]).episodes["agent"]) == {"b (frame_skip 4)", "b (frame_skip 8)"}
+
+
+def test_agents_that_played_different_profiles_are_not_compared_without_a_word(tmp_path):
+    task = "defend_the_center/default"
+    rows = [evaluation_row(who, task, 0, 50.0, profile=rules) for who, rules in (("a", "thesis"), ("b", "levdoom"))]
+    write_rows(tmp_path / "rows.jsonl", rows)
+    assert set(read_results([tmp_path]).episodes["agent"]) == {"a (thesis)", "b (levdoom)"}
 
 
 def test_players_that_observe_other_than_the_screen_have_it_in_their_names(tmp_path):
@@ -99,12 +120,12 @@ def test_agents_of_different_maps_that_played_the_same_are_not_one(tmp_path, exp
 def copied(small, tmp_path):
     """Copies a run to `tmp_path / name`, with other settings."""
 
-    def copy(name: str, **settings: dict) -> None:
+    def copy(name: str, **settings: Any) -> None:
         source = small / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111"
         shutil.copytree(source, tmp_path / name)
         saved = json.loads((tmp_path / name / "config.json").read_text())
         for field, values in settings.items():
-            saved["config"][field] |= values
+            saved["config"][field] = saved["config"][field] | values if isinstance(values, dict) else values
         (tmp_path / name / "config.json").write_text(json.dumps(saved))
 
     return copy
@@ -119,6 +140,32 @@ def test_runs_of_one_configuration_with_other_settings_are_several_agents(copied
         str(tmp_path / "b" / "run"): "rainbow_4task (agent.discount 0.99)",
     }
     assert not results.problems
+
+
+def test_runs_that_played_where_others_were_trained_are_agents_of_their_own(tmp_path, experiments_writer):
+    plan = Plan.of("general_on_policy", scale=0.0001, scenarios=("defend_the_center", "health_gathering"))
+    experiments_writer(tmp_path, plan, lambda _: 50.0)
+    one, other = (run_directory(tmp_path, run) for run in plan.runs())
+    assert set(read_results([tmp_path]).agents.values()) == {"ppo_segmented"}
+    rows = [json.loads(line) for line in (other / "evaluation.jsonl").read_text().splitlines()]
+    write_rows(one / "away.jsonl", [{**row, "params": "1"} for row in rows])
+    assert read_results([tmp_path]).agents == {
+        str(one): "ppo_segmented (trained in defend_the_center)",
+        str(other): "ppo_segmented (trained in health_gathering)",
+    }
+
+
+def test_a_run_that_lacks_a_setting_hides_no_difference_between_others(copied, tmp_path):
+    for seed, discount in enumerate((0.5, 0.9, None)):
+        copied(f"r/{seed}", seed=seed, agent={"discount": discount})
+    file = tmp_path / "r" / "2" / "config.json"
+    file.write_text(file.read_text().replace('"discount": null, ', ""))
+    agents = read_results([tmp_path / "r"]).agents
+    assert [agents[str(tmp_path / "r" / str(seed))] for seed in range(3)] == [
+        "rainbow_4task (agent.discount 0.5)",
+        "rainbow_4task (agent.discount 0.9)",
+        "rainbow_4task",
+    ]
 
 
 def test_runs_of_an_experiment_with_other_settings_are_put_together_and_named(small, tmp_path):
@@ -148,6 +195,19 @@ def test_seeds_that_learned_with_other_networks_are_named(small, tmp_path):
     assert problem == (
         f"{one.with_name('seed_3333')}: put together with {one.with_name('seed_2222')}, which learned with another "
         "segmentation network of defend_the_center"
+    )
+
+
+def test_seeds_of_other_budgets_are_named(copied, tmp_path):
+    copied("r/1", seed=1, max_processor_s=900.0)
+    copied("r/2", seed=2, max_processor_s=5400.0)
+    copied("r/3", seed=3, max_processor_s=900.0)
+    results = read_results([tmp_path / "r"])
+    assert set(results.agents.values()) == {"rainbow_4task"}
+    (problem,) = results.problems
+    assert problem == (
+        f"{tmp_path / 'r' / '2'}: put together with {tmp_path / 'r' / '1'}, which has another budget: 900 seconds of "
+        "processor time, at most 20 gradient steps, not 5,400 seconds of processor time, at most 20 gradient steps"
     )
 
 

@@ -58,3 +58,29 @@ def test_the_gap_of_an_agent_is_shown_in_each_of_its_scenarios(tmp_path, experim
         [gap] = [table for table in section.blocks[0].tables if table.id.endswith("_gap")]
         [[agent, of_tasks, _]] = gap.rows
         assert (agent.text, of_tasks.text.split()[0]) == ("ppo_segmented", "20.0")
+
+
+def test_players_of_two_profiles_are_two_and_agents_keep_their_gap(tmp_path, experiments_writer, monkeypatch):
+    plan = Plan.of("general_on_policy", scale=0.01, scenarios=("seek_and_kill",))
+    experiments_writer(tmp_path, plan, lambda played: 70.0 if played.task in played.run.tasks else 50.0)
+    rows = [evaluation_row("random", task, 0, 50.0, profile="levdoom") for task in plan.runs()[0].tasks]
+    write_rows(tmp_path / "levdoom.jsonl", rows)
+    drawn = {}
+    monkeypatch.setattr("gvz.reports.scenario_section.draw_curves", lambda *args: drawn.update({args[1]: args[-1]}))
+    (section,) = scenario_sections(read_results([tmp_path]), tmp_path)
+    (gap,) = [table for table in section.blocks[0].tables if table.id.endswith("_gap")]
+    assert [row[0].text for row in gap.rows] == ["ppo_segmented (thesis)"]
+    assert drawn["learning_seek_and_kill_ppo_segmented"] == {"random (levdoom)": 50.0, "random (thesis)": 20.5}
+
+
+def test_one_checkpoint_of_each_seed_is_no_curve(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("gvz.reports.scenario_section.draw_curves", lambda *args: drawn.append(args[1]))
+    rows = [
+        evaluation_row(f"r/{seed}@{at}", DEFAULT.id, 0, 50.0, run="r", run_seed=seed, num_updates=at, params=str(at))
+        for seed, at in ((1, 100), (2, 120), (2, 240))
+    ]
+    for several in (False, True):
+        write_rows(tmp_path / "rows.jsonl", rows if several else rows[:2])
+        scenario_sections(read_results([tmp_path]), tmp_path)
+        assert drawn == ["evaluation_seek_and_kill_r"] * several
