@@ -260,7 +260,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         if lost := [game for game, screen in screens.items() if not screen]:
             raise ResetNeeded(f"render: games {lost} have rendered nothing since their worker died; play on, or reset")
         shape = (self._config.render_height, self._config.render_width, 3)
-        return tuple(np.frombuffer(screens[game], np.uint8).reshape(shape) for game in games.tolist())
+        return tuple(np.frombuffer(screens[game], np.uint8).reshape(shape).copy() for game in games.tolist())
 
     def close_extras(self, **kwargs: Any) -> None:
         """Ends workers and engines; `close` calls it."""
