@@ -10,9 +10,8 @@ engine.
 import dataclasses
 import hashlib
 import itertools
-import os
 import re
-import tempfile
+import secrets
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -352,13 +351,12 @@ def _cached(data: bytes) -> Path:
         if path.exists() and path.read_bytes() == data:
             return path
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+        temporary = path.with_name(f"{secrets.token_hex(16)}.tmp")  # not of `tempfile`: only its owner could read it
         try:
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(data)
-            Path(temporary).replace(path)  # readers see the old file or the complete new one
+            temporary.write_bytes(data)
+            temporary.replace(path)  # readers see the old file or the complete new one
         except BaseException:
-            Path(temporary).unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
             raise
     except OSError as error:
         raise ResourceError(

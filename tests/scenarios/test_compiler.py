@@ -156,6 +156,16 @@ def test_a_cached_file_is_named_by_the_hash_of_its_bytes_and_not_written_again()
     assert path.stat().st_mtime_ns == written
 
 
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o002, 0o664), (0o077, 0o600)])
+def test_a_cached_file_may_be_read_by_all_whom_the_umask_allows(umask: int, mode: int):
+    before = os.umask(umask)
+    try:
+        path = compile_task(parse_task("seek_and_kill/red")).wad_path
+    finally:
+        os.umask(before)
+    assert path.stat().st_mode & 0o777 == mode
+
+
 @pytest.mark.parametrize("damage", [b"", b"PWAD", bytes(5000)])
 def test_a_damaged_cached_file_is_built_again(damage: bytes):
     task = parse_task("seek_and_kill/red")
