@@ -30,7 +30,7 @@ from gvz.scenarios.severity import graded, in_force, is_whole
 from gvz.wad.acs import compile_acs
 from gvz.wad.decorate import declared_actors, declared_numbers, used_sprites
 from gvz.wad.lumps import MAP_NAME, read_maps, read_wad, write_map_wad
-from gvz.wad.stock import scenario_wad, stock_editor_numbers, stock_sprites, stock_textures
+from gvz.wad.stock import scenario_wad, stock_editor_numbers, stock_patches, stock_sprites, stock_textures
 from gvz.wad.textures import blended, check_textures
 from gvz.wad.udmf import UdmfMap, is_inside, make_thing, parse_textmap, write_textmap
 
@@ -217,7 +217,8 @@ def map_source(task: Task, profile: Profile, number: int | None = None) -> MapSo
     magic = int.from_bytes(digest[:4], "little") % (2**31 - 1) + 1
     script = template.substitute(names, map_magic=magic)
     textures = "".join(
-        blended(name, blend.under, blend.over, blend.opacity, stock_textures()) for name, blend in every.blends.items()
+        blended(name, blend.under, blend.over, blend.opacity, stock_textures(), stock_patches())
+        for name, blend in every.blends.items()
     )
     return MapSource(textmap=textmap, script=script, decorate=decorate, textures=textures, map_magic=magic)
 
