@@ -171,6 +171,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         """
         given = given_episode_seed(options or {})
         super().reset(seed=seed)
+        self._playing = False  # if this call is interrupted, there is no episode to go on with
         self._episode_seed = int(self.np_random.integers(EPISODE_SEEDS)) if given is None else given
         if self._recycle_episodes and self._engine_episodes >= self._recycle_episodes:
             self._stop_engine()

@@ -61,7 +61,7 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
                 f"tasks: got tasks of {', '.join(names)}, whose actions differ; want one scenario, or "
                 'action_set="unified_v1"'
             )
-        self._sampler = self._uniform if sampler is None else sampler
+        self._sampler = sampler
         self._max_engines = max_engines
         self._running: list[DoomEnv] = []
         """games with an engine; the one played last comes last"""
@@ -97,7 +97,10 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         episode_seed = given_episode_seed(options, ("task",))
         given = self._game_of(options["task"]) if "task" in options else None
         super().reset(seed=seed)
-        self._game = game = self._game_of(self._sampler(self.np_random)) if given is None else given
+        if given is None:
+            sampler = self._uniform if self._sampler is None else self._sampler
+            given = self._game_of(sampler(self.np_random))
+        self._game = game = given
         if game in self._running:
             self._running.remove(game)
         elif len(self._running) == self._max_engines:

@@ -1,10 +1,13 @@
-"""Engines that die under an environment: the episode is cut and marked, the next one whole, the end an error."""
+"""Engines that die under an environment: the episode is cut and marked, the next one whole, the end an error.
+A reset that is interrupted.
+"""
 
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 
 from gvz.core.errors import EngineError
+from gvz.engine.engine import Engine
 from gvz.env import DoomEnv
 from tests.episodes import TURN, fingerprint, idle_to_the_end
 
@@ -78,6 +81,23 @@ def test_another_map_than_the_tasks_is_an_error():
     env._engine_config = DoomEnv("defend_the_center/gore")._engine_config
     with pytest.raises(EngineError, match=r"default: .* runs a map with magic number \d+, want \d+"):
         env.reset(seed=1)
+    env.close()
+
+
+def test_an_interrupted_reset_leaves_no_episode_to_play(monkeypatch: pytest.MonkeyPatch):
+    env = DoomEnv("defend_the_center/default")
+    env.reset(seed=1)
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Engine, "new_episode", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            env.reset(seed=2)
+    with pytest.raises(ResetNeeded):
+        env.step(TURN)
+    assert env.reset(seed=1)[1]["episode_frames"] == 0
     env.close()
 
 

@@ -1,8 +1,10 @@
 """Several tasks as one environment: the games are those of the single environments."""
 
 import dataclasses
+import gc
 
 import numpy as np
+import psutil
 import pytest
 from gymnasium.utils.env_checker import check_env
 
@@ -69,6 +71,20 @@ def test_a_task_may_be_chosen_by_any_of_its_names():
     with gvz.make(written, sampler=lambda _rng: written[0]) as env:
         assert env.reset(seed=1)[1]["task"] == env.tasks[0] == "defend_the_center/fuzzy_enemies+resized_enemies"
         assert env.reset(options={"task": written[0]})[1]["task"] == env.tasks[0]
+
+
+@pytest.mark.engine
+def test_engines_end_with_the_last_reference():
+    """At once: the cyclic garbage collector may come late."""
+    env = gvz.make(TASKS[:1])
+    env.reset(seed=1)
+    pid = env._game._engine.pid
+    gc.disable()
+    try:
+        del env
+        assert not psutil.pid_exists(pid)
+    finally:
+        gc.enable()
 
 
 @pytest.mark.engine

@@ -1,6 +1,7 @@
 """Segmented frames: what a network takes the screen for, in place of the screen."""
 
 import json
+import shutil
 from pathlib import Path
 
 import jax
@@ -153,6 +154,26 @@ def test_kept_networks_stay_what_they_were(tmp_path: Path, network: str):
         segmenter_file("health_gathering", kept)  # the installed one may have been trained on other tasks
     keep_segmenters(["seek_and_kill"], EnvConfig(), tmp_path / "none")
     assert not (tmp_path / "none").exists(), "frames of the screen need no network"
+
+
+def test_a_path_that_names_another_file_gives_another_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Overwritten, or relative to another directory; the same file gives the same network."""
+    screen = np.random.default_rng(0).integers(256, size=(144, 256, 3), dtype=np.uint8)
+    for directory in ("here", "there"):
+        (tmp_path / directory).mkdir()
+
+    def read(directory: str, scenario: str) -> Segmenter:
+        """Copies a scenario's network into a directory, and goes there."""
+        monkeypatch.chdir(tmp_path / directory)
+        shutil.copyfile(installed(scenario), "mine.onnx")
+        network = segmenter_of("seek_and_kill", EnvConfig(frames="segmented", segmenter="mine.onnx"))
+        np.testing.assert_array_equal(network(screen), Segmenter(installed(scenario))(screen))
+        return network
+
+    first = read("here", "health_gathering")
+    assert read("here", "health_gathering") is first
+    read("there", "defend_the_center")
+    read("there", "seek_and_kill")
 
 
 def test_what_is_no_network_is_refused_by_name(tmp_path: Path):

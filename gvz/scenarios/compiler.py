@@ -10,9 +10,8 @@ engine.
 import dataclasses
 import hashlib
 import itertools
-import os
 import re
-import tempfile
+import secrets
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -31,7 +30,7 @@ from gvz.scenarios.severity import graded, in_force, is_whole
 from gvz.wad.acs import compile_acs
 from gvz.wad.decorate import declared_actors, declared_numbers, used_sprites
 from gvz.wad.lumps import MAP_NAME, read_maps, read_wad, write_map_wad
-from gvz.wad.stock import scenario_wad, stock_editor_numbers, stock_sprites, stock_textures
+from gvz.wad.stock import scenario_wad, stock_editor_numbers, stock_patches, stock_sprites, stock_textures
 from gvz.wad.textures import blended, check_textures
 from gvz.wad.udmf import UdmfMap, is_inside, make_thing, parse_textmap, write_textmap
 
@@ -127,28 +126,38 @@ def _all_ways(task: Task, profile: Profile) -> Content:
 def _compiled_by_form(script: str, decorate: str) -> bytes:
     """The same bytes as `compile_acs`, from a compiled script that differs in numbers only, if there was one.
 
-    Most scripts of drawn maps differ in numbers only, and to compile one takes as long as to draw the map.
+    Most scripts of drawn maps differ in numbers only, and to compile one takes as long as to draw the map. A script is
+    compiled itself if it may have numbers that the compiler calculates with or sorts, or that are in a text.
     """
+    if re.search("switch|define", script, re.IGNORECASE):
+        return _compile(script, decorate)
     values: list[tuple[int, int]] = []  # (that of a mark, that of the number in its place)
 
     def mark(match: re.Match[str]) -> str:
         whole, point, fraction = match[0].partition(".")
         value = int(whole) if not point else (int(whole) << 16) + (int(fraction) << 16) // 10 ** len(fraction)
-        if value < 256:  # the compiler has shorter code for them
+        if not 256 <= value < 2**31:  # the compiler has shorter code for small ones, and refuses large ones
             return match[0]
         place = len(values) + 1
         values.append(((_MARK << 16) + place, value))
         return str((_MARK << 16) + place) if not point else f"{_MARK}.{(2 * place + 1) * 10**8 >> 17:08}"
 
-    compiled = _compile_form(_NUMBER.sub(mark, script), decorate)
+    form = _compile_form(_NUMBER.sub(mark, script), decorate)
+    compiled = bytearray(form)
     for marked, value in values:
-        compiled = compiled.replace(marked.to_bytes(4, "little"), value.to_bytes(4, "little"))
-    return compiled
+        bits = marked.to_bytes(4, "little")
+        if form.count(bits) != 1:  # the compiler calculated with it, or it is in a text or a comment
+            return _compile(script, decorate)
+        place = form.index(bits)
+        compiled[place : place + 4] = value.to_bytes(4, "little")
+    return bytes(compiled)
 
 
-@lru_cache(maxsize=1000)
-def _compile_form(script: str, decorate: str) -> bytes:
+def _compile(script: str, decorate: str) -> bytes:
     return compile_acs(script, actor_classes=declared_actors(decorate))
+
+
+_compile_form = lru_cache(maxsize=1000)(_compile)
 
 
 def task_content(task: Task, profile: Profile) -> Content:
@@ -208,7 +217,8 @@ def map_source(task: Task, profile: Profile, number: int | None = None) -> MapSo
     magic = int.from_bytes(digest[:4], "little") % (2**31 - 1) + 1
     script = template.substitute(names, map_magic=magic)
     textures = "".join(
-        blended(name, blend.under, blend.over, blend.opacity, stock_textures()) for name, blend in every.blends.items()
+        blended(name, blend.under, blend.over, blend.opacity, stock_textures(), stock_patches())
+        for name, blend in every.blends.items()
     )
     return MapSource(textmap=textmap, script=script, decorate=decorate, textures=textures, map_magic=magic)
 
@@ -219,7 +229,7 @@ def build_wad(source: MapSource) -> bytes:
     Raises:
         AcsError: the script does not compile.
     """
-    behavior = compile_acs(source.script, actor_classes=declared_actors(source.decorate))
+    behavior = _compile(source.script, source.decorate)
     return write_map_wad(
         textmap=source.textmap,
         behavior=behavior,
@@ -352,13 +362,12 @@ def _cached(data: bytes) -> Path:
         if path.exists() and path.read_bytes() == data:
             return path
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+        temporary = path.with_name(f"{secrets.token_hex(16)}.tmp")  # not of `tempfile`: only its owner could read it
         try:
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(data)
-            Path(temporary).replace(path)  # readers see the old file or the complete new one
+            temporary.write_bytes(data)
+            temporary.replace(path)  # readers see the old file or the complete new one
         except BaseException:
-            Path(temporary).unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
             raise
     except OSError as error:
         raise ResourceError(

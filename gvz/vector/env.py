@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from gvz.core.env_config import EPISODE_SEEDS, EnvConfig
-from gvz.core.errors import ConfigError, GvzError
+from gvz.core.errors import ConfigError
 from gvz.env import DoomEnv
 from gvz.observation import Observation
 from gvz.scenarios.base import Task
@@ -38,7 +38,8 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
       have answered.
     - Infos have one more key: `env_id`, the number of the game.
     - An engine that crashes truncates its episode, as in `DoomEnv`. So does a worker that dies; it is replaced. After
-      any other error in a worker the environment is closed.
+      any other error in a worker the environment is closed. It is also closed if Ctrl-C interrupts a call that speaks
+      to the workers: nobody knows then which answers are still to come.
     - Workers and engines end with this object, with this process, however it ends, and with the thread that made this
       object.
 
@@ -260,7 +261,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         if lost := [game for game, screen in screens.items() if not screen]:
             raise ResetNeeded(f"render: games {lost} have rendered nothing since their worker died; play on, or reset")
         shape = (self._config.render_height, self._config.render_width, 3)
-        return tuple(np.frombuffer(screens[game], np.uint8).reshape(shape) for game in games.tolist())
+        return tuple(np.frombuffer(screens[game], np.uint8).reshape(shape).copy() for game in games.tolist())
 
     def close_extras(self, **kwargs: Any) -> None:
         """Ends workers and engines; `close` calls it."""
@@ -277,24 +278,24 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             )
             for game, action in zip(games.tolist(), actions, strict=True)
         ]
-        for decision in decisions:
-            if decision.action is None and episode_seed is None:
-                self._next_seeds[decision.game] = None
-        self._pending[games] = True
         with self._closed_by_errors():
+            for decision in decisions:
+                if decision.action is None and episode_seed is None:
+                    self._next_seeds[decision.game] = None
+            self._pending[games] = True
             self._crew.send(decisions)
 
     def _receive(self, count: int) -> list[Outcome]:
         """The next outcomes, the smallest number of a game first."""
         with self._closed_by_errors():
             outcomes = self._crew.receive(count)
-        for outcome in outcomes:
-            game, over = outcome.game, outcome.terminated or outcome.truncated
-            self._begun[game], self._pending[game] = True, False
-            self._ended[game] = over and outcome.final_info is None
-            self._halves[game] = 1 - self._halves[game]
-            if outcome.final_info is not None:
-                self._next_seeds[game] = None
+            for outcome in outcomes:
+                game, over = outcome.game, outcome.terminated or outcome.truncated
+                self._begun[game], self._pending[game] = True, False
+                self._ended[game] = over and outcome.final_info is None
+                self._halves[game] = 1 - self._halves[game]
+                if outcome.final_info is not None:
+                    self._next_seeds[game] = None
         return sorted(outcomes, key=lambda outcome: outcome.game)
 
     def _seed(self, game: int) -> int:
@@ -346,7 +347,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
     def _closed_by_errors(self) -> Generator[None, None, None]:
         try:
             yield
-        except (GvzError, OSError):
+        except BaseException:  # Ctrl-C, too: a message may be half sent, or an answer lost
             self.close()
             raise
 

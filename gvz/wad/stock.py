@@ -12,7 +12,7 @@ from pathlib import Path
 from gvz.core.errors import WadError
 from gvz.wad.decorate import declared_actors
 from gvz.wad.lumps import read_wad
-from gvz.wad.textures import Size, flats, wall_textures
+from gvz.wad.textures import Patch, Size, flats, wall_patches, wall_textures
 
 _MAPINFO = ("common", "doomcommon", "doomitems", "doom2")
 """MAPINFO texts for Doom II, the game that we play"""
@@ -84,3 +84,9 @@ def stock_textures() -> dict[str, Size]:
     """Upper-case name -> size of all wall textures and flats of freedoom2.wad, which every game uses."""
     lumps = read_wad((engine_directory() / "freedoom2.wad").read_bytes())
     return wall_textures(lumps) | flats(lumps)
+
+
+@cache
+def stock_patches() -> dict[str, list[Patch]]:
+    """Upper-case name -> patches of all wall textures of freedoom2.wad."""
+    return wall_patches(read_wad((engine_directory() / "freedoom2.wad").read_bytes()))

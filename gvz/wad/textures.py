@@ -14,6 +14,8 @@ PLANE_FIELDS = ("texturefloor", "textureceiling")
 NO_TEXTURE = "-"
 Size = tuple[int, int]
 """(width, height) of a texture, pixels"""
+Patch = tuple[str, int, int]
+"""a picture's name, and where its left and upper edges lie in a texture, pixels"""
 _NAME = re.compile(r"[!-~]{1,8}")
 
 
@@ -28,11 +30,37 @@ def wall_textures(lumps: Sequence[Lump]) -> dict[str, Size]:
     sizes: dict[str, Size] = {}
     for lump in lumps:
         if lump.name in ("TEXTURE1", "TEXTURE2"):
-            sizes.update(_textures(lump)[lump.name == "TEXTURE1" :])
+            found = _textures(lump)[lump.name == "TEXTURE1" :]
+            sizes.update((name, struct.unpack_from("<hh", lump.data, offset + 12)) for name, offset in found)
     return sizes
 
 
-def _textures(lump: Lump) -> list[tuple[str, Size]]:
+def wall_patches(lumps: Sequence[Lump]) -> dict[str, list[Patch]]:
+    """Name -> patches of the textures in the TEXTURE1 and TEXTURE2 lumps, in the order in which they are drawn.
+
+    Raises:
+        WadError: a texture lump is damaged, or a patch has no name in the PNAMES lump.
+    """
+    listed = b"".join(lump.data[4:] for lump in lumps if lump.name == "PNAMES")
+    names = {n: listed[8 * n : 8 * n + 8].split(b"\0")[0].decode("latin-1").upper() for n in range(len(listed) // 8)}
+    patches: dict[str, list[Patch]] = {}
+    for lump in lumps:
+        if lump.name in ("TEXTURE1", "TEXTURE2"):
+            for texture, offset in _textures(lump):
+                try:
+                    (count,) = struct.unpack_from("<h", lump.data, offset + 20)
+                    found = [struct.unpack_from("<hhh", lump.data, offset + 22 + 10 * n) for n in range(count)]
+                    patches[texture] = [(names[number], x, y) for x, y, number in found]
+                except (struct.error, KeyError) as error:
+                    raise WadError(
+                        f"{lump.name}: got {texture} with a patch outside the {len(lump.data)} bytes or the "
+                        f"{len(names)} names of PNAMES, want all inside"
+                    ) from error
+    return patches
+
+
+def _textures(lump: Lump) -> list[tuple[str, int]]:
+    """(Name, offset in the lump) of each texture."""
     data = lump.data
     count = struct.unpack_from("<i", data)[0] if len(data) >= 4 else -1
     if count < 0 or 4 + 4 * count > len(data):
@@ -45,7 +73,7 @@ def _textures(lump: Lump) -> list[tuple[str, Size]]:
         name = raw_name.split(b"\0")[0].decode("latin-1")
         if not _NAME.fullmatch(name):
             raise WadError(f"{lump.name}: got the name {raw_name!r} at {offset}, want 1 to 8 ASCII characters")
-        found.append((name.upper(), struct.unpack_from("<hh", data, offset + 12)))
+        found.append((name.upper(), offset))
     return found
 
 
@@ -94,23 +122,43 @@ def check_textures(udmf_map: UdmfMap, textures: Collection[str]) -> None:
             raise WadError(f"{place}: got the unknown texture {texture!r}{hint}, want a wall texture or flat")
 
 
-def blended(name: str, under: str, over: str, opacity: float, sizes: Mapping[str, Size]) -> str:
-    """The entry of a TEXTURES lump that makes a texture of two.
+def blended(
+    name: str,
+    under: str,
+    over: str,
+    opacity: float,
+    sizes: Mapping[str, Size],
+    patches: Mapping[str, Sequence[Patch]],
+) -> str:
+    """The entries of a TEXTURES lump that make a texture of two.
 
-    It is as large as a whole number of each, so that both lie where they would lie alone.
+    It is as large as a whole number of each, so that both lie where they would lie alone. A wall texture comes first as
+    an entry of its own, made of its patches: by the texture's name the engine finds a patch of this name, if there is
+    one, and that may be another picture.
 
     Args:
-        name: of the new texture.
+        name: of the new texture. The entries of its wall textures have the letter U or O instead of its first one.
         under: a texture that is covered.
         over: the texture that covers it.
         opacity: of `over`, 0 to 1.
         sizes: of all textures.
+        patches: of all wall textures.
     """
     width, height = (math.lcm(*pair) for pair in zip(sizes[under], sizes[over], strict=True))
-    patches = [
-        f'Patch "{texture}", {x}, {y} {style}'
-        for texture, style in ((under, ""), (over, f"{{ Style Translucent Alpha {opacity:g} }}"))
-        for x in range(0, width, sizes[texture][0])
-        for y in range(0, height, sizes[texture][1])
-    ]
-    return "\n".join((f'Texture "{name}", {width}, {height}', "{", *patches, "}", ""))
+    text, parts = "", []
+    for texture, letter, style in ((under, "U", ""), (over, "O", f"{{ Style Translucent Alpha {opacity:g} }}")):
+        part = texture
+        if texture in patches:
+            part = f"{letter}{name[1:]}"
+            text += _entry(part, sizes[texture], [f'Patch "{patch}", {x}, {y}' for patch, x, y in patches[texture]])
+        parts += [
+            f'Patch "{part}", {x}, {y} {style}'
+            for x in range(0, width, sizes[texture][0])
+            for y in range(0, height, sizes[texture][1])
+        ]
+    return text + _entry(name, (width, height), parts)
+
+
+def _entry(name: str, size: Size, parts: Sequence[str]) -> str:
+    """An entry of a TEXTURES lump."""
+    return "\n".join((f'Texture "{name}", {size[0]}, {size[1]}', "{", *parts, "}", ""))

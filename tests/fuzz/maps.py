@@ -14,7 +14,7 @@ from gvz.wad.acs.lexer import tokenize
 from gvz.wad.decorate import declared_actors
 from gvz.wad.lumps import ENTRY, HEADER, Lump, read_maps, read_wad, write_wad
 from gvz.wad.stock import engine_directory, scenario_wad
-from gvz.wad.textures import check_textures, flats, wall_textures
+from gvz.wad.textures import check_textures, flats, wall_patches, wall_textures
 from gvz.wad.udmf import parse_textmap, write_textmap
 from tests.fuzz.target import Target
 
@@ -106,6 +106,8 @@ def texture_lump(_directory: Path) -> Target:
             names = wall_textures([Lump("TEXTURE2", data)])
         except WadError:
             return False
+        with contextlib.suppress(WadError):
+            wall_patches([Lump("TEXTURE2", data), Lump("PNAMES", bytes(4 + 8 * 1000))])
         assert all(re.fullmatch("[!-~]{1,8}", name) and name == name.upper() for name in names)
         assert 4 * len(names) < len(data)
         return True

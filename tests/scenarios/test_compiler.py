@@ -13,9 +13,18 @@ from pathlib import Path
 import pytest
 
 from gvz.core.errors import AcsError, ResourceError, TaskError, WadError
+from gvz.scenarios import compiler
 from gvz.scenarios.base import Attribute, Content, Task, Textures, Thing, Uniform
-from gvz.scenarios.compiler import acs_value, build_wad, compile_task, map_source, task_content
+from gvz.scenarios.compiler import (
+    _compiled_by_form,
+    acs_value,
+    build_wad,
+    compile_task,
+    map_source,
+    task_content,
+)
 from gvz.tasks import named_tasks, parse_task, scenario_named
+from gvz.wad.acs import compile_acs
 from gvz.wad.lumps import read_maps, read_wad
 from gvz.wad.udmf import UdmfMap, parse_textmap
 
@@ -156,6 +165,16 @@ def test_a_cached_file_is_named_by_the_hash_of_its_bytes_and_not_written_again()
     assert path.stat().st_mtime_ns == written
 
 
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o002, 0o664), (0o077, 0o600)])
+def test_a_cached_file_may_be_read_by_all_whom_the_umask_allows(umask: int, mode: int):
+    before = os.umask(umask)
+    try:
+        path = compile_task(parse_task("seek_and_kill/red")).wad_path
+    finally:
+        os.umask(before)
+    assert path.stat().st_mode & 0o777 == mode
+
+
 @pytest.mark.parametrize("damage", [b"", b"PWAD", bytes(5000)])
 def test_a_damaged_cached_file_is_built_again(damage: bytes):
     task = parse_task("seek_and_kill/red")
@@ -218,6 +237,38 @@ WAD = "defend_the_center.wad"
 def test_things_and_sprites_that_are_not_there_are_refused(content: Content, message: str):
     with pytest.raises(TaskError, match=f"task defend_the_center/new: .*{message}"):
         compile_task(with_attribute(content))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "script 1 OPEN { Delay(-300.0 + 96.5 * 1234567); }",
+        "int far = 2 * 300.0; script 1 OPEN { Delay(far); }",
+        "int far = - 300.0; script 1 OPEN { Delay(far); }",
+        "int far = 300.0 > 200; script 1 OPEN { Delay(far); }",
+        "#define FAR 300.0\n# Define HALF FAR / 2\nscript 1 OPEN { Delay(FAR + HALF); }",
+        "script 1 OPEN { Switch (Random(0, 1)) { case 900.0: Delay(1); break; case 300.0: Delay(2); break; } }",
+        'script 1 OPEN { Log(s:"at 96.5"); Delay(96.5); }',
+        "script 1 OPEN { Delay(96.5); } // at 96.5",
+    ],
+)
+def test_a_script_of_a_drawn_map_has_the_bytes_that_the_compiler_gives_it(text: str):
+    """Also where the compiler has calculated with its numbers, or sorted them."""
+    script = f'#include "zcommon.acs"\n{text}'
+    assert _compiled_by_form(script, "") == compile_acs(script)
+
+
+def test_scripts_of_drawn_maps_that_differ_in_numbers_are_compiled_once(monkeypatch: pytest.MonkeyPatch):
+    forms = "script 1 OPEN { Delay(96.5); Delay(4 * 1000000); }", "script 1 OPEN { Delay(7.25); Delay(4 * 2000000); }"
+    want = [compile_acs(script) for script in forms]
+    assert _compiled_by_form(forms[0], "") == want[0]
+    monkeypatch.setattr(compiler, "compile_acs", None)
+    assert _compiled_by_form(forms[1], "") == want[1]
+
+
+def test_a_number_of_a_drawn_map_that_is_too_large_is_refused():
+    with pytest.raises(AcsError, match=r"got the number 40000\.0, want at most 32767"):
+        _compiled_by_form("script 1 OPEN { Delay(40000.0); }", "")
 
 
 def test_an_integer_radius_is_refused():

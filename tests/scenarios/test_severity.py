@@ -74,12 +74,18 @@ def test_no_two_maps_of_a_task_need_different_classes_of_one_name(scenario):
 
 
 def test_a_blend_lies_where_both_textures_lie():
-    """A wall of 64x128 and a flat of 64x64: one patch of the wall, two of the flat."""
-    entry = blended("XWALL", "WALL", "FLAT", 0.25, {"WALL": (64, 128), "FLAT": (64, 64)})
-    assert entry.splitlines() == [
+    """A wall of 64x128 and a flat of 64x64: the wall once, made of its own patches, and the flat twice."""
+    patches = {"WALL": [("TOP", 0, 0), ("BOTTOM", 0, 64)]}
+    entries = blended("XWALL", "WALL", "FLAT", 0.25, {"WALL": (64, 128), "FLAT": (64, 64)}, patches)
+    assert entries.splitlines() == [
+        'Texture "UWALL", 64, 128',
+        "{",
+        'Patch "TOP", 0, 0',
+        'Patch "BOTTOM", 0, 64',
+        "}",
         'Texture "XWALL", 64, 128',
         "{",
-        'Patch "WALL", 0, 0 ',
+        'Patch "UWALL", 0, 0 ',
         'Patch "FLAT", 0, 0 { Style Translucent Alpha 0.25 }',
         'Patch "FLAT", 0, 64 { Style Translucent Alpha 0.25 }',
         "}",
@@ -157,6 +163,14 @@ def test_textures_at_a_severity_are_between_those_of_both_tasks():
     )
     assert from_default == sorted(from_default)
     assert to_whole == sorted(to_whole, reverse=True)
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("task", ["seek_and_kill/blue", "health_gathering/slime"])
+def test_a_texture_at_nearly_the_whole_severity_is_nearly_that_of_the_task(task):
+    """That of `blue` has the name of a patch that is another picture; that of `slime` has patches over each other."""
+    whole, nearly = (task_frame(parse_task(name))[:90].astype(float) for name in (task, f"{task}=0.999"))
+    assert np.abs(whole - nearly).mean() < 4
 
 
 @pytest.mark.engine

@@ -185,6 +185,7 @@ def test_views_show_the_shared_memory_and_last_until_the_call_after_the_next_one
     screens = views.render()
     assert screens is not None
     assert [screen.shape for screen in screens] == [(144, 256, 3)] * 2
+    assert all(screen.flags.writeable for screen in screens), "as DoomEnv's, to draw into"
     env = DoomEnv("defend_the_center/default", render_mode="rgb_array")
     env.reset(options={"episode_seed": 9})
     np.testing.assert_array_equal(screens[1], env.render())

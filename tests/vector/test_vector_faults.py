@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -173,6 +174,24 @@ def test_an_error_of_a_worker_is_raised_here_and_closes_everything(monkeypatch: 
         envs.step(TURN)
     with pytest.raises(ClosedEnvironmentError):
         envs.step(TURN)
+    assert not any(psutil.pid_exists(pid) for pid in pids)
+
+
+def test_an_interrupted_call_closes_everything():
+    envs = gvz.make_vec(TASK, 2, num_workers=2)
+    pids = envs._crew.pids
+    envs.reset(seed=1)
+
+    def interrupt() -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(pids[0], signal.SIGCONT)
+
+    os.kill(pids[0], signal.SIGSTOP)
+    threading.Timer(0.2, interrupt).start()
+    with pytest.raises(KeyboardInterrupt):
+        envs.step(TURN)
+    with pytest.raises(ClosedEnvironmentError):
+        envs.reset()
     assert not any(psutil.pid_exists(pid) for pid in pids)
 
 

@@ -6,8 +6,8 @@ import pytest
 
 from gvz.core.errors import WadError
 from gvz.wad.lumps import Lump, read_maps, read_wad
-from gvz.wad.stock import scenario_wad, stock_textures
-from gvz.wad.textures import check_textures, flats, used_textures, wall_textures
+from gvz.wad.stock import scenario_wad, stock_patches, stock_textures
+from gvz.wad.textures import check_textures, flats, used_textures, wall_patches, wall_textures
 from gvz.wad.udmf import UdmfMap, parse_textmap
 
 
@@ -54,6 +54,26 @@ def test_flats_are_the_lumps_between_their_markers():
 def test_a_damaged_texture_lump_is_refused(data: bytes, message: str):
     with pytest.raises(WadError, match=message):
         wall_textures([Lump("TEXTURE1", data)])
+
+
+def test_patches_of_wall_textures_are_listed_with_their_places():
+    """A texture may have the name of a patch that is none of its own."""
+    patches = stock_patches()
+    assert patches["FIREBLU2"] == [("W65B_2", 0, 0)]
+    assert patches["ICKWALL3"] == [("WALL72_7", 0, 0), ("WALL69_9", 0, 64), ("W67_2", 32, 64)]
+    assert patches["STONE2"][1] == ("W28_5", 64, 64)
+
+
+@pytest.mark.parametrize("patches", [b"", struct.pack("<h", 2) + bytes(10), struct.pack("<h3h4x", 1, 0, 0, 2)])
+def test_patches_beyond_the_texture_lump_or_without_a_name_are_refused(patches: bytes):
+    names = Lump("PNAMES", struct.pack("<i8s8s", 2, b"ONE", b"two"))
+    entry = struct.pack("<ii8s4xhh4x", 1, 8, b"WALL", 64, 128)
+    whole = Lump("TEXTURE1", entry + struct.pack("<h3h4x", 1, 5, -6, 1))
+    assert wall_patches([whole, names]) == {"WALL": [("TWO", 5, -6)]}
+    with pytest.raises(
+        WadError, match=r"TEXTURE1: got WALL with a patch outside the .* bytes or the 2 names of PNAMES"
+    ):
+        wall_patches([Lump("TEXTURE1", entry + patches), names])
 
 
 def test_freedoom_has_every_texture_of_the_benchmark_as_wall_or_flat():
