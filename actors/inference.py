@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from actors.policy import Policy
-from gvz.core.errors import WaitTimeoutError
+from gvz.core.errors import WaitTimeoutError, WorkerError
 from gvz.transport.inference import Answer, RequestReader
 from gvz.transport.messages import ParamsHeader
 
@@ -52,9 +52,13 @@ class InferenceServer:
             self._thread.start()
 
     def check(self) -> None:
-        """Raises what ended the thread, if anything did."""
-        if self._failure is not None:
-            raise self._failure
+        """Says what ended the thread, if anything did.
+
+        Raises:
+            WorkerError: choosing actions failed, whatever it was.
+        """
+        if (failure := self._failure) is not None:
+            raise WorkerError(f"choosing the actors' actions failed: {type(failure).__name__}: {failure}") from failure
 
     def close(self, *, abandon: bool = False) -> None:
         """Ends the thread; waits for the batch that is under way unless it is abandoned. Can be repeated.

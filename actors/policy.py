@@ -109,18 +109,19 @@ class ExportedPolicy:
             raise ValueError(f"acting function: it takes {self._ends[-1]} parameters, want {num_params}")
         self._jax = jax
         self._cpu = jax.devices("cpu")[0]
-        self._seed_key = jax.device_put(np.array(jax.random.PRNGKey(seed)), self._cpu)
+        # that of the functions, whatever JAX_DEFAULT_PRNG_IMPL says
+        self._seed_key = jax.device_put(jax.random.key(seed, impl="threefry2x32"), self._cpu)
+
+        def key_data(key: Any, num_calls: Any) -> Any:
+            return jax.random.key_data(jax.random.fold_in(key, num_calls))
+
         self._act = jax.jit(
-            lambda params, obs, key, num_calls, epsilon: exported.call(
-                params, obs, jax.random.fold_in(key, num_calls), epsilon
-            )
+            lambda params, obs, key, num_calls, epsilon: exported.call(params, obs, key_data(key, num_calls), epsilon)
         )
         self._fold = self._folded = self._folded_at = None
         self._fold_period_steps = fold_period_steps
         if folding is not None:
-            self._fold = jax.jit(
-                lambda params, key, num_calls: folding.call(params, jax.random.fold_in(key, num_calls))
-            )
+            self._fold = jax.jit(lambda params, key, num_calls: folding.call(params, key_data(key, num_calls)))
         self.num_calls = 0
         # compiles now, and shows now whether the function fits this actor's games
         self.set_params(np.zeros(num_params, np.float32), ParamsHeader(version=0, num_updates=0))

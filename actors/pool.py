@@ -155,7 +155,7 @@ class Pool(Protocol):
         """Watches the actors and returns what they said since the last call. Never waits long.
 
         Raises:
-            WorkerError: an actor failed more often than its budget allows. What went wrong in choosing actions here.
+            WorkerError: an actor failed more often than its budget allows, or choosing the actors' actions failed.
         """
         ...
 

@@ -17,6 +17,7 @@ from actors.loop import ActorLoop
 from actors.placement import keep_to
 from actors.preprocess import ObservationBatch
 from gvz.core.errors import EngineError, WaitTimeoutError
+from gvz.core.watchdog import AwakeClock
 from gvz.transport import child
 from gvz.transport.broadcast import BroadcastReader
 from gvz.transport.channel import Channel
@@ -80,13 +81,12 @@ class Worker:
 
     def _take_params(self) -> bool:
         """Acts by the newest parameters from now on; False if there are none newer, or if it is too soon."""
-        start = time.monotonic()
-        newest = self._params.read() if self._params and start >= self._take_params_at else None
+        clock = AwakeClock()
+        newest = self._params.read() if self._params and time.monotonic() >= self._take_params_at else None
         if newest is None:
             return False
         self._loop.set_params(*newest)
-        now = time.monotonic()
-        self._take_params_at = now + (now - start) / MAX_PARAMS_SHARE
+        self._take_params_at = time.monotonic() + clock.look() / MAX_PARAMS_SHARE
         return True
 
     def _wait_for_actions(self) -> bool:
@@ -99,12 +99,12 @@ class Worker:
 
     def _wait_for_params(self) -> bool:
         """Waits for the first version; False if told to stop first."""
-        start = time.monotonic()
+        clock = AwakeClock()
         while self._params and not self._take_params():
             self._ring.beat(WriterState.STARTING)
             if self._must_stop():
                 return False
-            if time.monotonic() - start > PARAMS_TIMEOUT_S:
+            if clock.look() > PARAMS_TIMEOUT_S:
                 raise WaitTimeoutError(
                     f"actor {self._spec.actor} waited {PARAMS_TIMEOUT_S:.0f} s for the learner to publish the first "
                     "parameters"

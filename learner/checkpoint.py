@@ -29,6 +29,7 @@ import orbax.checkpoint as ocp
 
 from gvz.core.durable import fsync, fsync_tree, saved_steps
 from gvz.core.errors import CheckpointError, WaitTimeoutError
+from gvz.core.watchdog import AwakeClock
 from learner.memory import release_freed_memory
 
 CHECKPOINT_SCHEMA = 1
@@ -40,6 +41,9 @@ it (300 MB in one piece took 19 s and 300 MB more, in blocks 3 s and 130 MB; the
 
 WRITE_TIMEOUT_S = 1800.0
 """a checkpoint that is not written by then never will be: the disk does not answer"""
+
+_JOIN_S = 0.1
+"""a wait for the thread looks at its clock so often"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -287,18 +291,20 @@ class Checkpointer:
         return outcome
 
     def wait(self, timeout_s: float = WRITE_TIMEOUT_S) -> None:
-        """Waits until nothing is being written.
+        """Waits until nothing is being written. Time in which this process was stopped does not count.
 
         Raises:
             WaitTimeoutError: it takes longer than `timeout_s`.
         """
         if self._thread is not None:
-            self._thread.join(timeout_s)
-            if self._thread.is_alive():
-                raise WaitTimeoutError(
-                    f"the learner waited {timeout_s:g} s for {self._thread.name} to be written to {self._checkpoints}; "
-                    "the disk does not answer, or is too slow for checkpoints of this size"
-                )
+            clock = AwakeClock()
+            while self._thread.is_alive():
+                if clock.look() > timeout_s:
+                    raise WaitTimeoutError(
+                        f"the learner waited {timeout_s:g} s for {self._thread.name} to be written to "
+                        f"{self._checkpoints}; the disk does not answer, or is too slow for checkpoints of this size"
+                    )
+                self._thread.join(min(timeout_s, _JOIN_S))
             self._thread = None
 
     def abandon(self) -> None:

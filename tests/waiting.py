@@ -5,6 +5,8 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
+import pytest
+
 T = TypeVar("T")
 
 
@@ -18,3 +20,16 @@ def wait_until(
         assert time.monotonic() < deadline, f"waited {timeout_s:g} s for {what}"
         time.sleep(0.02)
     return found
+
+
+def make_pause(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """A function that sets the clock forward, which is what a process sees that was stopped for so many seconds."""
+    paused_s, now = 0.0, time.monotonic
+
+    def pause(seconds: float) -> None:
+        nonlocal paused_s
+        paused_s += seconds
+
+    monkeypatch.setattr(time, "monotonic", lambda: now() + paused_s)
+    monkeypatch.setattr(time, "monotonic_ns", lambda: int(1e9 * time.monotonic()))
+    return pause

@@ -56,7 +56,9 @@ class WaitTimeoutError(GvzError, TimeoutError):
 
 
 class WorkerError(GvzError):
-    """An actor failed for good: its restart budget is spent. Carries the last log lines in its message."""
+    """An actor failed for good: its restart budget is spent, and the message has its last log lines. Or choosing the
+    actors' actions failed.
+    """
 
 
 class GroupError(GvzError):

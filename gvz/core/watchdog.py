@@ -33,7 +33,7 @@ class AwakeClock:
         now_s: seconds that count, at the last look.
     """
 
-    def __init__(self, longest_s: float):
+    def __init__(self, longest_s: float = 1.0):
         self.now_s, self._longest_s, self._looked_s = 0.0, longest_s, time.monotonic()
 
     def look(self) -> float:

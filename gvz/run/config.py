@@ -165,6 +165,11 @@ class RunConfig:
         learner = self.learner
         if not isinstance(learner, OnPolicyConfig) or self.replay is not None:
             raise _unfit(self, "learns on-policy", "learner=OnPolicyConfig(...), replay=None")
+        if self.agent.learns_sight:
+            raise ConfigError(
+                f"agent.name: {self.agent.name!r} learns on-policy and its configuration has `learns_sight` True; want "
+                "False: a loss of sight is for agents that learn from a replay"
+            )
         num_steps = self.num_lanes * learner.rollout_steps
         if num_steps % learner.num_minibatches:
             raise ConfigError(

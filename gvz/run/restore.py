@@ -18,19 +18,20 @@ def restore(run: RunDir, template: Any, group: Group, say: Callable[[str], None]
     """Reads the newest whole checkpoint that all processes of the run have; None for a new run.
 
     Raises:
-        CheckpointError: there are checkpoints, but none that can be used.
+        CheckpointError: there are checkpoints, but none that can be used; or the disk of a link is not mounted.
     """
     restored = group.restored(lambda newest: restore_newest(run.checkpoints, template, newest))
+    for folder, without in ((run.checkpoints, "begin a new run"), (run.path / "policies", "go on without what it had")):
+        if folder.is_symlink() and not folder.exists():
+            raise CheckpointError(
+                f"{folder}: leads to {folder.readlink()}, which is not there; mount its disk, or remove the link to "
+                f"{without}"
+            )
     if restored is None:
         if len(steps := saved_steps(run.checkpoints)) > 1:
             raise CheckpointError(
                 f"{run.checkpoints}: there are checkpoints of updates {steps}, but another learner process has none of "
                 "these; bring its run directory back, or give all another --run-dir"
-            )
-        if run.checkpoints.is_symlink() and not run.checkpoints.exists():
-            raise CheckpointError(
-                f"{run.checkpoints}: leads to {run.checkpoints.readlink()}, which is not there; mount its disk, or "
-                "remove the link to begin a new run"
             )
         say(f"new run in {run.path}")
         run.discard_after(0)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from actors.pool import STOP_TIMEOUT_S
 from gvz.core import janitor, records
 from gvz.core.cache import xla_cache_directory
-from gvz.core.errors import CheckpointError, WaitTimeoutError, WorkerError
+from gvz.core.errors import CheckpointError, ConfigError, WaitTimeoutError, WorkerError
 from gvz.core.stop import StopRequest
 from gvz.core.watchdog import AwakeClock, Watchdog
 from gvz.run import footprint, machine
@@ -82,6 +82,7 @@ class Trainer:
 
         Raises:
             WorkerError, WaitTimeoutError: the actors failed for good; a checkpoint is written first.
+            ConfigError: what the user gave does not work, for example an agent's epsilon; likewise.
             NonFiniteError: the learner's numbers went wrong; the checkpoints before it stand.
             CheckpointError: the last checkpoint could not be written.
         """
@@ -97,7 +98,7 @@ class Trainer:
                     self._broadcast()
                     self._record()
                     self._saver.save_when_due(self._group)
-        except (WorkerError, WaitTimeoutError):
+        except (ConfigError, WorkerError, WaitTimeoutError):
             with contextlib.suppress(CheckpointError, WaitTimeoutError):  # already reported; the first error is raised
                 self._saver.save_last(self._group, self._record_row)
             raise
@@ -164,11 +165,22 @@ class Trainer:
             self._send()
 
     def _send(self) -> None:
-        """Epsilon follows from the decisions at the publication, so a resumed run sends what was sent before."""
+        """Epsilon follows from the decisions at the publication, so a resumed run sends what was sent before.
+
+        Raises:
+            ConfigError: it is no probability.
+        """
+        epsilon = self._learner.epsilon(self._counts.published_env_steps)
+        if not 0 <= epsilon <= 1:
+            raise ConfigError(
+                f"agent.name: the `epsilon` of {self._config.agent.name!r} gives {epsilon} after "
+                f"{self._counts.published_env_steps} decisions of the run; want 0..1: keep its schedule within them, "
+                "and give the same command to go on"
+            )
         header = ParamsHeader(
             version=self._counts.version,
             num_updates=self._counts.published_updates,
-            epsilon=self._learner.epsilon(self._counts.published_env_steps),
+            epsilon=epsilon,
             layout_hash=self._parts.pool_config.layout_hash,
         )
         self._pool.publish(self._published_params, header)

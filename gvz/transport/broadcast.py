@@ -7,11 +7,11 @@ stays.
 """
 
 import struct
-import time
 
 import numpy as np
 
 from gvz.core.errors import TransportError, WaitTimeoutError
+from gvz.core.watchdog import AwakeClock
 from gvz.transport.messages import ParamsHeader
 from gvz.transport.segment import ALIGN_BYTES, Fence, Segment, aligned, hash_layout
 
@@ -126,7 +126,7 @@ class BroadcastReader(_ParamsQueue):
         """
         if self._count[0] == self._seen:
             return None
-        params, start = _empty_aligned(self.num_params), time.monotonic()
+        params, clock = _empty_aligned(self.num_params), AwakeClock()
         while True:
             count = self._count[0]
             slot = (count - 1) % len(self._words)
@@ -155,7 +155,7 @@ class BroadcastReader(_ParamsQueue):
                     )
                 self._seen = count
                 return params, header
-            if time.monotonic() - start > _READ_TIMEOUT_S:
+            if clock.look() > _READ_TIMEOUT_S:
                 raise WaitTimeoutError(
                     f"broadcast {self.name}: reader waited {_READ_TIMEOUT_S:.0f} s for a whole version; the writer "
                     "overtook every copy: raise learner.publish_period_updates"

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gvz.core.errors import WaitTimeoutError
+from gvz.core.watchdog import AwakeClock
 from gvz.transport.segment import Fence, Segment, aligned, hash_layout
 
 # u64 control words; the actor's and the learner's are in separate cache lines
@@ -115,7 +116,7 @@ class RequestWriter(_Requests):
         self._words[_REQUESTED] = (self._words[_REQUESTED] + 1) % 2**64
 
     def wait(self, timeout_s: float, *, beat: Callable[[], None], cancelled: Callable[[], bool]) -> bool:
-        """Waits for the answer, with a heartbeat.
+        """Waits for the answer, with a heartbeat. Time in which this process was stopped does not count.
 
         Returns:
             False if `cancelled()` became true first.
@@ -123,12 +124,12 @@ class RequestWriter(_Requests):
         Raises:
             WaitTimeoutError: there was no answer in time.
         """
-        start, sleep_s = time.monotonic(), _FIRST_SLEEP_S
+        clock, sleep_s = AwakeClock(), _FIRST_SLEEP_S
         while not (answered := self._words[_ANSWERED] == self._words[_REQUESTED]) and not cancelled():
             beat()
             time.sleep(sleep_s)
             sleep_s = min(2 * sleep_s, _LONGEST_SLEEP_S)
-            if time.monotonic() - start > timeout_s:
+            if clock.look() > timeout_s:
                 raise WaitTimeoutError(
                     f"{self._segment.name}: the actor waited {timeout_s:.0f} s for the learner to choose its actions"
                 )

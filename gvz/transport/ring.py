@@ -17,6 +17,7 @@ from enum import IntEnum
 import numpy as np
 
 from gvz.core.errors import TransportError, WaitTimeoutError
+from gvz.core.watchdog import AwakeClock
 from gvz.transport.messages import STEP_DTYPE, StepBlock
 from gvz.transport.segment import Fence, Segment, aligned, hash_layout
 
@@ -234,7 +235,8 @@ class RingWriter(_Ring):
     def wait_for_space(
         self, num_records: int, timeout_s: float, *, cancelled: Callable[[], bool] = lambda: False
     ) -> bool:
-        """Waits until `num_records` fit, with a heartbeat; adds the time to the ring's waiting time.
+        """Waits until `num_records` fit, with a heartbeat; adds the time to the ring's waiting time. Time in which this
+        process was stopped does not count.
 
         Returns:
             False if `cancelled()` became true first.
@@ -244,17 +246,17 @@ class RingWriter(_Ring):
         """
         if self.free >= num_records:
             return True
-        start_ns, sleep_s = time.monotonic_ns(), _FIRST_SLEEP_S
+        clock, sleep_s = AwakeClock(), _FIRST_SLEEP_S
         waited_before_ns = self._words[_WAITED_NS]
         while not (done := self.free >= num_records) and not cancelled():
             self.beat(WriterState.WAITING_FOR_SPACE)
             time.sleep(sleep_s)
             sleep_s = min(2 * sleep_s, _LONGEST_SLEEP_S)
-            waited_ns = time.monotonic_ns() - start_ns
-            self._words[_WAITED_NS] = (waited_before_ns + waited_ns) % 2**64
-            if waited_ns > timeout_s * 1e9:
+            waited_s = clock.look()
+            self._words[_WAITED_NS] = (waited_before_ns + int(1e9 * waited_s)) % 2**64
+            if waited_s > timeout_s:
                 raise WaitTimeoutError(
-                    f"ring {self.name}: writer (pid {os.getpid()}) waited {waited_ns / 1e9:.1f} s for the learner to "
+                    f"ring {self.name}: writer (pid {os.getpid()}) waited {waited_s:.1f} s for the learner to "
                     f"read; {self.free} of {self.capacity} records are free, {num_records} are wanted"
                 )
         return done

@@ -19,6 +19,7 @@ from actors.config import ActorsConfig
 from actors.inline import InlinePool
 from actors.pool import PoolConfig
 from actors.process_pool import ProcessPool
+from gvz.core.errors import WorkerError
 from gvz.transport.messages import ParamsHeader, StepBlock
 from gvz.transport.ring import WriterState
 
@@ -156,8 +157,10 @@ def test_what_goes_wrong_in_choosing_actions_ends_the_learners_loop(tmp_path: Pa
 
     with ProcessPool(asking(tmp_path), None, Broken) as pool:
         publish(pool)
-        with pytest.raises(RuntimeError, match="out of memory on the device"):
+        said = "choosing the actors' actions failed: RuntimeError: out of memory on the device"
+        with pytest.raises(WorkerError, match=said) as raised:  # at which a run saves itself
             Run(pool, asking(tmp_path)).until(lambda: False)
+        assert isinstance(raised.value.__cause__, RuntimeError)
 
 
 def test_choices_of_a_resumed_pool_have_another_seed(tmp_path: Path):

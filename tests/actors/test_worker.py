@@ -24,6 +24,7 @@ from gvz.transport.broadcast import BroadcastWriter
 from gvz.transport.channel import Channel
 from gvz.transport.messages import ActorSpec, ParamsHeader, Ready, Stop
 from gvz.transport.ring import RingReader, WriterState
+from tests.waiting import make_pause
 
 LAYOUT, NUM_PARAMS = 5, 4
 
@@ -156,5 +157,32 @@ def test_taking_parameters_keeps_to_its_share_of_the_time(
             monkeypatch.setattr(worker, "MAX_PARAMS_SHARE", share)
             queue.publish(*params(1))
             assert actor._take_params() == taken
+    finally:
+        queue.close()
+
+
+def test_a_pause_ends_no_wait_for_parameters_and_delays_no_taking_of_them(
+    spec: ActorSpec, ring: RingReader, channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
+):
+    spec = msgspec.structs.replace(spec, policy=first_param_policy(), num_params=NUM_PARAMS, layout_hash=LAYOUT)
+    queue = BroadcastWriter.create("gvz-test", NUM_PARAMS, LAYOUT)
+    try:
+        actor, pause, looks = Worker(spec, channels[1], ring.descriptor, queue.descriptor), make_pause(monkeypatch), []
+
+        def stopped_once() -> bool:
+            looks.append(1)
+            if len(looks) == 2:
+                pause(7200)
+            elif len(looks) == 4:
+                queue.publish(*params(1))
+            return False
+
+        set_params = actor._loop.set_params
+        monkeypatch.setattr(actor._loop, "set_params", lambda *newest: (pause(7200), set_params(*newest)))
+        monkeypatch.setattr(actor, "_must_stop", stopped_once)
+        assert actor._wait_for_params()
+        queue.publish(*params(2))
+        pause(60)
+        assert actor._take_params()
     finally:
         queue.close()

@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from learner import checkpoint
 from learner.agents.base import AgentSpec, make_agent
 from learner.agents.configs.rainbow import RainbowConfig
 from tests.full_disk import full_disk
+from tests.waiting import make_pause
 
 
 def example(fill: int = 0):
@@ -327,6 +329,26 @@ def test_a_save_that_does_not_end_is_named(tmp_path):
         saver.wait(0.001)
     saver.wait()
     assert saver.outcome() == ""
+
+
+def test_time_in_which_the_learner_was_stopped_is_no_time_of_waiting_for_a_save(tmp_path, monkeypatch):
+    saver, pause = checkpoint.Checkpointer(tmp_path, keep=1), make_pause(monkeypatch)
+
+    class Writing(threading.Thread):
+        """It ends after the third wait for it; the process is stopped for hours in each."""
+
+        waits = 0
+
+        def join(self, timeout: float | None = None) -> None:
+            del timeout
+            self.waits += 1
+            pause(7200)
+
+        def is_alive(self) -> bool:
+            return self.waits < 3
+
+    saver._thread = Writing()
+    saver.wait()
 
 
 WRITER = Path(__file__).with_name("checkpoint_writer.py")

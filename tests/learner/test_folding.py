@@ -83,6 +83,18 @@ def played(policy: Policy, obs: dict[str, np.ndarray], num_calls: int) -> list[t
     return [policy.act(obs) for _ in range(num_calls)]
 
 
+@pytest.mark.parametrize("steps", [1, STEPS])
+def test_an_actors_choices_do_not_depend_on_the_default_kind_of_keys(steps: int):
+    agent, obs = Telling(replace(CONFIG, noisy_period_steps=steps), SPEC), observed(GAMES)
+    params, found = np.asarray(flatten_params(params_of(agent))), []
+    for kind in ("threefry2x32", "rbg"):
+        with jax.default_prng_impl(kind):  # JAX_DEFAULT_PRNG_IMPL
+            policy = policy_of("actors", agent, obs)
+            policy.set_params(params, header(1, epsilon=0.3))
+            found.append(played(policy, obs, 20))
+    jax.tree.map(np.testing.assert_array_equal, *found)
+
+
 def test_folded_weights_are_eq_4_14():
     agent = Rainbow(CONFIG, SPEC)
     params, key = params_of(agent), jax.random.key(5)

@@ -1,6 +1,7 @@
 """Configurations of on-policy agents: which learners fit, and how many decisions a gradient step has."""
 
 import re
+from dataclasses import dataclass
 
 import pytest
 
@@ -36,6 +37,17 @@ from learner.config import OnPolicyConfig
 def test_an_agent_with_another_agents_learner_is_refused(fields, message):
     with pytest.raises(ConfigError, match=re.escape(message)):
         RunConfig(name="x", **fields)
+
+
+def test_a_loss_of_sight_on_rollouts_is_refused():
+    @dataclass(frozen=True, kw_only=True)
+    class Seeing(PPOConfig):
+        learns_sight = True
+
+    with pytest.raises(
+        ConfigError, match=r"'ppo' learns on-policy .*: a loss of sight is for agents that learn from a"
+    ):
+        RunConfig(name="x", agent=Seeing(), replay=None, learner=OnPolicyConfig())
 
 
 def test_decisions_for_a_gradient_step_follow_from_the_learner():

@@ -8,6 +8,7 @@ import stat
 import tempfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import gvz
@@ -18,9 +19,11 @@ from gvz.run.config_files import load_config
 from gvz.run.group import Alone
 from gvz.run.restore import restore
 from gvz.run.rundir import RunDir, move_aside
+from learner.checkpoint import write
 from tests.full_disk import full_disk
 
 CONFIG = load_config("rainbow_4task")
+WEIGHTS = {"weights": np.zeros(2, np.float32)}
 
 
 def test_it_is_private_and_held_by_one(tmp_path):
@@ -51,12 +54,15 @@ def test_a_run_goes_on_with_its_own_file_however_its_path_is_written(tmp_path, m
             )
 
 
-def test_checkpoints_on_a_disk_that_is_not_there_are_no_new_run(tmp_path):
+@pytest.mark.parametrize(("folder", "saved"), [("checkpoints", False), ("policies", False), ("policies", True)])
+def test_a_run_does_not_begin_without_what_is_on_a_disk_that_is_not_there(tmp_path, folder, saved):
     with RunDir(tmp_path / "run") as run:
         run.append("metrics.jsonl", {"row": 1})
-        run.checkpoints.symlink_to(tmp_path / "not mounted")
-        with pytest.raises(CheckpointError, match=r"checkpoints: leads to .*not mounted, which is not there"):
-            restore(run, None, Alone(), print)
+        if saved:
+            write(run.checkpoints / "1", WEIGHTS, {})
+        (run.path / folder).symlink_to(tmp_path / "not mounted")
+        with pytest.raises(CheckpointError, match=rf"{folder}: leads to .*not mounted, which is not there; mount its"):
+            restore(run, WEIGHTS, Alone(), print)
     assert (tmp_path / "run" / "metrics.jsonl").read_text()
 
 

@@ -4,7 +4,7 @@ import hashlib
 import itertools
 import re
 import signal
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgpack
@@ -15,6 +15,7 @@ from actors.config import ActorsConfig
 from benchmarks.last_parameters import main, write_last_parameters
 from gvz.cluster.config import ClusterConfig
 from gvz.core import records
+from gvz.core.durable import saved_steps
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError, ResumeError
 from gvz.core.stop import StopRequest
@@ -171,6 +172,24 @@ def test_a_run_that_explores_by_epsilon_goes_on_bit_for_bit_between_two_publicat
     assert (len(tasks_of_lanes) > games) == (curriculum == "uniform")
     assert logged_updates(tmp_path / "whole") == [20, 40, 60, 80]
     assert logged_updates(tmp_path / "cut") == [50, 60, 80]
+
+
+def test_an_epsilon_that_is_no_probability_ends_a_run_which_is_saved_first(tmp_path):
+    smallest = -10.0
+
+    @dataclass(frozen=True, kw_only=True)
+    class Falling(DQNConfig):
+        def epsilon(self, env_steps: int) -> float:
+            return max(smallest, 1.0 - env_steps / 100)
+
+    config = replace(DQN, agent=Falling(conv_channels=(4,), conv_kernels=(8,), conv_strides=(4,), hidden_units=16))
+    said = r"agent\.name: the `epsilon` of 'dqn' gives -\d\.\d+ after \d+ decisions of the run; want 0\.\.1"
+    with pytest.raises(ConfigError, match=said):
+        go_on(tmp_path, config, 120)
+    (saved,) = saved_steps(tmp_path / "checkpoints")
+    assert saved > 0
+    smallest = 0.0  # the user mends it
+    go_on(tmp_path, config, 120)
 
 
 def test_a_run_goes_on_bit_for_bit_within_a_stretch_of_noise(tmp_path):

@@ -19,6 +19,7 @@ from gvz.transport import broadcast
 from gvz.transport.broadcast import BroadcastReader, BroadcastWriter, broadcast_bytes
 from gvz.transport.messages import ParamsHeader
 from gvz.transport.segment import HEADER_BYTES
+from tests.waiting import make_pause
 
 NUM_PARAMS, LAYOUT = 1000, 0xABCDEF
 
@@ -118,6 +119,24 @@ def test_a_version_that_never_becomes_whole_is_named(
     monkeypatch.setattr(broadcast, "_READ_TIMEOUT_S", 0.05)
     with pytest.raises(WaitTimeoutError, match="reader waited 0 s for a whole version; the writer overtook every"):
         reader.read()
+
+
+def test_time_in_which_the_reader_was_stopped_is_no_time_of_waiting(
+    writer: BroadcastWriter, reader: BroadcastReader, monkeypatch: pytest.MonkeyPatch
+):
+    publish(writer, 1)
+    ticket, pause, fences = words_of(writer, 64), make_pause(monkeypatch), []
+    ticket[0] += 1  # the slot is being written
+
+    def stopped_once() -> None:
+        fences.append(1)
+        if len(fences) == 3:
+            pause(7200)
+        elif len(fences) == 6:
+            ticket[0] += 1
+
+    monkeypatch.setattr(reader, "_fence", stopped_once)
+    assert read(reader)[0] == header(1)
 
 
 @pytest.mark.parametrize("epsilon", [-0.1, 1.5, math.nan])

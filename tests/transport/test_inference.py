@@ -7,6 +7,7 @@ import pytest
 
 from gvz.core.errors import TransportError, WaitTimeoutError
 from gvz.transport.inference import Answer, RequestReader, RequestWriter, request_bytes
+from tests.waiting import make_pause
 
 OBSERVATION = {
     "frames": np.empty((2, 4, 5, 6), np.uint8),
@@ -80,6 +81,24 @@ def test_waiting_has_an_end_and_a_heartbeat(learner: RequestReader):
     with pytest.raises(WaitTimeoutError, match="gvz-test: the actor waited 0 s for the learner to choose its actions"):
         actor.wait(0.02, beat=lambda: beats.append(1), cancelled=lambda: False)
     assert len(beats) > 2
+
+
+def test_time_in_which_the_actor_was_stopped_is_no_time_of_waiting(
+    learner: RequestReader, monkeypatch: pytest.MonkeyPatch
+):
+    actor, pause, beats = attach(learner), make_pause(monkeypatch), []
+    actor.ask()
+    number = learner.pending()
+    assert number is not None
+
+    def stopped_once() -> None:
+        beats.append(1)
+        if len(beats) == 2:
+            pause(7200)
+        elif len(beats) == 4:
+            learner.answer(number, answer(1))
+
+    assert actor.wait(3600, beat=stopped_once, cancelled=lambda: False)
 
 
 def test_observations_of_another_shape_are_refused(learner: RequestReader):

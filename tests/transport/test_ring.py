@@ -20,7 +20,7 @@ from gvz.core.errors import TransportError, WaitTimeoutError
 from gvz.transport.messages import STEP_DTYPE, StepBlock
 from gvz.transport.ring import RingReader, RingWriter, WriterState, ring_bytes
 from gvz.transport.segment import HEADER_BYTES
-from tests.waiting import wait_until
+from tests.waiting import make_pause, wait_until
 
 CAPACITY, SHAPE = 8, (4, 5, 3)
 
@@ -188,6 +188,25 @@ def test_waiting_can_be_cancelled(writer: RingWriter):
     for number in range(CAPACITY):
         write(writer, number)
     assert not writer.wait_for_space(1, timeout_s=10.0, cancelled=lambda: True)
+
+
+def test_time_in_which_the_writer_was_stopped_is_no_time_of_waiting(
+    reader: RingReader, writer: RingWriter, monkeypatch: pytest.MonkeyPatch
+):
+    for number in range(CAPACITY):
+        write(writer, number)
+    pause, looks = make_pause(monkeypatch), []
+
+    def stopped_once() -> bool:
+        looks.append(1)
+        if len(looks) == 2:
+            pause(7200)
+        elif len(looks) == 4:
+            reader.read(1)
+        return False
+
+    assert writer.wait_for_space(1, timeout_s=3600, cancelled=stopped_once)
+    assert reader.writer_status().waited_for_space_s < 60
 
 
 def test_the_writer_shows_its_state(reader: RingReader, writer: RingWriter):
