@@ -7,6 +7,7 @@ An average (`learner.average_ema`) changes evaluation alone, so the two compare 
 """
 
 import dataclasses
+import json
 import shutil
 import sys
 import tempfile
@@ -20,6 +21,7 @@ from gvz.core.errors import ConfigError, GvzError
 from gvz.core.registry import NO_OWN_FILES, OwnFiles
 from gvz.evaluation.trained import find_checkpoint, read_run_config
 from gvz.run.assemble import assemble
+from gvz.run.config_files import config_from_dict
 from gvz.run.rundir import RunDir, disk_checked
 from gvz.segmentation import KEPT_SEGMENTERS
 from learner import checkpoint
@@ -55,7 +57,8 @@ def write_last_parameters(run_dir: Path, out: Path, own_files: OwnFiles = NO_OWN
         with disk_checked(out), RunDir(out) as made:
             if (run_dir / KEPT_SEGMENTERS).exists():
                 shutil.copytree(run_dir / KEPT_SEGMENTERS, out / KEPT_SEGMENTERS)
-            made.write_config(dataclasses.replace(config, name=f"{config.name}+last_parameters", run_dir=None))
+            saved = config_from_dict(json.loads((run_dir / "config.json").read_text()), own_files)
+            made.write_config(dataclasses.replace(saved, name=f"{saved.name}+last_parameters", run_dir=None))
             policy = out / "policies" / str(num_updates)
             checkpoint.write(policy, arrays["learner"].params, {"num_updates": num_updates})
     except BaseException:

@@ -2,6 +2,7 @@
 
 import hashlib
 import itertools
+import json
 import re
 import signal
 from dataclasses import dataclass, replace
@@ -65,15 +66,17 @@ def go_on(path: Path, config: RunConfig, total_updates: int) -> None:
 def test_a_run_keeps_the_network_of_its_segmented_frames_and_goes_on_with_it(tmp_path):
     network, path = write_network(tmp_path / "fresh.onnx"), tmp_path / "run"
     env = EnvConfig(frames="segmented", segmenter=str(network), frame_height=24, frame_width=32)
-    config, first = replace(DQN, env=env), network.read_bytes()
+    config = replace(DQN, env=env, learner=replace(DQN.learner, average_ema=0.9))
+    first = network.read_bytes()
     go_on(path, config, 20)
     network.write_text("no network")
     go_on(path, config, 40)
-    assert (path / "segmenters" / "defend_the_center.onnx").read_bytes() == first
+    assert write_last_parameters(path, tmp_path / "last") == 40
+    for directory in (path, tmp_path / "last"):
+        assert (directory / "segmenters" / "defend_the_center.onnx").read_bytes() == first
+        saved = json.loads((directory / "config.json").read_text())["config"]
+        assert saved["env"]["segmenter"] == str(network), "what was asked for"
     with RunDir(path) as run:
-        saved = run.saved_config()
-        assert saved is not None
-        assert saved.env.segmenter == str(network), "what was asked for"
         on_hosts = replace(
             config, cluster=ClusterConfig(address="127.0.0.1:6379", hosts=2), mode="async", replay=ReplayConfig()
         )
