@@ -23,6 +23,7 @@ from tests.score_tables import (
     task_sets,
     training_episodes,
 )
+from tests.test_average_findings import RUNS, SCENARIOS, gain_of_average
 
 
 @pytest.mark.parametrize(
@@ -239,7 +240,8 @@ def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
     agents = [agent_scores(mine, agent) for agent in ("rainbow_segmented+longer_network", "rainbow_segmented")]
     of_network = estimate_groups([(scores, tasks) for scores in agents], difference).text
     assert len(named) > 10
-    assert named <= gains | {*of_segmented, of_network} | of_training_sets
+    of_average = {gain_of_average(agent, name)[0] for agent in RUNS for name in SCENARIOS}
+    assert named <= gains | {*of_segmented, of_network} | of_training_sets | of_average
     assert f"game variables | {' | '.join(of_segmented)} | no: `rainbow_segmented` |" in summary
 
 
