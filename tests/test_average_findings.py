@@ -11,6 +11,7 @@ from tests.score_tables import PAGE, WORDS, in_words, results_of, task_sets
 
 RUNS: dict[str, tuple[str, str, TaskSet]] = {
     "Rainbow": ("general_train4", "rainbow_segmented+train4_network", "train4"),
+    "PPO": ("gates", "ppo_segmented+average", "train8"),
 }
 """agent -> where its runs are under results/, their name, what they trained on"""
 SCENARIOS = ("defend_the_center", "seek_and_kill")

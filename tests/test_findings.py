@@ -169,6 +169,8 @@ def test_the_findings_say_what_the_gates_records_give():
             ]
             for scenario, _, *cells in with_records:
                 words = title if len(with_records) == 1 else scenario.text
+                if len(cells) == 1:
+                    continue  # test_average_findings.py
                 assert f"| {words} | {' | '.join(cell.text for cell in cells)} |" in PAGE
         _, _, *cells = result_table(results, augmented, trained=trained).rows[1]
         assert [cell.text for cell in cells[:1]] == ["-"], "its run is that of general_sight_loss"
