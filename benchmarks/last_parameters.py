@@ -13,8 +13,6 @@ import sys
 import tempfile
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import tyro
 
 from gvz.core.errors import ConfigError, GvzError
@@ -48,9 +46,7 @@ def write_last_parameters(run_dir: Path, out: Path, own_files: OwnFiles = NO_OWN
     if out.exists():
         raise ConfigError(f"{out} is already there; name a new directory")
     with tempfile.TemporaryDirectory() as work:
-        parts = assemble(config, Path(work))
-    acting = jax.ShapeDtypeStruct((parts.pool_config.num_params,), jnp.float32)
-    template = {**parts.learner.array_shapes(), "acting": acting}
+        template = assemble(config, Path(work)).array_shapes()
     num_updates = find_checkpoint(run_dir, "newest")
     arrays, _ = checkpoint.read(run_dir / "checkpoints" / str(num_updates), template)
     try:

@@ -7,7 +7,7 @@ import pytest
 
 from gvz.reports.scores import Scores, agent_scores, estimate
 from gvz.tasks import TaskSet, scenario_named
-from tests.score_tables import PAGE, WORDS, in_words, results_of, task_sets
+from tests.score_tables import PAGE, ROOT, WORDS, in_words, metrics_of, results_of, task_sets
 
 RUNS: dict[str, tuple[str, str, TaskSet]] = {
     "Rainbow": ("general_train4", "rainbow_segmented+train4_network", "train4"),
@@ -49,6 +49,20 @@ def gain_of_average(agent: str, scenario: str) -> tuple[str, list[str]]:
     }
     by_run = [f"{np.mean([*gained[seed].values()]):.1f}" for seed in sorted(gained)]
     return estimate(replace(averaged, runs=gained), gate).text, by_run
+
+
+def test_the_findings_say_how_many_gradient_steps_the_runs_had():
+    for folder, name, training in RUNS.values():
+        runs = [ROOT / "results" / folder / "runs" / name / scenario / training for scenario in SCENARIOS]
+        steps = sorted(metrics_of(run)[-1]["num_updates"] for of_scenario in runs for run in of_scenario.iterdir())
+        assert f": {steps[0]:,} to {steps[-1]:,} gradient steps, " in WORDS
+
+
+def test_the_findings_say_what_ppo_loses_on_the_training_tasks():
+    averaged, last = pair("PPO", "seek_and_kill")
+    tasks = task_sets("seek_and_kill")[0]
+    lost = [last.runs[seed][task].mean() - averaged.runs[seed][task].mean() for seed in last.runs for task in tasks]
+    assert f"On the training tasks of Seek and Kill it loses {np.mean(lost):.1f} points." in WORDS
 
 
 @pytest.mark.parametrize("agent", RUNS)

@@ -127,6 +127,12 @@ def test_the_page_says_how_enemies_kill_each_other_and_what_walking_earns():
         assert told in page, told
 
 
+def test_the_page_says_that_other_sizes_of_enemies_make_a_task_harder():
+    names = ("blue+mixed_enemies+resized_enemies", "mixed_enemies")
+    sized, plain = (percent("scripted", f"seek_and_kill/{name}") for name in names)
+    assert f"`{names[0]}` has {sized:.1f}, `{names[1]}` {plain:.1f}." in " ".join(PAGE.read_text().split())
+
+
 def test_the_page_says_what_the_other_mean_over_test_tasks_would_give():
     levels = [[task.id for task in named_tasks("dodge_projectiles", level=level, split="test")] for level in (2, 3, 4)]
     flat = percent("sweep", *itertools.chain(*levels))

@@ -134,6 +134,11 @@ def test_the_joint_run_says_what_its_records_give():
         alone[name] = f"{np.mean(scores):.1f}"
     said = "(`rainbow_general`, eight training tasks) have {defend_the_center} and {seek_and_kill} on the same tasks"
     assert said.format(**alone) in WORDS
+    sweep = read_results([ROOT / "results" / "reference" / "sweep.jsonl.gz"]).episodes
+    of_scenarios = sweep.filter(polars.col("task").is_in([task.id for task in named_tasks(split="test")]))
+    nothing = of_scenarios.group_by("scenario").agg(polars.col("normalized_score").mean())["normalized_score"].mean()
+    assert f"the sweep has {nothing:.1f}." in WORDS
+    assert f"The sweep, which looks at nothing, has {nothing:.1f}." in " ".join(readme.split())
     assert "| rainbow_all | 47.7 [46.8, 48.8] | 41.4 [40.2, 42.7] |" in report
 
 
@@ -293,3 +298,26 @@ def test_pages_say_what_a_gpu_gave():
     page = " ".join((ROOT / "results" / "general_gpu" / "README.md").read_text().split())
     assert f"for five batch sizes ({acting:.0f} s), then the gradient step ({learning:.0f} s)" in page
     assert (len(act), len(train_step)) == (5, 1)
+
+
+def test_the_findings_say_how_many_games_and_steps_gates_of_training_sets_had():
+    def runs(gate: str) -> dict[tuple[str, str, int], Path]:
+        of_gate = {(run.training, run.scenario, run.seed): run.id for run in experiments()[gate].runs()}
+        directories = {key: ROOT / "results/gates/runs" / run_id for key, run_id in of_gate.items()}
+        return {key: directory for key, directory in directories.items() if directory.exists()}
+
+    def games(directory: Path) -> int:
+        return len({row["lane"] for row in rows_of(directory / "episodes.jsonl.gz")})
+
+    world, pairs = runs("gate_world"), runs("gate_pairs")
+    last = [metrics_of(directory)[-1] for directory in world.values()]
+    steps = sorted(row["num_updates"] for row in last)
+    decisions = sorted(round(row["actors/env_steps"], -3) for row in last)
+    said = f"{steps[0]:,} to {steps[-1]:,} gradient steps and {decisions[0]:,} to {decisions[-1]:,} decisions"
+    assert f"{said}; 8 games at once with eight tasks, otherwise 4" in WORDS
+    assert {(training == "train8", games(run)) for (training, *_), run in world.items()} == {(True, 8), (False, 4)}
+    of_pairs = {scenario: games(run) for (training, scenario, _), run in pairs.items() if training == "pairs"}
+    assert of_pairs == {"dodge_projectiles": 42, "health_gathering": 48}
+    of_eight = [games(run) for (training, *_), run in pairs.items() if training == "train8"]
+    assert sorted(of_eight) == [8, 16, 16, 16]
+    assert "and 42 and 48 games at once; eight tasks had 16, and 8 in one run of Health Gathering." in WORDS

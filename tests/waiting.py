@@ -23,7 +23,7 @@ def wait_until(
 
 
 def make_pause(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
-    """A function that sets the clock forward, which is what a process sees that was stopped for so many seconds."""
+    """A function that sets the clock forward by a number of seconds. A process that was stopped sees the same."""
     paused_s, now = 0.0, time.monotonic
 
     def pause(seconds: float) -> None:

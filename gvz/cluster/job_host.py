@@ -61,7 +61,7 @@ class JobHost:
 def hold_cores(count: int) -> tuple[tuple[int, ...], list[IO[str]]]:
     """Cores of this machine that no other job of this user holds, and their locks, which last as long as they are open.
 
-    Idle cores go first, and chance says which: containers see the same cores, but not each other's locks. All cores,
+    Idle cores go first, chosen at random: containers see the same cores, but not each other's locks. All cores,
     without locks, where too few are free: Ray was told of more cores than there are, or somebody holds them.
     """
     allowed, idle = sorted(os.sched_getaffinity(0)), idle_cores()

@@ -48,6 +48,11 @@ class RunParts:
     pool_config: PoolConfig
     footprint: Footprint
 
+    def array_shapes(self) -> dict[str, Any]:
+        """Shapes and dtypes of the arrays of a whole checkpoint."""
+        acting = jax.ShapeDtypeStruct((self.pool_config.num_params,), jnp.float32)
+        return {**self.learner.array_shapes(), "acting": acting}
+
     def make_pool(self, config: RunConfig, state: dict[str, Any] | None) -> Pool:
         """Starts the games: new ones, or from what `Pool.state()` gave."""
         if config.mode == "sync":

@@ -10,7 +10,6 @@ import dataclasses
 import shutil
 
 import jax
-import jax.numpy as jnp
 
 from actors.pool import STOP_TIMEOUT_S
 from gvz.core import janitor, records
@@ -273,8 +272,7 @@ def train(config: RunConfig, run: RunDir, stop: StopRequest) -> int:
         parts = assemble(with_own_segmenters(config, run), run.work)
         progress.say("\n".join(parts.footprint.lines()))
         footprint.check(parts.footprint, device_free=machine.free_device_memory())
-        acting = jax.ShapeDtypeStruct((parts.pool_config.num_params,), jnp.float32)
-        restored = restore(run, {**parts.learner.array_shapes(), "acting": acting}, group, progress.say)
+        restored = restore(run, parts.array_shapes(), group, progress.say)
         run.write_config(config)
         note_start(run, restored)
         stop.at_once = False
