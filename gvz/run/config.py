@@ -46,12 +46,14 @@ class CheckpointConfig:
 
     period_updates: int = 10_000
     """gradient steps between checkpoints; one more is written at the end and on Ctrl-C"""
+    period_s: float = 900.0
+    """seconds after which a run of one learner process writes one more, however few gradient steps it has made"""
     keep: int = 2
     """checkpoints kept with their replay; the newest valid one is resumed from"""
 
     def __post_init__(self) -> None:
-        for name in ("period_updates", "keep"):
-            if getattr(self, name) < 1:
+        for name in ("period_updates", "period_s", "keep"):
+            if not getattr(self, name) >= 1:
                 raise ConfigError(f"checkpoint.{name}: got {getattr(self, name)}, want at least 1")
 
 

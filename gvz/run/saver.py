@@ -1,4 +1,4 @@
-"""The checkpoints of a run over its life: at their period, again after a failure, and the last one."""
+"""The checkpoints of a run over its life: at their periods, again after a failure, and the last one."""
 
 import time
 from collections.abc import Callable
@@ -40,15 +40,15 @@ class Saver:
         """Removes what a killed run was still writing.
 
         Args:
-            run, config: where checkpoints go, their period, and how many are kept.
+            run, config: where checkpoints go, their periods, and how many are kept.
             counts: of the run; `saved_updates` is kept here.
             take: gives the state of the run now.
             report: is told why a save failed, and the seconds until it is tried again.
         """
-        self._checkpoints, self._period_updates, self._counts = run.checkpoints, config.period_updates, counts
+        self._checkpoints, self._config, self._counts = run.checkpoints, config, counts
         self._checkpointer = Checkpointer(run.path, keep=config.keep)
         self._take, self._report = take, report
-        self._num_failed, self._retry_at_s = 0, 0.0
+        self._num_failed, self._retry_at_s, self._begun_at_s = 0, 0.0, time.monotonic()
         self.num_saved = counts.saved_updates
         """gradient steps of the newest whole checkpoint"""
 
@@ -63,17 +63,21 @@ class Saver:
         return self.busy or self._counts.saved_updates != self._counts.updates or self._num_failed > 0
 
     def save_when_due(self, group: Group) -> None:
-        """Begins a checkpoint at every multiple of the period, and again some time after one failed.
+        """Begins a checkpoint at every multiple of `period_updates`, `period_s` after the last one, and again some time
+        after one failed.
 
-        With other processes only when all do, and not again before the next multiple.
+        With other processes only at the multiples, and only when all do.
         """
         if self.busy:
             return
         self._hear()
-        counts, period = self._counts, self._period_updates
+        counts, period = self._counts, self._config.period_updates
         due = counts.updates // period > counts.saved_updates // period
-        alone = group.num_common_saved is None
-        if (due and group.may_save()) or (alone and self._num_failed and time.monotonic() > self._retry_at_s):
+        if group.num_common_saved is None and self._num_failed:
+            due = due or time.monotonic() > self._retry_at_s
+        elif group.num_common_saved is None and counts.updates > counts.saved_updates:
+            due = due or time.monotonic() > self._begun_at_s + self._config.period_s
+        if due and group.may_save():
             self._begin(group.num_common_saved)
 
     def save_last(self, group: Group, begun: Callable[[], None]) -> None:
@@ -115,6 +119,7 @@ class Saver:
         return self._hear()
 
     def _begin(self, keep_from: int | None) -> None:
+        self._begun_at_s = time.monotonic()
         self._counts.saved_updates = self._counts.updates
         self._checkpointer.save(self._counts.updates, *self._take(), keep_from=keep_from)
 

@@ -198,6 +198,7 @@ BAD = {
     "--agent.conv-channels 32 --agent.conv-kernels 8 4": "want one equal length",
     "--actors.num-actors 1 --actors.games-per-actor 2": "every task needs a game: want at least 4",
     "--checkpoint.keep 0": "checkpoint.keep: got 0",
+    "--checkpoint.period-s nan": "checkpoint.period_s: got nan",
     "--log.period-updates 0": "log.period_updates: got 0",
     "--env.action-set unified_v2": "unified_v1",
     "--env.action-set multi_discrete_v1": "env.action_set: got multi_discrete_v1, want unified_v1",

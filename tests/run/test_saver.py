@@ -1,5 +1,6 @@
-"""The checkpoints of a run over its life: which stay when one of several processes ends alone."""
+"""The checkpoints of a run over its life: when they are written, and which stay."""
 
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,11 +15,39 @@ from gvz.run.saver import Saver, Snapshot
 STATE = {"w": np.zeros(2, np.float32)}
 
 
-def started(path: Path, num_updates: int) -> tuple[Saver, Counts]:
+ALONE: Any = SimpleNamespace(num_common_saved=None, may_save=lambda: True)
+
+
+def started(path: Path, num_updates: int, period_s: float = 900.0) -> tuple[Saver, Counts]:
     counts = Counts(updates=num_updates, saved_updates=num_updates)
     run: Any = SimpleNamespace(path=path, checkpoints=path / "checkpoints")
     snapshot = Snapshot(STATE, STATE, {})
-    return Saver(run, CheckpointConfig(period_updates=1000, keep=2), counts, lambda: snapshot, lambda *_: None), counts
+    config = CheckpointConfig(period_updates=1000, period_s=period_s, keep=2)
+    return Saver(run, config, counts, lambda: snapshot, lambda *_: None), counts
+
+
+def test_a_slow_run_is_saved_after_a_time_and_still_at_the_multiples(tmp_path, monkeypatch):
+    now_s = 0.0
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    saver, counts = started(tmp_path, 0)
+    several: Any = SimpleNamespace(num_common_saved=0, may_save=lambda: True)
+    saved = []
+    for now_s, num_updates, group in (
+        (901, 0, ALONE),  # its warm-up
+        (902, 3, several),  # processes have clocks of their own, so they agree on gradient steps alone
+        (903, 3, ALONE),
+        (1000, 60, ALONE),
+        (1804, 700, ALONE),
+        (1805, 1001, ALONE),  # a multiple of the period in gradient steps
+        (2704, 1500, ALONE),
+        (2706, 1500, ALONE),
+    ):
+        counts.updates = num_updates
+        saver.save_when_due(group)
+        saver.wait()
+        if (newest := max(saved_steps(tmp_path / "checkpoints"), default=0)) not in saved:
+            saved.append(newest)
+    assert saved == [0, 3, 700, 1001, 1500]
 
 
 def test_last_checkpoints_of_a_process_that_ends_alone_leave_the_one_that_all_have(tmp_path):
@@ -35,7 +64,6 @@ def test_last_checkpoints_of_a_process_that_ends_alone_leave_the_one_that_all_ha
         assert 2000 in saved_steps(tmp_path / "checkpoints")
         saver, counts = started(tmp_path, 2000)
         group.num_common_saved = 0  # until the processes have agreed on a step
-    alone: Any = SimpleNamespace(num_common_saved=None)
     counts.updates = 2300
-    saver.save_last(alone, lambda: None)
+    saver.save_last(ALONE, lambda: None)
     assert saved_steps(tmp_path / "checkpoints") == [2200, 2300]
