@@ -27,12 +27,12 @@ def started(path: Path, num_updates: int, period_s: float = 900.0) -> tuple[Save
 
 
 def test_a_slow_run_is_saved_after_a_time_and_still_at_the_multiples(tmp_path, monkeypatch):
-    now_s = 0.0
-    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    now_s = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
     saver, counts = started(tmp_path, 0)
     several: Any = SimpleNamespace(num_common_saved=0, may_save=lambda: True)
     saved = []
-    for now_s, num_updates, group in (
+    for at_s, num_updates, group in (
         (901, 0, ALONE),  # its warm-up
         (902, 3, several),  # processes have clocks of their own, so they agree on gradient steps alone
         (903, 3, ALONE),
@@ -42,7 +42,7 @@ def test_a_slow_run_is_saved_after_a_time_and_still_at_the_multiples(tmp_path, m
         (2704, 1500, ALONE),
         (2706, 1500, ALONE),
     ):
-        counts.updates = num_updates
+        now_s[0], counts.updates = at_s, num_updates
         saver.save_when_due(group)
         saver.wait()
         if (newest := max(saved_steps(tmp_path / "checkpoints"), default=0)) not in saved:
