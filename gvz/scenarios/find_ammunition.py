@@ -19,15 +19,13 @@ Source: thesis 6.2.1, its second idea for a scenario. Differs: wrong ammunition 
 """
 
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Variety, words
-from gvz.scenarios.find_the_key import ROOM_SPOTS, draw_rooms_of_spots
+from gvz.scenarios.find_the_key import MAZE, ROOM_SPOTS, draw_rooms_of_spots
 from gvz.scenarios.health_gathering import OBSTACLES
-from gvz.scenarios.parts import ACS_APART, ACS_NEAR, RESIZED, retextured, starts_at, things_at
+from gvz.scenarios.parts import ACS_APART, ACS_NEAR, GLOWING_ENEMIES, RESIZED_ENEMIES, retextured, starts_at
 from gvz.scenarios.rewards import Pace, Reward, Rose, death, living
-from gvz.scenarios.seek_and_kill import SPOTS as MAZE_SPOTS
 from gvz.scenarios.seek_and_kill import drain_acid
 
 WAD = "health_gathering.wad"
-MAZE_WAD = "health_gathering_supreme.wad"
 
 SCRIPT = (
     """\
@@ -264,20 +262,8 @@ SCENARIO = Scenario(
         draw_layout=draw_rooms_of_spots,
     ),
     attributes=(
-        Attribute(
-            name="maze",
-            groups=("map",),
-            content=Content(
-                base_wad=MAZE_WAD,
-                things={MAZE_WAD: starts_at(MAZE_SPOTS, 22)},
-                parameters={"last_spot": 29, "scatter": 16.0},
-            ),
-        ),
-        Attribute(
-            name="obstacles",
-            groups=("decorations",),
-            content=Content(things={wad: things_at(places) for wad, places in OBSTACLES.items()}),
-        ),
+        MAZE,
+        OBSTACLES,
         retextured("metal", "AQSECT09", "FLAT19", "AQF052"),
         retextured("stone_wall", "FLAT5_7", "FLOOR1_6", "CEIL3_3"),
         Attribute(
@@ -285,13 +271,8 @@ SCENARIO = Scenario(
             groups=("entity_type",),
             content=Content(parameters={"classes": ("DoomImp",)}, actors=HARMLESS_TO_IMPS),
         ),
-        Attribute(name="resized_enemies", groups=("entity_size",), aliases=("resized",), content=RESIZED),
-        Attribute(
-            name="glowing_enemies",
-            groups=("entity_rendering",),
-            aliases=("glowing",),
-            content=Content(entity={"RenderStyle": "STYLE_Add"}),
-        ),
+        RESIZED_ENEMIES,
+        GLOWING_ENEMIES,
         Attribute(
             name="fast_enemies", groups=("entity_speed",), aliases=("fast",), content=Content(entity={"Speed": 8.0})
         ),

@@ -27,7 +27,7 @@ import random
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
 from gvz.scenarios.health_gathering import OBSTACLES, draw_hall
 from gvz.scenarios.layout import Layout
-from gvz.scenarios.parts import ACS_APART, ACS_NEAR, retextured, starts_at, things_at
+from gvz.scenarios.parts import ACS_APART, ACS_NEAR, SHORT_AGENT, retextured, starts_at
 from gvz.scenarios.rewards import Pace, Reward, Rose, death, living
 from gvz.scenarios.seek_and_kill import SPOTS as MAZE_SPOTS
 from gvz.scenarios.seek_and_kill import drain_acid
@@ -181,6 +181,15 @@ SOON = (Pace(tics=20, times=2), Pace(tics=60))
 
 ROOM_SPOTS = tuple((x, y) for y in range(128, 1217, 240) for x in range(128, 1217, 240))
 """five rows of five places"""
+MAZE = Attribute(
+    name="maze",
+    groups=("map",),
+    content=Content(
+        base_wad=MAZE_WAD,
+        things={MAZE_WAD: starts_at(MAZE_SPOTS, 22)},
+        parameters={"last_spot": 29, "scatter": 16.0},
+    ),
+)
 
 
 def draw_rooms_of_spots(rng: random.Random, strength: float) -> Layout:
@@ -218,20 +227,8 @@ SCENARIO = Scenario(
         entities=("BlueCard",), entity_parameters=("key",), max_decorations=16, draw_layout=draw_rooms_of_spots
     ),
     attributes=(
-        Attribute(
-            name="maze",
-            groups=("map",),
-            content=Content(
-                base_wad=MAZE_WAD,
-                things={MAZE_WAD: starts_at(MAZE_SPOTS, 22)},
-                parameters={"last_spot": 29, "scatter": 16.0},
-            ),
-        ),
-        Attribute(
-            name="obstacles",
-            groups=("decorations",),
-            content=Content(things={wad: things_at(places) for wad, places in OBSTACLES.items()}),
-        ),
+        MAZE,
+        OBSTACLES,
         retextured("moss", "A-MOSBRI", "FLOOR4_6", "CEIL5_1"),
         retextured("metal", "AQSECT09", "FLAT19", "AQF052"),
         retextured("bricks", "BRICK12", "CRATOP1", "CRATOP1"),
@@ -247,11 +244,7 @@ SCENARIO = Scenario(
             aliases=("glowing",),
             content=Content(entity={"RenderStyle": "STYLE_Add"}),
         ),
-        Attribute(
-            name="short_agent",
-            groups=("agent_height",),
-            content=Content(agent={"ViewHeight": Uniform(0.0, 100.0)}),
-        ),
+        SHORT_AGENT,
         Attribute(
             name="decoys",
             groups=("decoys",),

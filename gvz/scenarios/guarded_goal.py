@@ -21,8 +21,8 @@ Source: thesis 6.2.1, its last idea for a scenario, with its small rewards for k
 
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
 from gvz.scenarios.find_the_key import ROOM_SPOTS, draw_rooms_of_spots
-from gvz.scenarios.health_gathering import OBSTACLES
-from gvz.scenarios.parts import ACS_NEAR, retextured, starts_at, things_at
+from gvz.scenarios.health_gathering import COLUMNS
+from gvz.scenarios.parts import ACS_NEAR, SHORT_AGENT, retextured, starts_at, things_at
 from gvz.scenarios.rewards import Fell, Pace, Reward, Rose, death
 from gvz.scenarios.seek_and_kill import drain_acid
 
@@ -222,7 +222,7 @@ SCENARIO = Scenario(
         entities=("DoomImp",), entity_parameters=("guard",), max_decorations=16, draw_layout=draw_rooms_of_spots
     ),
     attributes=(
-        Attribute(name="obstacles", groups=("decorations",), content=Content(things={WAD: things_at(OBSTACLES[WAD])})),
+        Attribute(name="obstacles", groups=("decorations",), content=Content(things={WAD: things_at(COLUMNS[WAD])})),
         retextured("moss", "A-MOSBRI", "FLOOR4_6", "CEIL5_1"),
         retextured("city", "SKY2", "ROCKRED1", "CEIL4_1"),
         retextured("bricks", "BRICK12", "CRATOP1", "CRATOP1"),
@@ -235,9 +235,7 @@ SCENARIO = Scenario(
         Attribute(
             name="shadows", groups=("entity_rendering",), content=Content(entity={"RenderStyle": "STYLE_Shadow"})
         ),
-        Attribute(
-            name="short_agent", groups=("agent_height",), content=Content(agent={"ViewHeight": Uniform(0.0, 100.0)})
-        ),
+        SHORT_AGENT,
         Attribute(name="traps", groups=("traps",), content=Content(parameters={"num_traps": 2})),
     ),
     complete=words("obstacles city knights resized_guards shadows short_agent traps"),

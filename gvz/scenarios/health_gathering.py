@@ -162,7 +162,7 @@ STARTS = (
 )
 """our choice, as the thesis only says "several"; at least 130 units from each other and from every obstacle"""
 
-OBSTACLES = {
+COLUMNS = {
     WAD: {
         30: ((928, 864), (288, 608), (352, 1056), (992, 352), (672, 96), (96, 480)),
         32: ((352, 352), (160, 928), (736, 288), (1056, 736), (352, 864), (736, 992), (1056, 1056)),
@@ -175,6 +175,11 @@ OBSTACLES = {
     },
 }
 """base map -> editor number (green column, red column, heart column) -> places"""
+OBSTACLES = Attribute(
+    name="obstacles",
+    groups=("decorations",),
+    content=Content(things={wad: things_at(places) for wad, places in COLUMNS.items()}),
+)
 
 
 def draw_hall(rng: random.Random, strength: float) -> Layout:
@@ -242,11 +247,7 @@ SCENARIO = Scenario(
                 actors=_health("CustomMedikit", "MEDI A -1\n    Stop", 20),
             ),
         ),
-        Attribute(
-            name="obstacles",
-            groups=("decorations",),
-            content=Content(things={wad: things_at(places) for wad, places in OBSTACLES.items()}),
-        ),
+        OBSTACLES,
         retextured("slime", "A-CAMO3", "SLIME04", "GRASS2"),
         retextured("lava", "AQCONC14", "LAVA1", "CEIL1_1"),
         retextured("water", "AQSECT09", "FWATER1", "AQF052"),

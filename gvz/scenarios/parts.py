@@ -7,6 +7,16 @@ from gvz.scenarios.layout import MAP_SPOT
 
 RESIZED = Content(entity={"ScaleX": Uniform(0.3, 3.0), "ScaleY": Uniform(0.3, 3.0)})
 """enemies or kits of any width and height"""
+RESIZED_ENEMIES = Attribute(name="resized_enemies", groups=("entity_size",), aliases=("resized",), content=RESIZED)
+GLOWING_ENEMIES = Attribute(
+    name="glowing_enemies",
+    groups=("entity_rendering",),
+    aliases=("glowing",),
+    content=Content(entity={"RenderStyle": "STYLE_Add"}),
+)
+SHORT_AGENT = Attribute(
+    name="short_agent", groups=("agent_height",), content=Content(agent={"ViewHeight": Uniform(0.0, 100.0)})
+)
 COUNTED_MARINE = {"MarineChainsawVzd": "ACTOR MarineChainsawVzd : MarineChainsaw\n{\n  +COUNTKILL\n}\n"}
 """class name -> definition: a marine with a chainsaw whose death counts as a kill"""
 

@@ -20,10 +20,19 @@ Known: enemies that die together with the agent, or by each other, count for KIL
     barrels let enemies kill each other: fireballs and charging souls burst them, too.
 """
 
-from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
+from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Variety, words
 from gvz.scenarios.find_the_key import ROOM_SPOTS, draw_rooms_of_spots
-from gvz.scenarios.health_gathering import OBSTACLES
-from gvz.scenarios.parts import ACS_APART, ACS_NEAR, RESIZED, retextured, starts_at, things_at
+from gvz.scenarios.health_gathering import COLUMNS
+from gvz.scenarios.parts import (
+    ACS_APART,
+    ACS_NEAR,
+    GLOWING_ENEMIES,
+    RESIZED_ENEMIES,
+    SHORT_AGENT,
+    retextured,
+    starts_at,
+    things_at,
+)
 from gvz.scenarios.rewards import Fell, Gained, Pace, Reward, death
 from gvz.scenarios.seek_and_kill import drain_acid
 
@@ -33,7 +42,7 @@ NUM_SQUADS, SQUAD_SIZE = 15, 3
 KILLS = (Pace(tics=70, times=1, amount=7), Pace(tics=70, times=13, amount=SQUAD_SIZE))
 """First those that have gathered die at once, then the squads as they come."""
 
-BARRELS = {2035: tuple(place for places in OBSTACLES[WAD].values() for place in places)}
+BARRELS = {2035: tuple(place for places in COLUMNS[WAD].values() for place in places)}
 """editor number of an exploding barrel -> places, where `obstacles` has columns"""
 
 SCRIPT = (
@@ -145,7 +154,7 @@ SCENARIO = Scenario(
         retextured("blue", "FIREBLU2", "FLAT14", "CEIL4_3"),
         retextured("slime", "A-CAMO3", "SLIME04", "GRASS2"),
         retextured("stone_wall", "FLAT5_7", "FLOOR1_6", "CEIL3_3"),
-        Attribute(name="obstacles", groups=("decorations",), content=Content(things={WAD: things_at(OBSTACLES[WAD])})),
+        Attribute(name="obstacles", groups=("decorations",), content=Content(things={WAD: things_at(COLUMNS[WAD])})),
         Attribute(name="barrels", groups=("decorations",), content=Content(things={WAD: things_at(BARRELS)})),
         Attribute(name="hell_knights", groups=("entity_type",), content=Content(parameters={"enemy": '"HellKnight"'})),
         Attribute(
@@ -154,24 +163,15 @@ SCENARIO = Scenario(
             aliases=("flying",),
             content=Content(parameters={"enemy": '"PeacefulSoul"'}, actors=PEACEFUL_SOUL),
         ),
-        Attribute(name="resized_enemies", groups=("entity_size",), aliases=("resized",), content=RESIZED),
-        Attribute(
-            name="glowing_enemies",
-            groups=("entity_rendering",),
-            aliases=("glowing",),
-            content=Content(entity={"RenderStyle": "STYLE_Add"}),
-        ),
+        RESIZED_ENEMIES,
+        GLOWING_ENEMIES,
         Attribute(
             name="fast_enemies",
             groups=("entity_speed",),
             aliases=("fast",),
             content=Content(entity={"Speed": 15.0}),
         ),
-        Attribute(
-            name="short_agent",
-            groups=("agent_height",),
-            content=Content(agent={"ViewHeight": Uniform(0.0, 100.0)}),
-        ),
+        SHORT_AGENT,
     ),
     complete=words("slime barrels hell_knights resized_enemies glowing_enemies fast_enemies short_agent"),
     tasks=words(
