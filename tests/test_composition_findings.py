@@ -1,5 +1,6 @@
 """What the findings say of training on compositions of attributes is what its records give."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +111,12 @@ def test_the_findings_say_what_further_seeds_of_compositions_gave_with_more_time
     percent, interval = on_test.split(" ", 1)
     readme = " ".join((ROOT / "README.md").read_text().split())
     assert f"for 45 minutes, they have {percent}% {interval} (three seeds); " in readme
+    guide = " ".join((ROOT / "docs" / "how-to" / "train.md").read_text().split())
+    assert f"Such agents have {percent}% of the bound on the 28 test tasks." in guide
+    for folder, words in (("general_short", "after 15 minutes"), ("general", "after 90.")):
+        rows = results_of(folder).episodes
+        eight = {name: agent_scores(rows.filter(scenario=name), "rainbow_segmented") for name in scenarios()}
+        assert re.search(rf"\[{means(eight)[2].split()[0]}%\]\([^)]*\) {words}", guide)
 
 
 def test_the_pages_say_how_near_the_test_tasks_are_to_compositions():

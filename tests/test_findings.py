@@ -244,7 +244,7 @@ def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
     assert len(named) > 10
     of_average = {gain_of_average(agent, name)[0] for agent in RUNS for name in SCENARIOS}
     assert named <= gains | {*of_segmented, of_network} | of_training_sets | of_average
-    assert f"game variables | {' | '.join(of_segmented)} | no: `rainbow_segmented` |" in summary
+    assert f"game variables | {' | '.join(of_segmented)} | in `rainbow_segmented` |" in summary
 
 
 def test_the_findings_say_how_far_apart_two_seeds_of_one_agent_lie():

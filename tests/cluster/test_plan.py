@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -131,6 +132,18 @@ def test_the_command_prints_the_plan_and_where_its_constants_are_from(capsys):
     assert RECORDED.source in out
     assert row["costs"]["source"] == RECORDED.source
     assert row["limits"]["actors"] == pytest.approx(64 / (RECORDED.decision_s + RECORDED.pack_s))
+
+
+def test_the_page_says_how_far_hosts_go(capsys):
+    page = (ROOT / "docs" / "CLUSTER.md").read_text()
+    rows = re.findall(r"^\| (\d+) \| (yes|no) \| (.*) \|$", page, flags=re.MULTILINE)
+    assert len(rows) == 5
+    for hosts, plain, cells in rows:
+        flags = ["--no-compress"] if plain == "yes" else []
+        assert cli.main(["cluster", "plan", "--hosts", hosts, "--cores", "16", "--json", *flags]) == 0
+        found = json.loads(capsys.readouterr().out)
+        rates = f"{found['limits'][found['first']]:,.0f} | {found['updates_per_s']:,.0f}"
+        assert cells == f"{rates} | {found['records_gbit_per_s']:.2f} | {found['first']}"
 
 
 def test_actors_of_a_plan_act_by_themselves_as_those_of_hosts_have_to(capsys, monkeypatch):
