@@ -99,6 +99,24 @@ def test_the_page_says_what_a_player_without_sight_reaches():
         assert told in page, told
 
 
+def test_the_page_says_how_many_sergeants_died_by_other_hands():
+    page, told = " ".join((PAGE.parent / "EXTENDED.md").read_text().split()), {}
+    for (player, task), rows in read_reference(RECORDS / "guarded_goal").items():
+        told[player, task] = tuple(int(sum(row[name] for row in rows)) for name in ("kills", "player_kills"))
+        if "sergeants" not in task:
+            cut = [row["length_frames"] == 1050 for row in rows if row["kills"] != row["player_kills"]]
+            assert all(cut), "only the last tic's death is not counted yet"
+            assert told[player, task][0] - told[player, task][1] == len(cut), "one of each"
+    random, sweep, scripted, idle = (
+        told[player, "guarded_goal/sergeants"] for player in ("random", "sweep", "scripted", "idle")
+    )
+    assert idle == (1, 0)
+    assert (
+        f"{random[0]} guards died of which random play killed {random[1]}, {sweep[0]} of which the sweep killed "
+        f"{sweep[1]}, and {scripted[0]} of which the script killed {scripted[1]}."
+    ) in page
+
+
 def test_the_page_says_where_the_thesis_is_beside_the_sweep():
     published = experiment_named("training_set_size").published["thesis"]
     above = [

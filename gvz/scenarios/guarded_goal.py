@@ -14,7 +14,9 @@ Termination: the agent dies. Truncation: after 1050 tics.
 Metric: goals reached; a score is at most 14. An agent that knows where the goals are, turns and walks at full speed
     from the first tic and is stopped by nobody reaches 13.9 on average (a simulation).
 Attributes: below. Those that no other scenario has: `traps` are two unguarded portals of another colour; each takes 35
-    of 100 health and vanishes. Profile levdoom is the same, since LevDoom has no such scenario.
+    of 100 health and vanishes. Pellets of `sergeants` hit other guards, too: a noise is enough, and two of the four
+    shoot the other two, while the agent does nothing. Missiles do not harm their own kind. `guard_killed` is of own
+    kills alone. Profile levdoom is the same, since LevDoom has no such scenario.
 Source: thesis 6.2.1, its last idea for a scenario, with its small rewards for kills and for coming closer. Differs: one
     goal follows another, so that a score is more than yes or no; not all guards have to die, so that haste has a price.
 """

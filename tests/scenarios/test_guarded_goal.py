@@ -125,6 +125,21 @@ def test_guards_shoot_at_an_agent_that_does_nothing_and_its_health_does_not_come
 
 
 @pytest.mark.engine
+@pytest.mark.parametrize(
+    ("name", "deaths"), [("default", 0), ("sergeants", 2), ("flying_guards", 0), ("knights+shadows", 0)]
+)
+def test_only_sergeants_kill_each_other_while_the_agent_does_nothing(start, name: str, deaths: int):
+    player = start(name)
+    for seed in range(3):
+        player.restart(seed)
+        player.step(tics=12)
+        player.command(903)  # nothing hurts the agent
+        player.step("ATTACK", 4)  # the noise wakes all of them
+        player.step(tics=600)
+        assert (player["KILLCOUNT"], player["PLAYER_KILLS"], player["GOALS"]) == (deaths, 0, 0), seed
+
+
+@pytest.mark.engine
 def test_a_trap_takes_35_health_and_vanishes(start):
     player = start("traps")
     player.step(tics=12)
