@@ -14,7 +14,8 @@ Termination: the agent dies. Truncation: after 1050 tics.
 Metric: goals reached; a score is at most 14. An agent that knows where the goals are, turns and walks at full speed
     from the first tic and is stopped by nobody reaches 13.9 on average (a simulation).
 Attributes: below. Those that no other scenario has: `traps` are two unguarded portals of another colour; each takes 35
-    of 100 health and vanishes. Pellets of `sergeants` hit other guards, too: a noise is enough, and two of the four
+    of 100 health, times the damage factor of the guards (70 with `sergeants`, 20 with `flying_guards`, 13 with
+    `knights`), and vanishes. Pellets of `sergeants` hit other guards, too: a noise is enough, and two of the four
     shoot the other two, while the agent does nothing. Missiles do not harm their own kind. `guard_killed` is of own
     kills alone. Profile levdoom is the same, since LevDoom has no such scenario.
 Source: thesis 6.2.1, its last idea for a scenario, with its small rewards for kills and for coming closer. Differs: one
@@ -273,8 +274,8 @@ SCENARIO = Scenario(
             event=Rose("PLAYER_KILLS"), weight=0.2, levdoom=0.2, paces=(Pace(tics=13, times=4), Pace(tics=18))
         ),
         "nearer": Reward(event=Rose("STEPS_NEARER"), weight=0.05, levdoom=0.05, paces=(Pace(tics=8),)),
-        # The third trap kills.
-        "trapped": Reward(event=Rose("POISONS_TAKEN"), weight=-0.5, levdoom=-0.5, paces=(Pace(tics=4, times=3),)),
+        # The agent's damage factor counts for traps, too: the third kills, but with `knights` only the eighth.
+        "trapped": Reward(event=Rose("POISONS_TAKEN"), weight=-0.5, levdoom=-0.5, paces=(Pace(tics=4, times=8),)),
         "health_lost": Reward(event=Fell("HEALTH"), weight=-0.05, levdoom=-0.05, paces=(Pace(tics=4, times=30),)),
         "ammo_spent": Reward(event=Fell("AMMO2"), weight=-0.01, levdoom=-0.01, paces=(Pace(tics=13, times=200),)),
         "death": Reward(event=death, weight=-1.0, levdoom=-1.0, paces=(Pace(times=1),)),

@@ -140,15 +140,33 @@ def test_only_sergeants_kill_each_other_while_the_agent_does_nothing(start, name
 
 
 @pytest.mark.engine
-def test_a_trap_takes_35_health_and_vanishes(start):
-    player = start("traps")
+@pytest.mark.parametrize(
+    ("name", "damage"), [("traps", 35), ("sergeants+traps", 70), ("flying_guards+traps", 20), ("complete", 13)]
+)
+def test_traps_take_35_health_times_the_guards_damage_factor_and_vanish(start, name: str, damage: int):
+    player, taken = start(name), 0
     player.step(tics=12)
-    for taken in (1, 2):
-        health = player["HEALTH"]
-        warp(player, *places(player, "Trap")[0])
+    while not player.game.is_player_dead():
+        assert (player["HEALTH"], player["POISONS_TAKEN"]) == (100 - taken * damage, taken)
+        assert player["GOALS"] == taken // 2
+        for guard in range(FIRST_GUARD, FIRST_GUARD + 4):
+            player.command(901, guard, 0)  # so that only traps hurt
+        traps = places(player, "Trap")
+        assert len(traps) == 2 - taken % 2
+        warp(player, *traps[0])
         player.step(tics=2)
-        assert (player["POISONS_TAKEN"], player["GOALS"], player["HEALTH"]) == (taken, 0, health - 35)
-        assert len(places(player, "Trap")) == 2 - taken
+        taken += 1
+        if taken % 2 == 0 and not player.game.is_player_dead():  # two others stand round the next goal
+            warp(player, *places(player, "Goal")[0])
+            player.step(tics=3)
+    assert taken == math.ceil(100 / damage)
+
+
+def test_the_reward_of_traps_expects_as_many_as_an_agent_can_take():
+    scenario = scenario_named("guarded_goal")
+    factors = [attribute.content.agent.get("DamageFactor", 1.0) for attribute in scenario.attributes]
+    (pace,) = scenario.rewards["trapped"].paces
+    assert pace.times == max(math.ceil(100 / int(35 * factor - 0.01)) for factor in factors)
 
 
 @pytest.mark.engine

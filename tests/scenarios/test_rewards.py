@@ -234,7 +234,7 @@ FILLED_SHARES = {
     "dodge_projectiles": (0.45, 0.1),
     "find_ammunition": (0.2, 0.15),
     "find_the_key": (0.2, 0.15),
-    "guarded_goal": (0.2, 0.15),
+    "guarded_goal": (0.15, 0.15),
     "rockets": (0.3, 0.5),
 }
 """How much of v_min and of v_max the three players reach, at least, in profile thesis at frame skip 4.
