@@ -1,12 +1,13 @@
 """What a user gives to a vector environment, checked."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Discrete, MultiDiscrete
 from gymnasium.vector import AutoresetMode
 
-from gvz.core.env_config import given_episode_seed, typed
+from gvz.core.env_config import as_integer, given_episode_seed, typed
 from gvz.core.errors import ConfigError
 from gvz.scenarios.base import Task
 from gvz.tasks import id_for_processes
@@ -80,19 +81,26 @@ def action_numbers(actions: np.ndarray, games: np.ndarray, space: Discrete | Mul
     return actions.tolist()
 
 
-def seeds(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:
-    """The seed of each game: seed + i, or seed[i].
+def seeds(seed: Any, num_envs: int) -> list[int | None]:
+    """The seed of each game: seed + i, or seed[i], which may be None.
 
     Raises:
-        ValueError: not one seed for each game.
+        ValueError: not one seed for each game, or one that is no integer from 0 on.
     """
     if seed is None:
         return [None] * num_envs
-    if isinstance(seed, int | np.integer):
-        return [int(seed) + game for game in range(num_envs)]
-    if len(seed) != num_envs:
-        raise ValueError(f"reset: got {len(seed)} seeds, want {num_envs}, one for each game")
-    return list(seed)
+    if (first := as_integer(seed)) >= 0:
+        return [first + game for game in range(num_envs)]
+    try:
+        given: list[object] = list(seed)
+    except TypeError:
+        raise ValueError(f"reset: seed: got {seed!r}, want an integer, 0 or more, or one for each game") from None
+    if len(given) != num_envs:
+        raise ValueError(f"reset: got {len(given)} seeds, want {num_envs}, one for each game")
+    for game, one in enumerate(given):
+        if one is not None and as_integer(one) < 0:
+            raise ValueError(f"reset: seed of game {game}: got {one!r}, want an integer, 0 or more")
+    return [None if one is None else as_integer(one) for one in given]
 
 
 def reset_options(options: dict[str, object] | None, num_envs: int) -> tuple[int | None, np.ndarray]:

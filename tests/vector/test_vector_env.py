@@ -157,8 +157,23 @@ def test_calls_out_of_turn_are_errors_and_change_nothing(envs: DoomVectorEnv):
     ):
         with pytest.raises(ValueError, match=message):
             envs.reset(options=options)
-    with pytest.raises(ValueError, match="reset: got 2 seeds, want 3, one for each game"):
-        envs.reset(seed=[1, 2])
+    for seed, message in (
+        ([1, 2], "reset: got 2 seeds, want 3, one for each game"),
+        ([7, 8, -1], "reset: seed of game 2: got -1, want an integer, 0 or more"),
+        ([7, 8.0, None], r"reset: seed of game 1: got 8\.0, want an integer"),
+        (np.array([0.0, 1.0, 2.0]), r"reset: seed of game 0: got .*0\.0.*, want an integer"),
+        (1.0, r"reset: seed: got 1\.0, want an integer, 0 or more, or one for each game"),
+        (-1, "reset: seed: got -1, want an integer, 0 or more, or one for each game"),
+        ("one", "reset: seed of game 0: got 'o', want an integer"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            envs.reset(seed=seed)
+    assert envs.num_playing == 1, "what is on its way is still there"
+    drawn = envs.reset()[1]["episode_seed"].tolist()
+    envs.reset(seed=1)
+    assert envs.reset()[1]["episode_seed"].tolist() == drawn, "no game was seeded"
+    firsts = [envs.reset(seed=seed)[1]["episode_seed"].tolist() for seed in (5, [5, 6, 7], np.array([5, 6, 7]))]
+    assert firsts[0] == firsts[1] == firsts[2] == envs.reset(seed=np.int64(5))[1]["episode_seed"].tolist()
     _, infos = envs.reset(seed=1)
     assert infos["episode_frames"].tolist() == [0, 0, 0]
 
