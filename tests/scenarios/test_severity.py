@@ -1,5 +1,7 @@
 """Graded attributes: ids, what an engine shows at a severity, and how often whole attributes are in force."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -7,9 +9,10 @@ import gvz
 from gvz.core.errors import TaskError
 from gvz.evaluation.gallery import task_frame
 from gvz.evaluation.play import episode_seed
+from gvz.scenarios.base import Task
 from gvz.scenarios.compiler import compile_task, map_source, task_content
 from gvz.scenarios.severity import in_force
-from gvz.tasks import all_scenarios, parse_task
+from gvz.tasks import all_scenarios, parse_task, scenarios
 from gvz.wad.textures import blended
 from tests.scenarios.conftest import bad_lines
 
@@ -71,6 +74,18 @@ def test_no_two_maps_of_a_task_need_different_classes_of_one_name(scenario):
                 task_content(one, profile).actors for one in (task, parse_task(f"{scenario.id}/default"))
             )
             assert all(with_it[name] == text for name, text in without.items())
+
+
+@pytest.mark.parametrize("scenario", scenarios().values(), ids=lambda scenario: scenario.id)
+def test_a_graded_name_has_no_exception_of_profile_levdoom(scenario):
+    plain = dataclasses.replace(scenario, levdoom_tasks={})
+    for name in scenario.levdoom_tasks:
+        whole = parse_task(f"{scenario.id}/{name}")
+        graded = Task(scenario, whole.attributes, severities=tuple((one, 0.999) for one in whole.attributes))
+        for task in (whole, graded):
+            without = dataclasses.replace(task, scenario=plain)
+            is_plain = task_content(task, "levdoom") == task_content(without, "levdoom")
+            assert is_plain == bool(task.severities), task.id
 
 
 def test_a_blend_lies_where_both_textures_lie():
