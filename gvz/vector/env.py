@@ -111,6 +111,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         self.single_observation_space, self.single_action_space = first.observation_space, first.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._action_masks = np.array([envs[ids[game % len(ids)]].action_masks() for game in range(self.num_envs)])
         self._config, self._copy = first.config, copy
         self._rngs: list[np.random.Generator | None] = [None] * self.num_envs
         self._next_seeds: list[int | None] = [None] * self.num_envs  # drawn, and not used by an episode yet
@@ -262,6 +263,10 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             raise ResetNeeded(f"render: games {lost} have rendered nothing since their worker died; play on, or reset")
         shape = (self._config.render_height, self._config.render_width, 3)
         return tuple(np.frombuffer(screens[game], np.uint8).reshape(shape).copy() for game in games.tolist())
+
+    def action_masks(self) -> np.ndarray:
+        """bool[N, A]: the actions that each game's task allows, as `DoomEnv.action_masks` has them."""
+        return self._action_masks.copy()
 
     def close_extras(self, **kwargs: Any) -> None:
         """Ends workers and engines; `close` calls it."""

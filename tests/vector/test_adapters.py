@@ -22,6 +22,16 @@ class FakeVecEnv:
     def _reset_seeds(self) -> None:
         self._seeds = [None] * self.num_envs
 
+    def _get_indices(self, indices: int | list[int] | None) -> list[int]:
+        return list(range(self.num_envs)) if indices is None else [indices] if isinstance(indices, int) else indices
+
+    def has_attr(self, attr_name: str) -> bool:
+        try:
+            self.get_attr(attr_name)
+        except AttributeError:
+            return False
+        return True
+
 
 @pytest.fixture
 def sb3_vec_env(monkeypatch):
@@ -50,6 +60,24 @@ def test_an_episode_of_stable_baselines3_ends_with_its_own_score(sb3_vec_env):
                 ended += 1
             before[game] = 0.0 if over[game] else info["score"]
     assert envs.get_images() == [None, None]
+    envs.close()
+
+
+@pytest.mark.parametrize("action_set", ["unified_v1", "multi_discrete_v1"])
+def test_sb3_contrib_is_told_which_actions_each_game_allows(sb3_vec_env, action_set):
+    """Its `is_masking_supported` and `get_action_masks` ask so."""
+    tasks = ["defend_the_center/default", "health_gathering/default"]
+    envs = sb3_vec_env(gvz.make_vec(tasks, 3, autoreset_mode="SameStep", action_set=action_set))
+    assert envs.has_attr("action_masks")
+    assert not envs.has_attr("no_such_thing")
+    alone = [gvz.make(task, action_set=action_set).action_masks() for task in (*tasks, tasks[0])]
+    masks = np.stack(envs.env_method("action_masks"))
+    assert masks.dtype == bool
+    np.testing.assert_array_equal(masks, alone)
+    np.testing.assert_array_equal(envs.env_method("action_masks", indices=[1]), alone[1:2])
+    assert (masks[0] != masks[1]).any()
+    with pytest.raises(NotImplementedError, match="'reset' cannot be called"):
+        envs.env_method("reset")
     envs.close()
 
 

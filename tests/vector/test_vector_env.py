@@ -253,6 +253,16 @@ def test_wrong_arguments_are_refused_before_a_process_starts(arguments: tuple, e
         DoomVectorEnv(*positional, **options)
 
 
+def test_each_game_has_the_mask_of_its_own_task():
+    envs = gvz.make_vec(["defend_the_center/gore", "seek_and_kill/default"], 3, action_set="unified_v1")
+    masks = envs.action_masks()
+    for game, task in enumerate(envs.tasks):
+        np.testing.assert_array_equal(masks[game], gvz.make(task, action_set="unified_v1").action_masks())
+    masks[:] = False
+    assert envs.action_masks().any(axis=1).all(), "it is a copy"
+    envs.close()
+
+
 def test_infos_of_some_games_have_masks():
     batch = batch_infos([{"a": 1, "b": {"c": 0.5}, "final_obs": {"x": 1}}, None, {"a": 2, "d": "text", "b": {}}])
     assert_same(

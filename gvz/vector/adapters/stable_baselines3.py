@@ -75,8 +75,14 @@ class Sb3VecEnv(VecEnv):
         raise NotImplementedError("Sb3VecEnv: the games are in other processes; set it by an argument of gvz.make_vec")
 
     def env_method(self, method_name: str, *args: Any, indices: int | Sequence[int] | None = None, **kwargs: Any):
-        """Not possible: the games are in other processes."""
-        raise NotImplementedError(f"Sb3VecEnv: the games are in other processes; {method_name!r} cannot be called")
+        """`action_masks` of each game, bool[A], as sb3-contrib's MaskablePPO asks for it.
+
+        Raises:
+            NotImplementedError: another method; the games are in other processes.
+        """
+        if method_name != "action_masks":
+            raise NotImplementedError(f"Sb3VecEnv: the games are in other processes; {method_name!r} cannot be called")
+        return list(self.envs.action_masks()[list(self._get_indices(indices))])
 
     def env_is_wrapped(self, wrapper_class: type, indices: int | Sequence[int] | None = None) -> list[bool]:
         """False for each game: they have no wrappers."""
