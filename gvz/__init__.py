@@ -5,6 +5,7 @@ Tier 1. The modules beside this file belong to the benchmark, except the command
 `import gvz` registers every named task in Gymnasium: gymnasium.make("GViZDoom/DefendTheCenter-Gore-v0").
 """
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, overload
 
 from gvz.core.env_config import LABEL_CLASSES
@@ -37,9 +38,10 @@ def make(task: "str | Task | Sequence[str | Task]", **options: Any) -> "DoomEnv 
     """
     from gvz.env import DoomEnv  # here, so that `import gvz` is quick
     from gvz.multi_task import MultiTaskEnv
-    from gvz.scenarios.base import Task
 
-    return DoomEnv(task, **options) if isinstance(task, str | Task) else MultiTaskEnv(task, **options)
+    if isinstance(task, Iterable) and not isinstance(task, str):
+        return MultiTaskEnv(task, **options)
+    return DoomEnv(task, **options)
 
 
 def make_vec(

@@ -379,4 +379,4 @@ def _with_fields(config: EnvConfig, fields: Mapping[str, Any]) -> EnvConfig:
     known = [field.name for field in dataclasses.fields(EnvConfig)]
     if unknown := sorted(fields.keys() - set(known)):
         raise ConfigError(f"env: unknown options {unknown}, want some of {', '.join(known)}")
-    return dataclasses.replace(config, **fields)
+    return dataclasses.replace(typed(EnvConfig, config, "config"), **fields)

@@ -89,10 +89,11 @@ def id_for_processes(task: Task | str) -> str:
     """The task's id, by which other processes make it.
 
     Raises:
-        TaskError: they would make another task, because its scenario is not the one in gvz/scenarios.
+        TaskError: as `parse_task`; or they would make another task, because its scenario is not the one in
+            gvz/scenarios.
     """
-    if isinstance(task, str):
-        return task
+    if not isinstance(task, Task):
+        return parse_task(task).id
     known = all_scenarios().get(task.scenario.id)
     if task.scenario != known:
         raise TaskError(

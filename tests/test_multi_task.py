@@ -99,6 +99,9 @@ def test_bad_input_is_named():
         gvz.make(TASKS)
     with pytest.raises(ConfigError, match="want at least one, each once"):
         gvz.make([TASKS[0], TASKS[0]])
+    for no_task in (None, 3, [None]):
+        with pytest.raises(TaskError, match=r"task: got (None|3), want '<scenario>/<task>'"):
+            gvz.make(no_task)
     for number, message in ((0, "got 0, want at least 1"), (1.5, "got 1.5, want int")):
         with pytest.raises(ConfigError, match=f"max_engines: {message}"):
             gvz.make(TASKS, action_set="unified_v1", max_engines=number)

@@ -1,6 +1,6 @@
 """What a user gives to a vector environment, checked."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ def task_ids(tasks: Task | str | Sequence[Task | str]) -> list[str]:
     Raises:
         ConfigError: there is none. TaskError: as `id_for_processes`.
     """
-    several = [tasks] if isinstance(tasks, Task | str) else list(tasks)
+    several = list(tasks) if isinstance(tasks, Iterable) and not isinstance(tasks, str) else [tasks]
     if not several:
         raise ConfigError("make_vec: got no task, want at least one, for example 'defend_the_center/gore'")
     return [id_for_processes(task) for task in several]

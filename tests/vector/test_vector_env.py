@@ -231,6 +231,8 @@ def test_gymnasium_makes_it_by_the_tasks_id():
     ("arguments", "error", "message"),
     [
         (([],), ConfigError, "got no task, want at least one"),
+        ((None,), TaskError, "task: got None, want '<scenario>/<task>'"),
+        (([None],), TaskError, "task: got None, want '<scenario>/<task>'"),
         (("defend_the_center/gor", 2), TaskError, "did you mean"),
         (("defend_the_center/gore", 0), ConfigError, "got num_envs=0, want 1 or more"),
         (("defend_the_center/gore", 2, None, {"batch_size": 3}), ConfigError, "got batch_size=3, want 1..2"),
@@ -240,6 +242,11 @@ def test_gymnasium_makes_it_by_the_tasks_id():
         (("defend_the_center/gore", 2, None, {"copy": False, "batch_size": 1}), ConfigError, "batch_size=1, want 2"),
         (("defend_the_center/gore", 2, None, {"render_mode": "human"}), ConfigError, "want None or 'rgb_array'"),
         (("defend_the_center/gore", 2, None, {"frame_skp": 4}), ConfigError, "unknown options"),
+        (
+            ("defend_the_center/gore", 2, {"frame_skip": 4}),
+            ConfigError,
+            "config: got {'frame_skip': 4}, want EnvConfig",
+        ),
         (
             (("defend_the_center/default", "seek_and_kill/default"),),
             ConfigError,
