@@ -315,8 +315,8 @@ class Task:
             left out have severity 1; an attribute given with severity 0 is left out altogether.
 
     Raises:
-        TaskError: an unknown attribute, two of one group, a severity out of range, or an attribute that such drawn maps
-            cannot have.
+        TaskError: an unknown attribute, two of one group, a severity out of range or of an attribute that is not among
+            them, or an attribute that such drawn maps cannot have.
     """
 
     scenario: Scenario
@@ -326,9 +326,7 @@ class Task:
 
     def __post_init__(self) -> None:
         if self.maps is not None and self.scenario.variety is None:
-            raise TaskError(
-                f"scenario {self.scenario.id}: got {self.maps.name}, but the scenario has no variety; set it"
-            )
+            raise TaskError(f"{self.scenario.id}: got {self.maps.name}, but the scenario has no variety; set it")
         if self.maps is not None and self.maps.split != VARIED and self.attributes:
             raise TaskError(
                 f"{self.scenario.id}: got {self.maps.name} and {'+'.join(self.attributes)}, want one of them; "
@@ -350,6 +348,8 @@ class Task:
                 taken[group] = attribute.name
         severities = {self.scenario.attribute(name).name: float(value) for name, value in self.severities}
         for name, severity in severities.items():
+            if severity and name not in [one.name for one in found]:
+                raise TaskError(f"{self.scenario.id}: got {name}={severity:g}, want {name} among the attributes, too")
             if not 0 <= severity <= 1 or round(severity, 3) != severity:  # the name gives three decimals back
                 raise TaskError(
                     f"scenario {self.scenario.id}: got {name}={severity:g}, want a severity from 0 (as without it) to "

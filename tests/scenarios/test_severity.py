@@ -64,6 +64,15 @@ def test_a_wrong_severity_is_an_error_that_says_what_is_possible(text, message):
         parse_task(text)
 
 
+def test_a_severity_of_an_attribute_that_the_task_does_not_have_is_an_error():
+    scenario = scenarios()["defend_the_center"]
+    with pytest.raises(TaskError, match=r"got fast_enemies=0\.5, want fast_enemies among the attributes"):
+        Task(scenario, ("gore",), severities=(("fast", 0.5),))
+    assert Task(scenario, severities=(("fast", 0),)) == Task(scenario), "0 is as without it"
+    for one in (Task(scenario, ("gore",)), Task(scenario, ("gore", "fast"), severities=(("gore", 0.5), ("fast", 0)))):
+        assert dataclasses.replace(one, severities=one.severities) == one
+
+
 @pytest.mark.parametrize("scenario", all_scenarios().values(), ids=lambda scenario: scenario.id)
 def test_no_two_maps_of_a_task_need_different_classes_of_one_name(scenario):
     """The task's file holds the classes of all maps of its episodes."""
