@@ -320,13 +320,6 @@ def a_run(small, tmp_path):
     return shutil.copytree(source, tmp_path / "run")
 
 
-def test_training_scores_of_older_records_count_up_to_the_bound(a_run):
-    file = a_run / "episodes.jsonl"
-    file.write_text(file.read_text().replace('"normalized_score": 100.0', '"normalized_score": 190.0'))
-    (run,) = read_results([a_run]).runs
-    assert run.training_episodes["normalized_score"].max() == 100.0
-
-
 @pytest.mark.parametrize(
     ("old", "new"),
     [
