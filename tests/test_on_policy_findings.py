@@ -22,7 +22,7 @@ from tests.score_tables import (
 )
 
 FOLDER = ROOT / "results" / "general_on_policy"
-SCENARIOS = json.loads((FOLDER / "plan.json").read_text())["scenarios"]
+SCENARIOS = json.loads((FOLDER / "plan.json").read_text())["experiments"]["general_on_policy"]
 PERIODS_S = ((300, 600), (900, 1_500), (2_400, 3_000), (4_800, 5_400))
 RUNS = {"Rainbow": "general/runs/rainbow_segmented/{}/train8", "PPO": "general_on_policy/runs/ppo_segmented/{}/train8"}
 SEEDS = {1: "one seed", 2: "two seeds", 3: "three seeds"}

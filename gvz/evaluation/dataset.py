@@ -231,11 +231,7 @@ def _read_file(file: Path) -> tuple[pl.DataFrame, list[str]]:
     problems += [f"{file}: {message}" for message in (*trouble, *unknown)]
     frame = frame.join(tasks, on=["task", "profile"], how="left", nulls_equal=True)
     percent = normalize(pl.col("score"), pl.col("bound"))
-    frame = frame.with_columns(normalized_score=pl.coalesce("normalized_score", percent))
-    return frame.with_columns(  # older rows also scored the kills beyond the bound
-        score=pl.min_horizontal("score", "most_kills"),
-        normalized_score=pl.min_horizontal("normalized_score", normalize(pl.col("most_kills"), pl.col("bound"))),
-    ).drop("bound", "most_kills"), problems
+    return frame.with_columns(normalized_score=pl.coalesce("normalized_score", percent)).drop("bound"), problems
 
 
 _FIELDS = REQUIRED | OPTIONAL
@@ -297,18 +293,17 @@ def _task_columns(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
         task = _known_task(task_id)
         if isinstance(task, str):
             problems.append(f"{task}; its {num_rows} rows have no level")
-            rows.append((task_id, profile, task_id.partition("/")[0], None, None, None, None))
+            rows.append((task_id, profile, task_id.partition("/")[0], None, None, None))
             continue
         bound = task.scenario.upper_bounds.get("levdoom" if profile == "levdoom" else "thesis")
-        most_kills = bound if task.scenario.metric == "kills" else None
-        rows.append((task_id, profile, task.scenario.id, task.level, list(task.attributes), bound, most_kills))
+        rows.append((task_id, profile, task.scenario.id, task.level, list(task.attributes), bound))
     schema = {
         "task": pl.String(),
         "profile": pl.String(),
         **{n: DERIVED[n] for n in ("scenario", "level", "attributes")},
+        "bound": pl.Float64(),
     }
-    bounds = {"bound": pl.Float64(), "most_kills": pl.Float64()}
-    return pl.DataFrame(rows, schema | bounds, orient="row"), problems
+    return pl.DataFrame(rows, schema, orient="row"), problems
 
 
 @cache

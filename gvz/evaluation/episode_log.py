@@ -71,15 +71,7 @@ def read_rows(file: Path) -> list[Row]:
             problems.append(f"{file}, row {number}: got task, episode and base seed {episode}: no row of an evaluation")
     if problems:
         raise ConfigError(f"{problems[0]}; {_ANOTHER_FILE}")
-    return [_at_most_the_bound(row) for row in rows]
-
-
-def _at_most_the_bound(row: Row) -> Row:
-    """The row; one with a score above the upper bound, as older rows of Seek and Kill have it, at the bound."""
-    score, percent = row.get("score"), row.get("normalized_score")
-    if not isinstance(score, float) or not isinstance(percent, float) or percent <= 100:
-        return row
-    return {**row, "score": 100 * score / percent, "normalized_score": 100.0}
+    return rows
 
 
 class RecordFile(records.Writer):

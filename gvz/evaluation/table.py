@@ -58,12 +58,10 @@ def _score_row(played: Mapping[Task, Sequence[Row]]) -> dict[str, Any]:
 
 
 def _value(name: str, row: Row, task: Task) -> float:
-    """Rows of earlier versions have no normalized score, and their kills may exceed the upper bound."""
-    if "normalized_score" in row or name == "player_kills":
+    """Rows of earlier versions have no normalized score."""
+    if name in row:
         return row[name]
-    bound = task.scenario.upper_bound(row.get("profile", "thesis"))
-    score = min(row["score"], bound)
-    return score if name == "score" else normalize(score, bound)
+    return normalize(row["score"], task.scenario.upper_bound(row.get("profile", "thesis")))
 
 
 def score_lines(found: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -146,12 +146,9 @@ def read_plan(results: Path) -> Plan | None:
         return None
     try:
         saved = json.loads(file.read_text())
-        if saved["schema"] == 1:  # one choice of scenarios for all experiments
-            asked = dict.fromkeys(saved["experiments"], saved["scenarios"])
-        elif saved["schema"] == PLAN_SCHEMA:
-            asked = dict(saved["experiments"])
-        else:
-            raise ConfigError(f"{file}: schema {saved['schema']}, want 1 or {PLAN_SCHEMA}")
+        if saved["schema"] != PLAN_SCHEMA:
+            raise ConfigError(f"{file}: schema {saved['schema']}, want {PLAN_SCHEMA}")
+        asked = dict(saved["experiments"])
         return Plan(
             asked={name: None if scenarios is None else tuple(scenarios) for name, scenarios in asked.items()},
             scale=saved["scale"],

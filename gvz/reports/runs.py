@@ -113,10 +113,7 @@ def read_run(file: Path, results: Path) -> tuple[Run | None, list[str]]:
             config=saved["config"],
             tasks=tuple(map(str, saved["resolved"]["tasks"])),
             metrics=metrics,
-            # records of older versions have scores above the bound where enemies kill each other
-            training_episodes=episodes.filter(~pl.col("cut")).with_columns(
-                pl.col("normalized_score").clip(upper_bound=100)
-            ),
+            training_episodes=episodes.filter(~pl.col("cut")),
             starts=tuple(starts),
         )
         _ = run.name, run.seed, run.total_updates, run.training, run.curriculum

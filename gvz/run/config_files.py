@@ -140,16 +140,15 @@ def config_from_dict(saved: Any, own_files: OwnFiles = NO_OWN_FILES) -> RunConfi
     """The configuration that `config_to_dict` wrote, with the derived numbers it ran with made explicit.
 
     Args:
-        saved: what was written, by this version or by one before it.
+        saved: what was written.
         own_files: the Python files of the run, if it has any. They are executed; the paths that `saved` has are not.
 
     Raises:
         ConfigError: another schema, an unknown or missing key, a wrong type or value, or a file is missing.
     """
-    if isinstance(saved, dict) and saved.get("schema") == 1:
-        saved = _from_schema_1(saved)
-    if not isinstance(saved, dict) or saved.get("schema") != CONFIG_SCHEMA:
-        raise ConfigError(f"saved configuration: want a map with schema {CONFIG_SCHEMA}")
+    schema = saved.get("schema") if isinstance(saved, dict) else None
+    if schema != CONFIG_SCHEMA:
+        raise ConfigError(f"saved configuration: got schema {schema!r:.20}, want a map with schema {CONFIG_SCHEMA}")
     plain, kind = saved.get("config"), AgentConfig
     match plain:
         case {"agent": {"name": str()} as agent}:
@@ -162,11 +161,6 @@ def config_from_dict(saved: Any, own_files: OwnFiles = NO_OWN_FILES) -> RunConfi
         case {"mode": "async", "actors": {**actors}}:
             numbers = {"num_actors": resolved.num_actors, "games_per_actor": resolved.games_per_actor}
             plain = {**plain, "actors": {**actors, **numbers}}
-        case _:
-            pass
-    match plain:  # an earlier version let one process have these; they had no effect
-        case {"group": {"num_processes": 1} as group}:
-            plain = {**plain, "group": {**group, "process_id": None, "coordinator": None}}
         case _:
             pass
     config = build_config(plain, "config", kind)
@@ -198,19 +192,6 @@ def build_config(plain: Any, where: str, agent: type[AgentConfig]) -> RunConfig:
     return _from_plain(RunConfig, plain, where, {"agent": agent, "learner": learner})
 
 
-def _from_schema_1(saved: dict[str, Any]) -> dict[str, Any]:
-    """What a version before this one wrote: every agent had the fields of Rainbow, those it did not use included."""
-    match saved:
-        case {"config": {"agent": {**agent}, **plain}, "resolved": {**resolved}}:
-            if agent.get("name") == "dqn":
-                fields = {f.name for f in dataclasses.fields(agent_config_class("dqn"))}
-                agent = {name: value for name, value in agent.items() if name in fields}
-            resolved = {"support" if name == "value_range" else name: value for name, value in resolved.items()}
-            return {"schema": CONFIG_SCHEMA, "config": {**plain, "agent": agent}, "resolved": resolved}
-        case _:
-            return saved
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Resolved:
     """What a run derived from its configuration and its machine."""
@@ -218,8 +199,7 @@ class _Resolved:
     tasks: tuple[str, ...]
     num_actors: int
     games_per_actor: int
-    support: tuple[float, float] | None = None
-    """missing in runs of older versions"""
+    support: tuple[float, float] | None
 
 
 def _from_plain(kind: Any, value: Any, where: str, kinds: Mapping[str, Any] = MappingProxyType({})) -> Any:

@@ -22,7 +22,7 @@ from gvz.core.durable import fsync, saved_steps
 from gvz.core.errors import ConfigError, GvzError, ResumeError
 from gvz.core.registry import NO_OWN_FILES, OwnFiles
 from gvz.run.config import RunConfig
-from gvz.run.config_files import CONFIG_SCHEMA, config_from_dict, config_to_dict
+from gvz.run.config_files import config_from_dict, config_to_dict
 from gvz.run.resume import changed_schedules, differences
 
 RECORD_FILES = ("metrics.jsonl", "episodes.jsonl", "faults.jsonl")
@@ -66,22 +66,15 @@ class RunDir:
         `config_from_dict`.
 
         Raises:
-            ResumeError: config.json is damaged, or of a version whose checkpoints this one cannot read.
+            ResumeError: config.json is damaged, or of another schema.
         """
         file = self.path / "config.json"
         if not file.exists():
             return None
         try:
-            saved = json.loads(file.read_text())
-            config = config_from_dict(saved, own_files)
+            return config_from_dict(json.loads(file.read_text()), own_files)
         except (ValueError, OSError, RecursionError) as error:
             raise ResumeError(f"{file} cannot be read: {error}; start again with --fresh or --run-dir") from error
-        if saved["schema"] < CONFIG_SCHEMA:
-            raise ResumeError(
-                f"{self.path} is a run of an earlier version. Its policies can be evaluated, but it cannot be resumed: "
-                "its checkpoints have another layout. Move it aside with --fresh, or give another --run-dir."
-            )
-        return config
 
     def check_resumable(self, config: RunConfig) -> list[str]:
         """Refuses a configuration that would change the meaning of the run that lives here.

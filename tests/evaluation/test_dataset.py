@@ -46,16 +46,6 @@ def test_the_bound_is_the_profiles(tmp_path):
     assert read_evaluations(file)["normalized_score"].to_list() == [100.0, 12.5]
 
 
-def test_older_rows_with_more_kills_than_the_bound_count_as_the_bound(tmp_path):
-    file = tmp_path / "idle.jsonl"
-    kills = {"task": "seek_and_kill/invulnerable", "score": 38.0, "kills": 38.0}
-    file.write_text(line(**kills, normalized_score=190.0) + line(**kills, episode=1) + line(episode=2, score=1100.0))
-    rows = read_evaluations(file)
-    assert rows["score"].to_list() == [20.0, 20.0, 1100.0]
-    assert rows["normalized_score"].to_list() == [100.0, 100.0, 100.0]
-    assert rows["kills"].to_list() == [38.0, 38.0, None]
-
-
 def test_rows_of_a_run_say_what_it_was_trained_on(tmp_path):
     (tmp_path / "evaluation.jsonl").write_text(line(player="r/seed_1@9", run="r", run_seed=1, num_updates=9))
     (tmp_path / "config.json").write_text(json.dumps({"resolved": {"tasks": [GORE]}}))

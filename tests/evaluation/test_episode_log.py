@@ -60,14 +60,6 @@ def test_only_rows_of_the_same_player_rules_and_base_seed_count(file):
     ]
 
 
-def test_older_rows_with_more_kills_than_the_bound_count_as_the_bound(file, tmp_path):
-    file.append(row("idle", 0, score=38.0, normalized_score=190.0, kills=38.0))
-    file.append(row("idle", 1, score=20.0, normalized_score=100.0))
-    old, new = read_rows(tmp_path / "evaluation.jsonl")
-    assert (old["score"], old["normalized_score"], old["kills"]) == (20.0, 100.0, 38.0)
-    assert (new["score"], new["normalized_score"]) == (20.0, 100.0)
-
-
 def test_a_half_written_line_is_cut_off(tmp_path):
     path = tmp_path / "evaluation.jsonl"
     file = RecordFile(path)

@@ -22,8 +22,8 @@ def test_rows_of_earlier_versions_have_what_follows_from_their_score_and_count_o
     (row,) = score_rows(rows, {"player": "p"}, [default], episodes=9)
     assert (row["episodes"], row["score"], row["normalized_score"]) == (2, 110.0, 10.0)
     (kills, *_) = named_tasks("seek_and_kill")
-    (row,) = score_rows([{**rows[0], "task": kills.id, "score": 25.0}], {"player": "p"}, [kills], episodes=9)
-    assert (row["player_kills"], row["score"], row["normalized_score"]) == (None, 20.0, 100.0)
+    (row,) = score_rows([{**rows[0], "task": kills.id, "score": 15.0}], {"player": "p"}, [kills], episodes=9)
+    assert (row["player_kills"], row["score"], row["normalized_score"]) == (None, 15.0, 75.0)
 
 
 def test_own_kills_stand_beside_a_score_that_is_kills():

@@ -87,17 +87,6 @@ def test_a_plan_of_an_experiment_that_is_gone_is_named_with_its_file(tmp_path):
         read_plan(tmp_path)
 
 
-@pytest.mark.parametrize("chosen", [None, ["seek_and_kill", "health_gathering"]])
-def test_the_first_schema_had_one_choice_of_scenarios_for_all_experiments(tmp_path, chosen):
-    names = ["training_set_size", "rainbow_evaluation"]
-    saved = {"schema": 1, "experiments": names, "scale": 0.5, "scenarios": chosen}
-    (tmp_path / "plan.json").write_text(json.dumps(saved))
-    wanted = Plan.of(*names, scale=0.5, scenarios=None if chosen is None else tuple(chosen))
-    assert read_plan(tmp_path) == wanted
-    assert write_plan(tmp_path, wanted) == wanted
-    assert json.loads((tmp_path / "plan.json").read_text())["experiments"] == dict.fromkeys(names, chosen)
-
-
 def test_commands_that_start_at_once_all_get_into_the_plan(tmp_path, monkeypatch):
     def read_slowly(results):
         found = read_plan(results)
@@ -119,7 +108,7 @@ def test_scales_are_not_mixed(tmp_path):
         write_plan(tmp_path, Plan.of("rainbow_evaluation", scale=0.5))
 
 
-@pytest.mark.parametrize("text", ["", "{}", '{"schema": 1}', "[]"])
+@pytest.mark.parametrize("text", ["", "{}", '{"schema": 2}', "[]"])
 def test_a_damaged_plan_is_named(tmp_path, text):
     (tmp_path / "plan.json").write_text(text)
     with pytest.raises(ConfigError, match=r"plan\.json cannot be read: .*; move it aside to make a new plan"):
@@ -127,8 +116,8 @@ def test_a_damaged_plan_is_named(tmp_path, text):
 
 
 def test_a_plan_of_another_schema_is_refused(tmp_path):
-    (tmp_path / "plan.json").write_text(json.dumps({"schema": 9}))
-    with pytest.raises(ConfigError, match=r"plan\.json: schema 9, want 1 or 2"):
+    (tmp_path / "plan.json").write_text(json.dumps({"schema": 1, "experiments": ["general"], "scale": 1.0}))
+    with pytest.raises(ConfigError, match=r"plan\.json: schema 1, want 2"):
         read_plan(tmp_path)
 
 

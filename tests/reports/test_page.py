@@ -89,7 +89,7 @@ def test_a_place_that_cannot_be_written_is_an_error(tmp_path):
 
 def test_results_of_one_experiment_twice_are_an_error(tmp_path):
     row = '{"schema": 1, "player": "random", "task": "seek_and_kill/red", "episode": 0, "seed": 1, "score": 3}\n'
-    plan = '{"schema": 1, "experiments": ["quick_comparison"], "scale": 1, "scenarios": null}'
+    plan = '{"schema": 2, "scale": 1, "experiments": {"quick_comparison": null}}'
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "random.jsonl").write_text(row)

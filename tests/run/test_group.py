@@ -235,9 +235,6 @@ def test_a_group_that_is_not_whole_is_refused(values, message, monkeypatch):
 def test_an_option_of_a_group_without_a_number_of_processes_is_refused(name, value):
     with pytest.raises(ConfigError, match=rf"group\.{name}: got {value} without other .*; group\.num_processes says"):
         GroupConfig(**{name: value})
-    saved = config_to_dict(CONFIG)
-    saved["config"]["group"][name] = value  # as an earlier version wrote it
-    assert config_from_dict(saved).group == GroupConfig()
 
 
 def test_slurm_says_which_process_this_is_and_each_has_a_directory_and_games_of_its_own(monkeypatch):

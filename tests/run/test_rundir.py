@@ -229,13 +229,13 @@ def test_a_run_that_began_with_other_atoms_goes_on_with_those_alone(tmp_path, su
             run.check_resumable(CONFIG.with_support(support))
 
 
-def test_a_run_of_an_earlier_version_cannot_be_resumed(tmp_path):
+def test_a_run_of_another_schema_cannot_be_resumed(tmp_path):
     with RunDir(tmp_path) as run:
         run.write_config(CONFIG)
         file = tmp_path / "config.json"
         saved = json.loads(file.read_text())
         file.write_text(json.dumps({**saved, "schema": 1}))
-        with pytest.raises(ResumeError, match="is a run of an earlier version"):
+        with pytest.raises(ResumeError, match="got schema 1, want a map with schema 2; start again"):
             run.check_resumable(CONFIG)
 
 
