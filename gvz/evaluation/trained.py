@@ -87,6 +87,20 @@ def check_tasks(config: RunConfig, tasks: Sequence[Task]) -> None:
             )
 
 
+def _check_game(config: RunConfig, env: "DoomEnv") -> None:
+    """Raises ConfigError for a game that the run's policy cannot play: of such a task, or with other actions or frames
+    than those it has learned with.
+    """
+    check_tasks(config, [env.task])
+    for name in ("action_set", "frames", "frame_shape", "buffers"):
+        got, want = getattr(env.config, name), getattr(config.env, name)
+        if got != want:
+            raise ConfigError(
+                f"{env.task.id}: the game has {name} {got!r}, but the policy of {config.name} learned with {want!r}; "
+                "make it by make_env of what load_player returns, or give evaluate_player env=policy.env"
+            )
+
+
 def find_checkpoints(run_dir: Path, wanted: Sequence[str]) -> list[int]:
     """The chosen policies of a run, as gradient steps, oldest first.
 
@@ -194,7 +208,7 @@ class TrainedPlayer:
         self._params = jax.device_put(params)
         self._evaluate = _jitted(agent)
         self._evaluation: Evaluation | None = None
-        self._table, spec = config.table, agent.spec
+        self._config, self._table, spec = config, config.table, agent.spec
         self._obs = ObservationBatch(
             1,
             config.env.frame_shape,
@@ -221,6 +235,12 @@ class TrainedPlayer:
         )
 
     def begin(self, env: "DoomEnv", observation: "Observation", info: dict[str, Any], seed: int) -> None:
+        """As `Player.begin`.
+
+        Raises:
+            ConfigError: the policy cannot play this game.
+        """
+        _check_game(self._config, env)
         assert isinstance(observation, np.ndarray)
         self._obs.begin(0, self._task(env), observation, info["variables"])
         if "mask" in self._obs.arrays:
