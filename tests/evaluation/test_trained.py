@@ -178,8 +178,8 @@ def test_a_conditioned_policy_refuses_a_task_that_has_no_index(run):
     write_policy(run, config, 20)
     player, frame = TrainedPlayer(run, 20), np.zeros(config.env.frame_shape, np.uint8)
     player.begin(SimpleNamespace(task=config.table.tasks[3], config=config.env), frame, {"variables": {}}, 1)
+    other = SimpleNamespace(task=parse_task("defend_the_center/complete"), config=config.env)
     with pytest.raises(ConfigError, match="the policy takes the index of one of its 4 training tasks as input"):
-        other = SimpleNamespace(task=parse_task("defend_the_center/complete"), config=config.env)
         player.begin(other, frame, {"variables": {}}, 1)
 
 
