@@ -20,6 +20,7 @@ import numpy as np
 from actors.preprocess import ObservationBatch
 from gvz.core.durable import saved_steps
 from gvz.core.errors import CheckpointError, ConfigError
+from gvz.core.libraries import require_learner
 from gvz.core.registry import NO_OWN_FILES, OwnFiles
 from gvz.evaluation.episode_log import row_identity
 from gvz.evaluation.play import PlayerSpec
@@ -152,7 +153,7 @@ def trained_player(run_dir: Path, config: RunConfig, num_updates: int) -> Player
     before anything is played.
 
     Raises:
-        CheckpointError: it is damaged, or belongs to another configuration.
+        CheckpointError: it is damaged, or belongs to another configuration. ConfigError: JAX is not installed.
     """
     _, params = read_params(run_dir, config, num_updates)
     import jax  # not before: reading says on which platform
@@ -187,7 +188,7 @@ def load_player(run: str | Path, checkpoint: str | int = "newest", own_files: Ow
         own_files: as for `read_run_config`.
 
     Raises:
-        ConfigError, CheckpointError: there is no such policy, or it is damaged.
+        ConfigError, CheckpointError: there is no such policy, it is damaged, or JAX is not installed.
     """
     run_dir = run_directory(Path(run))
     return trained_player(run_dir, read_run_config(run_dir, own_files), find_checkpoint(run_dir, str(checkpoint)))
@@ -273,6 +274,7 @@ def _jitted(agent: "Agent") -> Any:
 
 
 def read_params(run_dir: Path, config: RunConfig, num_updates: int) -> "tuple[Agent, Any]":
+    require_learner("playing by a trained policy")
     # acting is done on the CPU, by the form of the convolutions that is quick there
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     import jax

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from gvz.core.cache import cache_directory
 from gvz.core.errors import ConfigError, ResourceError, nearest
+from gvz.core.libraries import require_learner
 from gvz.core.registry import NO_OWN_FILES, OwnFiles
 
 if TYPE_CHECKING:
@@ -124,6 +125,7 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", own_files: OwnFil
         ConfigError: not a run, no such policy, a name that no file can have, or a file that would be too large.
         CheckpointError: the policy is damaged.
     """
+    require_learner("adding a policy to the zoo")
     from gvz.core import records
     from gvz.evaluation.trained import find_checkpoint, read_params, read_run_config, trained_player
     from gvz.run.config_files import config_to_dict
