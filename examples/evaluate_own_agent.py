@@ -34,14 +34,19 @@ def mean_score(rows: list[Row], task: Task) -> str:
     return str(bootstrap([np.array([row["score"] for row in rows if row["task"] == task.id])]))
 
 
-def main(episodes: int = 3, level: int = 0, workers: int = 0, out: Path = Path("own_agent.jsonl")):
-    """Plays every named task of a level; the same command resumes an interrupted evaluation."""
+def main(
+    name: str = "motion", episodes: int = 3, level: int = 0, workers: int = 0, out: Path = Path("own_agent.jsonl")
+):
+    """Plays every named task of a level; the same command resumes an interrupted evaluation.
+
+    Episodes of a name are played once: whoever changes `choose` gives another name.
+    """
     tasks = named_tasks("defend_the_center", level=level)
     rows = evaluate_player(
         partial(FramePlayer, choose, stack_size=2),
         tasks,
         out,
-        name="motion",
+        name=name,
         episodes=episodes,
         env=EnvConfig(frame_height=48, grayscale=True),
         num_workers=workers,

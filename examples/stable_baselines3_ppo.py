@@ -4,6 +4,7 @@ python examples/stable_baselines3_ppo.py --steps 200000 --episodes 20
 (how to install: docs/how-to/use-your-own-agent.md)
 """
 
+import hashlib
 from functools import partial
 from pathlib import Path
 
@@ -37,8 +38,11 @@ def main(
     def choose(stack: np.ndarray) -> int:
         return int(model.predict(stack, deterministic=True)[0])
 
+    weights = b"".join(tensor.cpu().numpy().tobytes() for tensor in model.policy.state_dict().values())
+    digest = hashlib.blake2b(weights, digest_size=4).hexdigest()
+    name = f"sb3_ppo@{steps} {digest}"  # of this model alone: episodes of a name are played once
     tasks = named_tasks(scenario, split="test")[:max_tasks]
-    rows = evaluate_player(partial(FramePlayer, choose), tasks, out, name=f"sb3_ppo@{steps}", episodes=episodes)
+    rows = evaluate_player(partial(FramePlayer, choose), tasks, out, name=name, episodes=episodes)
     for task in tasks:
         score = np.mean([row["score"] for row in rows if row["task"] == task.id])
         print(f"{task.id}: mean score {score:.1f} of {episodes} episodes")

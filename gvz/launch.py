@@ -14,6 +14,7 @@ from typing import Annotated
 import tyro
 
 from gvz.core.errors import ConfigError, GvzError
+from gvz.core.libraries import require_learner
 from gvz.core.stop import StopRequest, exit_at_once
 from gvz.run.config import RunConfig, with_agent
 from gvz.run.config_files import load_config
@@ -91,6 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with StopRequest(at_once=True) as stop:  # before the trainer exists, a signal ends the command at once
         try:
             launch = parse(arguments)
+            require_learner("training")
             directory = launch.run.resolved_run_dir
             if launch.fresh and launch.run.group.num_processes > 1:
                 raise ConfigError("--fresh: got it for a group of learner processes; give all another --run-dir")

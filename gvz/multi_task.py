@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
-from gvz.core.env_config import EPISODE_SEEDS, given_episode_seed, typed
+from gvz.core.env_config import EPISODE_SEEDS, EnvConfig, given_episode_seed, typed
 from gvz.core.errors import ConfigError, TaskError
 from gvz.env import Action, DoomEnv
 from gvz.observation import Observation
@@ -78,6 +78,11 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
     def task(self) -> Task:
         """The task of the present episode; before the first one, the first task."""
         return self._game.task
+
+    @property
+    def config(self) -> EnvConfig:
+        """Sizes, action set and profile: the same in all tasks."""
+        return self._game.config
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None

@@ -43,6 +43,9 @@ def test_own_agent_is_evaluated_on_the_episodes_of_everybody(tmp_path):
     rows = [json.loads(line) for line in (tmp_path / "own_agent.jsonl").read_text().splitlines()]
     assert [row["seed"] for row in rows] == [episode_seed("defend_the_center/default", n) for n in range(2)]
     assert {row["player"] for row in rows} == {"motion"}
+    run("evaluate_own_agent.py", "--episodes", "1", "--name", "changed", where=tmp_path)
+    rows = [json.loads(line) for line in (tmp_path / "own_agent.jsonl").read_text().splitlines()]
+    assert [row["player"] for row in rows] == ["motion", "motion", "changed"]
 
 
 EXECUTE = """

@@ -150,6 +150,37 @@ def test_environments_and_their_evaluation_need_no_jax(tmp_path):
     assert task in run(*gvz, "evaluate", *playing, **here)
 
 
+@pytest.mark.parametrize(
+    ("command", "what"),
+    [
+        ("evaluate zoo:health_gathering --tasks health_gathering/slime", "playing by a trained policy"),
+        ("record zoo:health_gathering --out episode.gif", "playing by a trained policy"),
+        ("watch zoo:health_gathering", "playing by a trained policy"),
+        ("gallery --kind augmented --scenario health_gathering --out .", "the sheet of augmentations"),
+        ("zoo --add zoo:health_gathering --name mine", "adding a policy to the zoo"),
+        ("train --config rainbow_quick", "training"),
+    ],
+)
+def test_what_needs_jax_says_so_where_there_is_none(command, what, tmp_path):
+    site = tmp_path / "site"
+    site.mkdir()
+    (site / "sitecustomize.py").write_text("import sys; sys.modules['jax'] = None")  # as if it were not installed
+    (where := tmp_path / "empty").mkdir()
+    done = subprocess.run(
+        [sys.executable, "-m", "gvz.cli", *command.split()],
+        cwd=where,
+        env={**os.environ, "PYTHONPATH": f"{site}:{ROOT}", "GVZ_CACHE_DIR": str(tmp_path / "cache")},
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    wanted = f"error: {what} needs JAX and the other libraries of the learner; not installed here: jax; `pip install"
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(wanted)
+    assert list(where.iterdir()) == []
+
+
 def test_the_examples_need_the_same_versions_as_the_package():
     wanted = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
     lines = (ROOT / "examples" / "requirements.txt").read_text().splitlines()

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 class Export:
     """Write the records of runs as CSV or Parquet: a table each of metrics, episodes, faults, starts and evaluations.
 
-    The rows of all runs go into one table, with the columns `run_dir`, `run` and `run_seed`.
+    The rows of all runs go into one table, with the columns `run_dir`, `run` and `run_seed`. A table without rows is
+    not written, and one of that name and format from an earlier export is removed.
 
     Example: gvz export runs/rainbow_4task/seed_* --format parquet --out tables
     """
@@ -36,7 +37,7 @@ class Export:
     """directory to write to"""
 
     def run(self) -> int:
-        """Writes the tables that have rows; prints their paths, and what could not be read."""
+        """Writes the tables that have rows; prints their paths, what was removed, and what could not be read."""
         if not self.run_dirs:
             raise ConfigError("export: got no run directory, want at least one")
         from gvz.evaluation.dataset import collect_evaluations
@@ -51,8 +52,12 @@ class Export:
         except OSError as error:
             raise ConfigError(f"--out: {self.out} cannot be made: {error.strerror}") from error
         for name, table in tables.items():
+            file = self.out / f"{name}.{self.format}"
             if not table.is_empty():
-                print(write_table(table, self.out / f"{name}.{self.format}"))
+                print(write_table(table, file))
+            elif file.is_file():
+                file.unlink()
+                problems.append(f"{file} is removed: it is of an earlier export, and this one has no rows for it")
         for problem in problems + damaged:
             print(f"note: {problem}", file=sys.stderr)
         return 0

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from gvz.core.errors import EXIT_INTERRUPTED, ConfigError
+from gvz.core.stop import StopRequest
 from gvz.evaluation.choice import ANY_EPISODE, EpisodeChoice
 
 if TYPE_CHECKING:
@@ -77,13 +78,16 @@ class Record:
                     if moment.frames >= num_tics:
                         return
 
-        rate = Fraction(TICS_PER_SECOND, 1 if every_tic else player_spec.env.frame_skip)
+        rate, stop = (
+            Fraction(TICS_PER_SECOND, 1 if every_tic else player_spec.env.frame_skip),
+            StopRequest(at_once=True),
+        )
         try:
-            with contextlib.closing(pictures()) as drawn:
+            with stop, contextlib.closing(pictures()) as drawn:
                 write_video(self.out, drawn, rate)
         except KeyboardInterrupt:
             print("interrupted; nothing was written", file=sys.stderr)
-            return EXIT_INTERRUPTED
+            return stop.exit_code or EXIT_INTERRUPTED
         if self.tensorboard and self.choice.run_dir is not None:
             events = run_directory(self.choice.run_dir) / "tensorboard" / "episodes"
             add_to_tensorboard(self.out, events, f"episode/{task.id}", player_spec.identity["num_updates"])

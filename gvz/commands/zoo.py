@@ -1,14 +1,14 @@
 """`gvz zoo`: the trained policies that come with GViZDoom."""
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import tyro
 
-from gvz.core.errors import ConfigError
+from gvz.core.errors import ConfigError, GvzError
 from gvz.core.registry import OwnFiles
 from gvz.evaluation.zoo import EVALUATION, PREFIX, pack, run_directory, score_card, zoo_names
 
@@ -24,7 +24,7 @@ class Zoo:
 
     Examples: gvz zoo seek_and_kill
               gvz watch zoo:dodge_projectiles --task dodge_projectiles/mancubus
-              gvz zoo --add runs/rainbow_general/seed_1111 --name seek_and_kill
+              gvz zoo --add runs/rainbow_general/seed_1111 --name my_seek_and_kill
     """
 
     names: Annotated[
@@ -41,12 +41,13 @@ class Zoo:
     checkpoint: str = "newest"
     """which of the run's policies is added: gradient steps, or newest"""
     agent: Path | None = None
-    """the Python file of the run's agent, if it is in a file of its own"""
+    """the Python file of the agent, of the run or of policies, if it is in a file of its own: it is executed"""
     encoder: Path | None = None
     """likewise, of its encoder"""
 
     def run(self) -> int:
-        """Prints the policies, or what was added."""
+        """Prints the policies, or what was added. A list says of a policy that cannot be read why."""
+        own_files = OwnFiles(self.agent, self.encoder)
         if (self.add is None) != (self.name is None):
             raise ConfigError("zoo: want --add and --name together")
         if self.add is not None and self.name is not None:
@@ -54,14 +55,14 @@ class Zoo:
                 raise ConfigError(f"zoo: got {' '.join(self.names)} beside --add; the policy's name is that of --name")
             if self.name in zoo_names() and not self.replace and str(self.add) != f"{PREFIX}{self.name}":
                 raise ConfigError(f"--name: the zoo has a policy {self.name} already; give another name, or --replace")
-            packed = pack(run_directory(self.add), self.name, self.checkpoint, OwnFiles(self.agent, self.encoder))
+            packed = pack(run_directory(self.add), self.name, self.checkpoint, own_files)
             print(f"{packed.file}: {packed.num_updates:,} updates, {packed.num_bytes:,} bytes")
             if not packed.num_episodes:
                 print(f"no score card yet: gvz evaluate {PREFIX}{self.name}, then add {PREFIX}{self.name} again")
         elif self.names:
-            print("\n\n".join(_card(_read(name.removeprefix(PREFIX))) for name in self.names))
+            print("\n\n".join(_card(_read(name.removeprefix(PREFIX), own_files)) for name in self.names))
         elif known := zoo_names():
-            print(_table([_read(name) for name in known]))
+            print(_table({name: _read_or_why_not(name, own_files) for name in known}))
         else:
             print("the zoo is empty")
         return 0
@@ -83,30 +84,40 @@ class _Policy(NamedTuple):
     """`score_rows` of those that were evaluated"""
 
 
-def _read(name: str) -> _Policy:
+def _read_or_why_not(name: str, own_files: OwnFiles) -> _Policy | str:
+    try:
+        return _read(name, own_files)
+    except GvzError as error:
+        return str(error)
+
+
+def _read(name: str, own_files: OwnFiles) -> _Policy:
     from gvz.core import records
     from gvz.evaluation.selection import TaskSelection
     from gvz.evaluation.table import score_rows
     from gvz.evaluation.trained import find_checkpoints, read_run_config
 
     directory = run_directory(Path(f"{PREFIX}{name}"))
-    config = read_run_config(directory)
+    config = read_run_config(directory, own_files)
     [num_updates] = find_checkpoints(directory, ["newest"])
     rows = score_card(records.read_stored(directory / EVALUATION)[0])
     metrics, _ = records.read_stored(directory / "metrics.jsonl")
     tasks = TaskSelection(split="test").of_run([scenario.id for scenario in config.table.scenarios])
     scores = score_rows(rows, {}, tasks, episodes=10**9)
-    spent_s = metrics[-1]["run/processor_s"] if metrics else None
+    spent_s = metrics[-1].get("run/processor_s") if metrics else None
     return _Policy(name, config, num_updates, spent_s, len(tasks), scores)
 
 
-def _table(policies: Sequence[_Policy]) -> str:
-    """A line for each policy; the score is the mean over the test tasks."""
+def _table(policies: Mapping[str, _Policy | str]) -> str:
+    """A line for each policy, or why it cannot be read; the score is the mean over the test tasks."""
     from gvz.evaluation.table import interval_text
 
-    width = max(len(policy.name) for policy in policies) + len(PREFIX)
+    width = max(map(len, policies)) + len(PREFIX)
     lines = [f"{'policy':{width}}  {'frames':9}  trained on  updates  processor time  % of the bound, test tasks [95%]"]
-    for policy in policies:
+    for name, policy in policies.items():
+        if isinstance(policy, str):
+            lines.append(f"{PREFIX + name:{width}}  error: {policy}")
+            continue
         tasks = f"{len(policy.config.table.ids)} tasks"
         spent = "" if policy.processor_s is None else f"{policy.processor_s:,.0f} s"
         played, of_all = sum(row["task"] is not None for row in policy.scores), policy.num_test_tasks
@@ -114,7 +125,7 @@ def _table(policies: Sequence[_Policy]) -> str:
         if played == of_all:
             score = interval_text(policy.scores[-1], "normalized_score")
         lines.append(
-            f"{PREFIX + policy.name:{width}}  {policy.config.env.frames:9}  {tasks:>10}  {policy.num_updates:7,}  "
+            f"{PREFIX + name:{width}}  {policy.config.env.frames:9}  {tasks:>10}  {policy.num_updates:7,}  "
             f"{spent:>14}  {score}"
         )
     return "\n".join([*lines, "", "gvz zoo NAME shows a policy's training tasks, and its score on each test task."])

@@ -3,6 +3,7 @@
 Knows processes and files, not vizdoom: the game it starts is any object with `init` and `close`.
 """
 
+import atexit
 import contextlib
 import ctypes
 import os
@@ -17,7 +18,8 @@ from pathlib import Path
 from typing import Protocol
 
 from gvz.core import janitor, records
-from gvz.core.errors import EngineError, ResourceError
+from gvz.core.errors import EXIT_INTERRUPTED, EngineError, ResourceError
+from gvz.core.stop import exit_at_once
 from gvz.core.watchdog import AwakeClock
 from gvz.engine import queue_locks
 
@@ -66,20 +68,20 @@ def start(game: Startable, directory: Path, engine: Path, log: Path, timeout_s: 
     """Runs `game.init()`, which launches this engine, with a deadline and with few others at a time on this machine.
 
     It runs in a thread of its own. After the deadline thread and engine are left alone, because ending an engine that
-    still starts would crash this process; if it starts later, it is closed at once. After all other failures nothing is
-    left, not even the private directory.
+    still starts would crash this process; if it starts later, it is closed at once. So it is after Ctrl-C, and
+    the interpreter's exit waits for that. After all other failures nothing is left, not even the private directory.
 
     Raises:
         ResourceError: not enough free shared memory.
         EngineError: not started within `timeout_s`, or ViZDoom raised, or programs in the directory may not be run.
     """
     deadline = time.monotonic() + timeout_s
-    attempt = _Attempt(game, directory)
+    attempt = _Attempt(game, directory, deadline)
     try:
         game.set_vizdoom_path(str(write_launcher(directory, engine, log)))
         _require_shared_memory()
         with one_of(_START_LOCKS, deadline):
-            finished = attempt.run(max(0.0, deadline - time.monotonic()))
+            finished = attempt.run()
         if not finished:
             raise EngineError(f"engine in {directory}: not started within {timeout_s:g} s{log_tail(log)}")
         if attempt.error is not None:
@@ -102,21 +104,26 @@ def _require_shared_memory() -> None:
 class _Attempt:
     """One run of `game.init()` in a thread, which can be given up."""
 
-    def __init__(self, game: Startable, directory: Path):
+    def __init__(self, game: Startable, directory: Path, deadline: float):
         self.error: Exception | None = None
         self._game = game
         self._directory = directory
+        self._deadline = deadline
         self._thread = threading.Thread(target=self._init, name=f"start {directory.name}", daemon=True)
         self._lock = threading.Lock()
+        self._ended = threading.Event()  # before Python 3.13, an interrupted `join` takes the thread for ended
         self._running = False
         self._given_up = False
 
-    def run(self, timeout_s: float) -> bool:
+    def run(self) -> bool:
         """Returns whether `init` has ended in time."""
         self._running = True
         self._thread.start()
-        self._thread.join(timeout_s)
-        return not self._thread.is_alive()
+        return self.wait()
+
+    def wait(self) -> bool:
+        """Waits until the deadline; returns whether the thread has ended."""
+        return self._ended.wait(max(0.0, self._deadline - time.monotonic()))
 
     def give_up(self) -> None:
         """Ends the engine and removes what it has: now, or when it has started."""
@@ -126,14 +133,35 @@ class _Attempt:
                 end(self._game, self._directory)
 
     def _init(self) -> None:
+        _starting.add(self)
         try:
             self._game.init()
         except Exception as error:  # handed to the waiting thread
             self.error = error
-        with self._lock:
-            self._running = False
-            if self._given_up:
-                end(self._game, self._directory)
+        try:
+            with self._lock:
+                self._running = False
+                if self._given_up:
+                    end(self._game, self._directory)
+        finally:
+            _starting.discard(self)
+            self._ended.set()
+
+
+_starting: set[_Attempt] = set()
+os.register_at_fork(after_in_child=_starting.clear)
+
+
+@atexit.register
+def _wait_for_starts() -> None:
+    """Gives starts that were interrupted the rest of their time: if a thread is in the client library when the
+    interpreter ends, the process aborts, and what the engine has stays. A further Ctrl-C ends the process at once.
+    """
+    try:
+        for attempt in list(_starting):
+            attempt.wait()
+    except KeyboardInterrupt:
+        exit_at_once(EXIT_INTERRUPTED, "interrupted while an engine starts; the next start removes what it leaves")
 
 
 @contextlib.contextmanager

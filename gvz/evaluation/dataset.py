@@ -6,7 +6,7 @@ Everything readable is read. What cannot be read is reported by file and line, a
 import json
 import math
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -76,7 +76,7 @@ _NUM_RESULTS = pl.max_horizontal(pl.col("score").n_unique(), pl.col("length_fram
 """of the rows of one episode"""
 
 _NOT_RECORDS = {"discarded", "work", "checkpoints", "policies", "tensorboard"}
-"""directories of a run that hold no records, or only discarded ones"""
+"""folders of a run directory that hold no records, or only discarded ones"""
 
 _PYTHON_TYPES: dict[type[pl.DataType], tuple[type, ...]] = {
     pl.String: (str,),
@@ -187,18 +187,22 @@ def evaluation_files(paths: Iterable[Path | str]) -> list[Path]:
         if not path.exists():
             raise ConfigError(f"{path}: no such file or directory; want record files or directories that hold some")
         for file in [path] if path.is_file() else files_below(path, "*.jsonl*"):
-            if path.is_file() or _may_be_evaluation(file.relative_to(path)):
+            if path.is_file() or (_may_be_evaluation(file) and not is_in_folder_of_run(file, path, _NOT_RECORDS)):
                 found.setdefault(file.resolve(), file)
     return list(found.values())
 
 
 def _may_be_evaluation(file: Path) -> bool:
     training = {name.removesuffix(".jsonl") for name in (*RECORD_FILES, START_RECORDS)}
-    return (
-        file.name.endswith(SUFFIXES)
-        and file.name.partition(".")[0] not in training
-        and _NOT_RECORDS.isdisjoint(file.parts[:-1])
-    )
+    return file.name.endswith(SUFFIXES) and file.name.partition(".")[0] not in training
+
+
+def is_in_folder_of_run(file: Path, below: Path, names: Collection[str]) -> bool:
+    """Whether a run directory in `below` has a folder of one of these names that the file is in. Other folders may be
+    called so: that of the runs of `gvz train --name work`.
+    """
+    folders = file.relative_to(below).parents
+    return any(folder.name in names and (below / folder.parent / "config.json").is_file() for folder in folders)
 
 
 def _read_file(file: Path) -> tuple[pl.DataFrame, list[str]]:

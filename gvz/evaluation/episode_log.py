@@ -1,6 +1,7 @@
 """Evaluations on disk: episodes are played and appended to a record file. Those already there are not played again."""
 
 import os
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -151,13 +152,15 @@ def evaluate_player(
     env: EnvConfig | None = None,
     num_workers: int = 0,
 ) -> list[Row]:
-    """Evaluates any player by the benchmark's protocol. A second call resumes what was stopped.
+    """Evaluates any player by the benchmark's protocol. A second call resumes what was stopped: episodes that the file
+    holds under this name are not played again, and a line on stderr says how many these are.
 
     Args:
         make_player: makes it, in each process that plays; picklable unless `num_workers` is 0.
         tasks: tasks or their ids.
         out: record file, JSON lines; may hold other players' rows too.
-        name: of the player, unique in the file: with agent, seed and checkpoint.
+        name: of the player, unique in the file: with agent, seed and checkpoint. What is trained again, or changed,
+            needs another one.
         episodes: of each task.
         base_seed: another one draws other episodes; comparisons use 0.
         env: what it plays in; default the thesis's. Actions are not repeated by chance, whatever it says.
@@ -178,9 +181,13 @@ def evaluate_player(
     file = RecordFile(Path(out))
     try:
         player_specs = {player_spec: file}
-        for _ in play_and_record(player_specs, missing_jobs(player_specs, wanted), num_workers=num_workers):
+        jobs, num_wanted = missing_jobs(player_specs, wanted), len(set(wanted))
+        if held := num_wanted - len(jobs):
+            note = f"{out}: holds {held} of these {num_wanted} episodes of {name!r}, which are not played again"
+            print(f"{note}; another player needs another name", file=sys.stderr)
+        for _ in play_and_record(player_specs, jobs, num_workers=num_workers):
             pass
     finally:
         file.close()
-    held = rows_of(player_spec, file.rows)
-    return [held[episode] for episode in wanted]
+    found = rows_of(player_spec, file.rows)
+    return [found[episode] for episode in wanted]

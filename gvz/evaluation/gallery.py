@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from gvz.core.env_config import EnvConfig
+from gvz.core.libraries import require_learner
 from gvz.engine.engine import Engine, EngineConfig
 from gvz.engine.probe import ensure_loads
 from gvz.env import TICS_PER_SECOND
@@ -163,6 +164,7 @@ def severity_sheet(scenario: Scenario) -> Image.Image:
 
 def augmented_sheet(scenario: Scenario) -> Image.Image:
     """The default task's frame under each augmentation of `learner.augment`, as it is, at half and at full strength."""
+    require_learner("the sheet of augmentations")
     import jax
 
     from learner.augment import AUGMENTATIONS, augment

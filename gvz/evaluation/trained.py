@@ -20,6 +20,7 @@ import numpy as np
 from actors.preprocess import ObservationBatch
 from gvz.core.durable import saved_steps
 from gvz.core.errors import CheckpointError, ConfigError
+from gvz.core.libraries import require_learner
 from gvz.core.registry import NO_OWN_FILES, OwnFiles
 from gvz.evaluation.episode_log import row_identity
 from gvz.evaluation.play import PlayerSpec
@@ -87,6 +88,20 @@ def check_tasks(config: RunConfig, tasks: Sequence[Task]) -> None:
             )
 
 
+def _check_game(config: RunConfig, env: "DoomEnv") -> None:
+    """Raises ConfigError for a game that the run's policy cannot play: of such a task, or with other actions or frames
+    than those it has learned with.
+    """
+    check_tasks(config, [env.task])
+    for name in ("action_set", "frames", "frame_shape", "buffers"):
+        got, want = getattr(env.config, name), getattr(config.env, name)
+        if got != want:
+            raise ConfigError(
+                f"{env.task.id}: the game has {name} {got!r}, but the policy of {config.name} learned with {want!r}; "
+                "make it by make_env of what load_player returns, or give evaluate_player env=policy.env"
+            )
+
+
 def find_checkpoints(run_dir: Path, wanted: Sequence[str]) -> list[int]:
     """The chosen policies of a run, as gradient steps, oldest first.
 
@@ -138,7 +153,7 @@ def trained_player(run_dir: Path, config: RunConfig, num_updates: int) -> Player
     before anything is played.
 
     Raises:
-        CheckpointError: it is damaged, or belongs to another configuration.
+        CheckpointError: it is damaged, or belongs to another configuration. ConfigError: JAX is not installed.
     """
     _, params = read_params(run_dir, config, num_updates)
     import jax  # not before: reading says on which platform
@@ -173,7 +188,7 @@ def load_player(run: str | Path, checkpoint: str | int = "newest", own_files: Ow
         own_files: as for `read_run_config`.
 
     Raises:
-        ConfigError, CheckpointError: there is no such policy, or it is damaged.
+        ConfigError, CheckpointError: there is no such policy, it is damaged, or JAX is not installed.
     """
     run_dir = run_directory(Path(run))
     return trained_player(run_dir, read_run_config(run_dir, own_files), find_checkpoint(run_dir, str(checkpoint)))
@@ -194,7 +209,7 @@ class TrainedPlayer:
         self._params = jax.device_put(params)
         self._evaluate = _jitted(agent)
         self._evaluation: Evaluation | None = None
-        self._table, spec = config.table, agent.spec
+        self._config, self._table, spec = config, config.table, agent.spec
         self._obs = ObservationBatch(
             1,
             config.env.frame_shape,
@@ -221,6 +236,12 @@ class TrainedPlayer:
         )
 
     def begin(self, env: "DoomEnv", observation: "Observation", info: dict[str, Any], seed: int) -> None:
+        """As `Player.begin`.
+
+        Raises:
+            ConfigError: the policy cannot play this game.
+        """
+        _check_game(self._config, env)
         assert isinstance(observation, np.ndarray)
         self._obs.begin(0, self._task(env), observation, info["variables"])
         if "mask" in self._obs.arrays:
@@ -253,6 +274,7 @@ def _jitted(agent: "Agent") -> Any:
 
 
 def read_params(run_dir: Path, config: RunConfig, num_updates: int) -> "tuple[Agent, Any]":
+    require_learner("playing by a trained policy")
     # acting is done on the CPU, by the form of the convolutions that is quick there
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     import jax

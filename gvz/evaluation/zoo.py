@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from gvz.core.cache import cache_directory
 from gvz.core.errors import ConfigError, ResourceError, nearest
+from gvz.core.libraries import require_learner
 from gvz.core.registry import NO_OWN_FILES, OwnFiles
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ def run_directory(path: Path) -> Path:
     """The run directory that `path` names: itself, or that of a policy, which is unpacked into the cache.
 
     Raises:
-        ConfigError: there is no such policy. ResourceError: the cache cannot be written.
+        ConfigError: there is no such policy. ResourceError: its file is damaged, or the cache cannot be written.
     """
     if not str(path).startswith(PREFIX):
         return path
@@ -56,7 +57,11 @@ def run_directory(path: Path) -> Path:
     unpacked = cache_directory() / "zoo" / digest / name
     try:
         _unpack(file, unpacked)
-    except OSError as error:
+    except (OSError, zipfile.BadZipFile, EOFError) as error:
+        if not isinstance(error, OSError) or error.errno is None:  # what a library says of compressed data
+            raise ResourceError(
+                f"{file} is damaged: {error}; install GViZDoom again, or add the policy again"
+            ) from error
         raise ResourceError(
             f"cache {cache_directory()}: {error}; make it writable, or set GVZ_CACHE_DIR to a directory that is"
         ) from error
@@ -120,6 +125,7 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", own_files: OwnFil
         ConfigError: not a run, no such policy, a name that no file can have, or a file that would be too large.
         CheckpointError: the policy is damaged.
     """
+    require_learner("adding a policy to the zoo")
     from gvz.core import records
     from gvz.evaluation.trained import find_checkpoint, read_params, read_run_config, trained_player
     from gvz.run.config_files import config_to_dict
@@ -157,8 +163,14 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", own_files: OwnFil
                 f"zoo: {name} would have {size:,} bytes, want at most {MAX_BYTES:,}; train a smaller network"
             )
         ZOO_DIRECTORY.mkdir(exist_ok=True)
-        shutil.copy(file, ZOO_DIRECTORY)
-    return Packed(file=ZOO_DIRECTORY / file.name, num_updates=num_updates, num_bytes=size, num_episodes=len(rows))
+        added = ZOO_DIRECTORY / file.name
+        unfinished = added.with_suffix(".unfinished")
+        try:
+            shutil.copy(file, unfinished)
+            unfinished.replace(added)
+        finally:
+            unfinished.unlink(missing_ok=True)
+    return Packed(file=added, num_updates=num_updates, num_bytes=size, num_episodes=len(rows))
 
 
 def score_card(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:

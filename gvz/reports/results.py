@@ -11,7 +11,7 @@ import polars as pl
 
 from gvz.core.errors import ConfigError
 from gvz.core.files import files_below
-from gvz.evaluation.dataset import collect_evaluations
+from gvz.evaluation.dataset import collect_evaluations, is_in_folder_of_run
 from gvz.experiments.base import Experiment
 from gvz.experiments.plan import read_plan
 from gvz.reports.agents import agents_of_runs, pooled_runs, with_agents
@@ -56,7 +56,8 @@ def read_results(paths: Sequence[Path]) -> Results:
     for path in paths:
         for config in files_below(path, "config.json") if path.is_dir() else []:
             of_group = (config.resolve().parents[1] / "config.json").exists()  # a further learner process of that run
-            if config.parent.resolve() not in runs and "discarded" not in config.parts and not of_group:
+            discarded = is_in_folder_of_run(config, path, ("discarded",))
+            if config.parent.resolve() not in runs and not discarded and not of_group:
                 run, found = read_run(config, path)
                 problems += found
                 if run is not None:

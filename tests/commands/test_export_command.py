@@ -66,6 +66,22 @@ def test_compressed_records_and_starts_are_tables_too(run_dirs, tmp_path, capsys
     assert json.loads(starts["versions"][0]) == {"jax": "0.7"}
 
 
+def test_tables_of_an_earlier_export_that_are_not_written_again_are_removed(run_dirs, tmp_path, capsys):
+    out = tmp_path / "tables"
+    for kind in ("csv", "parquet"):
+        assert cli.main(["export", str(run_dirs[1]), "--format", kind, "--out", str(out)]) == 0
+    (out / "notes.csv").write_text("mine")
+    capsys.readouterr()
+    assert cli.main(["export", str(run_dirs[0]), "--out", str(out)]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.splitlines() == [str(out / "metrics.csv")]
+    why = "is removed: it is of an earlier export, and this one has no rows for it"
+    assert printed.err.splitlines() == [f"note: {out / name}.csv {why}" for name in ("episodes", "evaluation")]
+    assert {file.name for file in out.iterdir()} == {
+        *("metrics.csv", "notes.csv", "metrics.parquet", "episodes.parquet", "evaluation.parquet"),
+    }
+
+
 def test_bad_input_is_named(run_dirs, tmp_path, capsys):
     assert cli.main(["export"]) == 2
     assert "got no run directory, want at least one" in capsys.readouterr().err

@@ -1,5 +1,6 @@
 """gvz record, as it is called."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -89,16 +90,24 @@ def test_tensorboard_gets_the_animation_at_the_policys_gradient_step(small_run, 
 
 
 @pytest.mark.engine
-def test_an_interrupted_recording_leaves_nothing(tmp_path):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_recording_leaves_nothing(tmp_path, number, code):
     command = [
         *(sys.executable, "-m", "gvz.cli", "record", "--player", "scripted", "--task", "defend_the_center/default"),
         *("--out", str(tmp_path / "video.mp4")),
     ]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+    )
     wait_until(lambda: list(tmp_path.glob(".writing-*")), "the first picture", 120, process=process)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     out, err = process.communicate(timeout=60)
-    assert (process.returncode, out) == (130, "")
+    assert (process.returncode, out) == (code, "")
     assert "interrupted; nothing was written" in err
     assert "Traceback" not in err
     assert list(tmp_path.iterdir()) == []

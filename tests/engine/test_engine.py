@@ -1,5 +1,6 @@
 """An engine starts under a limit, dies when it hangs or its owner ends, and leaves nothing."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -237,6 +238,54 @@ def test_an_engine_that_starts_too_late_is_given_up_and_cleared_away():
     with pytest.raises(EngineError, match=r"not started within 0\.02 s"):
         Engine(config(start_timeout_s=0.02))
     wait_until(lambda: set(janitor.runtime_dir().glob("*.json")) <= before, "the removal of the engine's record")
+
+
+@contextlib.contextmanager
+def stopped_start(where: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """A process that was interrupted while its engine starts, and this engine's process id, which is stopped."""
+    code = (
+        "import time\n"
+        "try:\n    engine = Engine(config); time.sleep(60)\n"
+        "except KeyboardInterrupt: print('interrupted', flush=True)"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-W", "error", "-c", HEAD + code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "TMPDIR": str(where)},
+    )
+    with process:
+        wait_until(lambda: list(where.glob("gvz-engine-*/instance")), "the engine", process=process)
+        [directory] = where.glob("gvz-engine-*")
+        wait_until(lambda: (directory / "instance").read_text().endswith("\n"), "its number", process=process)
+        instance = janitor.read_instance(directory)
+        assert instance is not None
+        os.kill(instance[0], signal.SIGSTOP)
+        process.send_signal(signal.SIGINT)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "interrupted\n"
+        yield process, instance[0]
+
+
+def test_an_interrupted_start_leaves_nothing_and_does_not_abort_the_process(tmp_path: Path):
+    with stopped_start(tmp_path) as (process, engine):
+        time.sleep(0.5)  # the interpreter is at its end
+        os.kill(engine, signal.SIGCONT)
+        assert process.communicate(timeout=60) == ("", "")
+        assert process.returncode == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_second_interruption_does_not_wait_for_the_engine_that_starts(tmp_path: Path):
+    with stopped_start(tmp_path) as (process, engine):
+        deadline = time.monotonic() + 50
+        while process.poll() is None and time.monotonic() < deadline:
+            time.sleep(1.0)
+            process.send_signal(signal.SIGINT)
+        assert process.returncode == 130
+        assert "interrupted while an engine starts; the next start removes what it leaves\n" in process.communicate()[1]
+    wait_until(lambda: janitor.process_start(engine) is None, "the end of the engine")
 
 
 def test_what_vizdoom_refuses_is_an_engine_error(tmp_path: Path):

@@ -104,12 +104,28 @@ def test_two_policies_of_one_name_are_told_of(tmp_path):
 
 
 def test_records_of_training_and_discarded_ones_are_left_alone(tmp_path):
-    (tmp_path / "discarded").mkdir()
-    for name in ("episodes.jsonl", "starts.jsonl", "metrics.jsonl.gz", "faults.jsonl", "discarded/evaluation.jsonl"):
+    (tmp_path / "config.json").write_text(json.dumps({"resolved": {"tasks": [GORE]}}))
+    kept = ("discarded/evaluation.jsonl", "policies/10/rows.jsonl", "work/actor_0/log.jsonl")
+    for name in ("episodes.jsonl", "starts.jsonl", "metrics.jsonl.gz", "faults.jsonl", *kept):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("not read")
     frame, problems = collect_evaluations([tmp_path])
     assert frame.is_empty()
     assert not problems
+
+
+@pytest.mark.parametrize("name", ["discarded", "work", "checkpoints", "policies", "tensorboard"])
+def test_runs_in_a_folder_that_is_called_as_one_of_a_run_are_read(tmp_path, name):
+    run_dir = tmp_path / "runs" / name / "seed_1"
+    (run_dir / name).mkdir(parents=True)
+    (run_dir / "config.json").write_text(json.dumps({"resolved": {"tasks": [GORE]}}))
+    (run_dir / "evaluation.jsonl").write_text(line(player="r/seed_1@9", run="r", run_seed=1, num_updates=9))
+    (run_dir / name / "evaluation.jsonl").write_text("not read")
+    (run_dir.parent / "random.jsonl").write_text(line())
+    for path in (tmp_path, tmp_path / "runs", run_dir.parent):
+        frame, problems = collect_evaluations([path])
+        assert sorted(frame["player"]) == ["r/seed_1@9", "random"]
+        assert not problems
 
 
 def test_a_half_written_line_is_named_and_the_rest_is_read(tmp_path):

@@ -170,6 +170,23 @@ def test_anybody_s_player_is_evaluated_by_the_same_protocol(tmp_path):
 
 
 @pytest.mark.engine
+def test_an_evaluation_says_which_episodes_it_does_not_play_again(tmp_path, capsys):
+    path, env = tmp_path / "rows.jsonl", player_env("random", EnvConfig())
+
+    def play(name: str, episodes: int) -> str:
+        evaluate_player(RandomPlayer, [TASK], path, name=name, episodes=episodes, env=env)
+        return capsys.readouterr().err
+
+    def said(held: int, wanted: int) -> str:
+        return f"{path}: holds {held} of these {wanted} episodes of 'mine', which are not played again; another player "
+
+    assert play("mine", 1) == ""
+    assert play("mine", 1) == said(1, 1) + "needs another name\n"
+    assert play("mine", 2) == said(1, 2) + "needs another name\n"
+    assert play("other", 1) == ""
+
+
+@pytest.mark.engine
 def test_rows_say_what_else_than_the_screen_a_player_observes(tmp_path):
     def play(**env) -> list[dict]:
         return evaluate_player(RandomPlayer, [TASK], path, name="mine", episodes=1, env=EnvConfig(**env))

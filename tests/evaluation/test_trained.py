@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import json
 import pickle
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +15,7 @@ from gvz.core.errors import CheckpointError, ConfigError
 from gvz.core.registry import OwnFiles
 from gvz.env import DoomEnv
 from gvz.evaluation.choice import EpisodeChoice
+from gvz.evaluation.episode_log import evaluate_player
 from gvz.evaluation.selection import TaskSelection
 from gvz.evaluation.trained import (
     TrainedPlayer,
@@ -150,6 +152,48 @@ def test_a_loaded_player_is_of_one_policy(run):
     assert load_player(str(run)).identity["num_updates"] == 100
     with pytest.raises(ConfigError, match=r"--checkpoint: got all, want one of .*20, 100"):
         load_player(run, "all")
+
+
+@pytest.mark.parametrize(
+    ("task", "changes", "message"),
+    [
+        ("dodge_projectiles/flames", {}, "dodge_projectiles/flames: the run was trained on defend_the_center, which"),
+        ("defend_the_center/gore", {"action_set": "combinations"}, "has action_set 'combinations', .* with 'buttons'"),
+        ("defend_the_center/gore", {"frame_height": 48}, r"has frame_shape \(48, 32, 1\), .* with \(24, 32, 1\)"),
+        ("defend_the_center/gore", {"grayscale": False}, r"has frame_shape \(24, 32, 3\), .* with \(24, 32, 1\)"),
+        ("defend_the_center/gore", {"frames": "classes"}, "has frames 'classes', .* learned with 'screen'; make it by"),
+        ("defend_the_center/gore", {"buffers": ("depth",)}, r"has buffers \('depth',\), .* learned with \(\)"),
+    ],
+)
+def test_a_policy_refuses_a_game_that_it_cannot_play(run, task, changes, message):
+    env = SimpleNamespace(task=parse_task(task), config=dataclasses.replace(CONFIG.env, **changes))
+    frame = np.zeros(env.config.frame_shape, np.uint8)
+    with pytest.raises(ConfigError, match=message):
+        TrainedPlayer(run, 20).begin(env, frame, {"variables": {}}, 1)
+
+
+def test_a_conditioned_policy_refuses_a_task_that_has_no_index(run):
+    config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, task_conditioned=True))
+    (run / "config.json").write_text(json.dumps(config_to_dict(config)))
+    write_policy(run, config, 20)
+    player, frame = TrainedPlayer(run, 20), np.zeros(config.env.frame_shape, np.uint8)
+    player.begin(SimpleNamespace(task=config.table.tasks[3], config=config.env), frame, {"variables": {}}, 1)
+    other = SimpleNamespace(task=parse_task("defend_the_center/complete"), config=config.env)
+    with pytest.raises(ConfigError, match="the policy takes the index of one of its 4 training tasks as input"):
+        player.begin(other, frame, {"variables": {}}, 1)
+
+
+@pytest.mark.engine
+def test_an_evaluation_in_python_by_other_rules_than_the_policys_is_refused(run, tmp_path):
+    policy, file = load_player(run), tmp_path / "mine.jsonl"
+    with pytest.raises(ConfigError, match=r"defend_the_center/gore: .* give evaluate_player env=policy\.env"):
+        evaluate_player(policy.make_player, ["defend_the_center/gore"], file, name="mine", episodes=1)
+    assert file.read_text() == ""
+    with (
+        pytest.raises(ConfigError, match="seek_and_kill/blue: the run was trained on"),
+        policy.make_env("seek_and_kill/blue") as env,
+    ):
+        policy.make_player().begin(env, *env.reset(seed=1), seed=1)
 
 
 def test_an_encoders_file_is_executed_only_if_it_is_named(tmp_path, run):

@@ -1,7 +1,9 @@
 """Policies of the zoo: packed, unpacked, played."""
 
 import dataclasses
+import errno
 import json
+import re
 import shutil
 from contextlib import closing
 
@@ -9,16 +11,21 @@ import numpy as np
 import pytest
 
 from gvz import cli
+from gvz.commands import zoo as zoo_command
 from gvz.core.env_config import EnvConfig
-from gvz.core.errors import ConfigError
+from gvz.core.errors import ConfigError, ResourceError
+from gvz.core.registry import OwnFiles
 from gvz.evaluation import zoo
 from gvz.evaluation.episode_log import RecordFile, read_rows
 from gvz.evaluation.trained import find_checkpoints, read_params, read_run_config, trained_player
 from gvz.evaluation.zoo import pack, run_directory, zoo_names
+from gvz.run.config_files import config_to_dict
 from gvz.run.rundir import RunDir
 from gvz.segmentation import segmenter_file
 from tests.evaluation.policies import CONFIG, write_policy
 from tests.test_segmentation import write_network
+
+SHIPPED = zoo.ZOO_DIRECTORY
 
 
 @pytest.fixture(autouse=True)
@@ -151,3 +158,61 @@ def test_an_unknown_policy_is_named(run):
         run_directory("zoo:dodge_projectile")
     with pytest.raises(ConfigError, match="zoo: got name 'a/b', want letters, digits, _ and -"):
         pack(run, "a/b")
+
+
+def test_a_list_says_of_a_policy_that_cannot_be_read_why_and_shows_the_others(run, tmp_path, capsys):
+    source = tmp_path / "theirs.py"
+    source.write_text(
+        "from learner.agents.configs.rainbow import CONFIG as CONFIG\n"
+        "from learner.agents.rainbow import AGENT as AGENT\n"
+    )
+    pack(run, "plain")
+    config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, name=str(source)))
+    (run / "config.json").write_text(json.dumps(config_to_dict(config)))
+    pack(run, "theirs", own_files=OwnFiles(agent=source))
+    whole = (zoo.ZOO_DIRECTORY / "plain.zip").read_bytes()
+    (zoo.ZOO_DIRECTORY / "cut.zip").write_bytes(whole[: len(whole) // 2])
+    assert cli.main(["zoo"]) == 0
+    _, cut, plain, theirs, *_ = capsys.readouterr().out.splitlines()
+    assert plain.split() == "zoo:plain screen 4 tasks 100 0 of 7 tasks evaluated".split()
+    assert cut.startswith(f"zoo:cut     error: {zoo.ZOO_DIRECTORY / 'cut.zip'} is damaged: File is not a zip")
+    assert theirs.startswith("zoo:theirs  error: ")
+    assert "its agent is a Python file" in theirs
+    for name in ([], ["theirs"]):
+        assert cli.main(["zoo", *name, "--agent", str(source)]) == 0
+        assert "its agent is a Python file" not in capsys.readouterr().out
+    assert cli.main(["zoo", "cut"]) == 2
+    assert "cut.zip is damaged: File is not a zip file; install GViZDoom again, or add" in capsys.readouterr().err
+
+
+def test_a_file_with_damaged_contents_is_told(run):
+    pack(run, "one")
+    file = zoo.ZOO_DIRECTORY / "one.zip"
+    data = bytearray(file.read_bytes())
+    start = data.index(b"BZh")
+    for first in (start, start + 40):  # no bzip2 at all, or another checksum
+        (damaged := data.copy())[first : first + 8] = bytes(8)
+        file.write_bytes(damaged)
+        with pytest.raises(ResourceError, match=r"one\.zip is damaged: .*; install GViZDoom again, or add the policy"):
+            run_directory("zoo:one")
+
+
+def test_a_policy_that_cannot_be_written_leaves_the_one_before(run, monkeypatch):
+    pack(run, "one")
+    before, copy = (zoo.ZOO_DIRECTORY / "one.zip").read_bytes(), shutil.copy
+
+    def full(source, target):
+        copy(source, target)
+        if zoo.ZOO_DIRECTORY in (target, *target.parents):
+            (target / source.name if target.is_dir() else target).write_bytes(b"half")
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(shutil, "copy", full)
+    with pytest.raises(OSError, match="No space left"):
+        pack(run, "one", "20")
+    assert [file.read_bytes() for file in zoo.ZOO_DIRECTORY.iterdir()] == [before]
+
+
+def test_the_example_of_the_help_adds_a_policy_of_a_new_name():
+    (name,) = re.findall(r"gvz zoo --add \S+ --name (\S+)", zoo_command.Zoo.__doc__)
+    assert not (SHIPPED / f"{name}.zip").exists()

@@ -49,6 +49,15 @@ def test_an_agent_trained_in_one_way_needs_no_more_than_its_name(small, tmp_path
     assert (run.id, run.training, run.seed) == ("seed_1111", "4 tasks", 1111)
 
 
+def test_a_run_in_a_folder_called_discarded_is_read_and_what_a_run_discarded_is_not(small, tmp_path):
+    one = small / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111"
+    run = tmp_path / "discarded" / "seed_1111"
+    shutil.copytree(one, run)
+    shutil.copytree(one, run / "discarded" / "further" / "seed_1111")
+    for path in (tmp_path, tmp_path / "discarded"):
+        assert [found.path for found in read_results([path]).runs] == [run]
+
+
 def test_final_are_the_last_quarter_of_a_runs_checkpoints(small):
     episodes = read_results([small]).episodes
     final = episodes.filter(pl.col("final") & pl.col("run").is_not_null())
