@@ -45,6 +45,13 @@ def test_a_learning_curve_is_the_mean_of_the_seeds_running_means():
     assert (curve.low[0], curve.high[0]) == (10.0, 20.0)
 
 
+def test_the_band_is_the_middle_95_percent_of_redrawn_seeds():
+    """Means of five of 0, 10, .. 40: their deviation is 14.1 / sqrt(5) = 6.3, and they are multiples of 2."""
+    curve = learning_curve("x", [run_of(n, [(0, "a/x", 10.0 * n), (99, "a/x", 10.0 * n)]) for n in range(5)], ["a/x"])
+    assert curve is not None
+    assert (curve.low[0], curve.high[0]) == pytest.approx((20 - 1.96 * 6.3, 20 + 1.96 * 6.3), abs=2.5)
+
+
 def test_a_curve_of_one_seed_shows_its_episodes():
     curve = learning_curve("x", [run_of(1, [(0, "a/x", 10.0), (99, "a/x", 30.0)])], ["a/x"])
     assert curve is not None

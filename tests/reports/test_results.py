@@ -65,6 +65,17 @@ def test_final_are_the_last_quarter_of_a_runs_checkpoints(small):
     assert episodes.filter(player="random")["final"].all()
 
 
+@pytest.mark.parametrize(("num_checkpoints", "num_final"), [(4, 1), (5, 2), (8, 2)])
+def test_the_last_quarter_is_rounded_up(tmp_path, num_checkpoints, num_final):
+    rows = [
+        evaluation_row(f"r@{n}", "seek_and_kill/default", 0, 50.0, run="r", run_seed=1, num_updates=n, params=str(n))
+        for n in range(num_checkpoints)
+    ]
+    write_rows(tmp_path / "rows.jsonl", rows)
+    final = read_results([tmp_path]).episodes.filter("final")
+    assert sorted(final["num_updates"]) == list(range(num_checkpoints))[-num_final:]
+
+
 def test_a_record_file_may_hold_several_runs_each_with_its_last_checkpoint(tmp_path):
     """As `gvz evaluate RUN RUN RUN --out FILE` writes it; the seeds have different numbers of gradient steps."""
     trained = [("DQN", 1, 400), ("DQN", 1, 100), ("DQN", 2, 300), ("PPO", 1, 50)]

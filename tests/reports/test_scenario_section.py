@@ -1,7 +1,8 @@
-"""The section of a scenario: own kills beside a score that is kills."""
+"""The section of a scenario: own kills beside a score that is kills, levels, who solved a task, gaps, curves."""
 
 import json
 
+from gvz.evaluation.statistics import SOLVED_EPISODES
 from gvz.experiments.plan import Plan
 from gvz.reports.results import read_results
 from gvz.reports.scenario_section import scenario_sections
@@ -47,6 +48,31 @@ def test_levels_are_means_of_named_tasks_alone(tmp_path):
     write_rows(tmp_path / "rows.jsonl", rows[-2:])
     (section,) = scenario_sections(read_results([tmp_path]), tmp_path)
     assert "dodge_projectiles_levels" not in [table.id for table in section.blocks[0].tables]
+
+
+def test_a_task_is_solved_where_the_newest_checkpoint_of_every_seed_survived(tmp_path):
+    """Final are the last two of five. An older one changes nothing, whether it survived or not."""
+    survivors = {"gore": {(1, 5), (2, 5)}, "default": {(1, 5)}, "stone_wall": {(1, 4), (2, 4)}}
+    rows = [
+        evaluation_row(
+            f"a/{seed}@{at}",
+            f"defend_the_center/{task}",
+            n,
+            100.0 if (seed, at) in survivors[task] else 50.0,
+            run="a",
+            run_seed=seed,
+            num_updates=at,
+            params=f"{seed} {at}",
+        )
+        for task in survivors
+        for seed in (1, 2)
+        for at in range(1, 6)
+        for n in range(SOLVED_EPISODES)
+    ]
+    write_rows(tmp_path / "rows.jsonl", rows)
+    (section,) = scenario_sections(read_results([tmp_path]), tmp_path)
+    (tasks,) = [table for table in section.blocks[0].tables if table.id.endswith("_tasks")]
+    assert {row[0].text for row in tasks.rows if row[2].note == "solved"} == {"gore"}
 
 
 def test_the_gap_of_an_agent_is_shown_in_each_of_its_scenarios(tmp_path, experiments_writer):

@@ -255,6 +255,29 @@ def test_a_lost_repeated_or_torn_record_is_found(reader: RingReader, writer: Rin
         reader.read(5)  # and it stays found
 
 
+def test_a_record_that_changes_while_it_is_copied_is_found(
+    reader: RingReader, writer: RingWriter, monkeypatch: pytest.MonkeyPatch
+):
+    write(writer, 0, 1)
+    fences = []
+
+    def overwrite_after_the_copy() -> None:
+        fences.append(1)
+        if len(fences) == 2:
+            steps_of(reader)["sequence"][1] = 9
+
+    monkeypatch.setattr(reader, "_fence", overwrite_after_the_copy)
+    with pytest.raises(TransportError, match="got record 9 where 1 should be; records were lost, repeated or torn"):
+        reader.read(2)
+
+
+def test_a_slot_that_is_being_filled_holds_no_record(reader: RingReader, writer: RingWriter):
+    write(writer, *range(CAPACITY))
+    reader.read(CAPACITY)
+    writer.reserve(1)
+    assert steps_of(reader)["sequence"][:2].tolist() == [2**64 - 1, 1]
+
+
 @settings(max_examples=100)
 @given(published=st.integers(0, 2**64 - 1), consumed=st.integers(0, 2**64 - 1))
 @example(published=2**64 - 1, consumed=2**64 - 1)
@@ -279,6 +302,14 @@ def test_a_damaged_count_of_waiting_does_not_end_the_writer(writer: RingWriter, 
     with pytest.raises(WaitTimeoutError, match="for the learner to read"):
         writer.wait_for_space(1, timeout_s=0.01)
     assert reader.writer_status().waited_for_space_s < 60  # counted on from there
+
+
+def test_the_wait_of_a_successor_is_added_to_those_of_its_predecessors(writer: RingWriter, reader: RingReader):
+    write(writer, *range(CAPACITY))
+    words_of(reader)[4] = 3600 * 10**9
+    with pytest.raises(WaitTimeoutError):
+        writer.wait_for_space(1, timeout_s=0.01)
+    assert reader.writer_status().waited_for_space_s > 3600
 
 
 def test_an_unknown_writer_state_is_found(reader: RingReader):

@@ -1,0 +1,85 @@
+"""A supervised actor whose process is made up: what its budget, its patience and its waits are counted from."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fake_env import config
+
+from actors import supervisor
+from actors.config import ActorsConfig
+from actors.pool import lanes_to_begin_with
+from actors.supervisor import SupervisedActor
+from gvz.transport.messages import Fault, Message, Ready
+from gvz.transport.ring import WriterState
+
+
+class Process:
+    """What `start_actor` gives, and its channel."""
+
+    def __init__(self):
+        self.said: list[Message] = []
+        self.exit: str | None = None
+        self.dumped = False
+        self.channel = self
+
+    def receive(self) -> list[Message]:
+        said, self.said = self.said, []
+        return said
+
+    def exit_text(self) -> str | None:
+        return self.exit
+
+    def dump_stacks(self) -> None:
+        self.dumped = True
+
+    def end(self, *, grace_s: float) -> None:
+        del grace_s
+
+
+@pytest.fixture
+def actor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SupervisedActor]:
+    monkeypatch.setattr(supervisor, "start_actor", lambda *_: Process())
+    limits = ActorsConfig(max_restarts=1, restart_window_s=100.0, heartbeat_timeout_s=30.0, start_timeout_s=120.0)
+    pool = config(tmp_path, {}, num_actors=1, actors=limits)
+    (spec,) = pool.actor_specs(lanes_to_begin_with(pool, None))
+    supervised = SupervisedActor(spec, limits, None)
+    supervised.start()
+    yield supervised
+    supervised.free()
+
+
+def get_ready(actor: SupervisedActor, now: float) -> None:
+    actor.process.said.append(Ready(actor=0, pid=1))
+    actor.watch(now, 0.0)
+
+
+def end(actor: SupervisedActor, now: float) -> Fault:
+    actor.process.exit = "exited with code 1"
+    (fault,) = actor.watch(now, 0.0)
+    return fault
+
+
+def test_an_end_counts_only_within_the_window(actor: SupervisedActor):
+    for now in (0.0, 150.0, 300.0):
+        assert end(actor, now).kind == "died"
+        actor.start()
+    assert end(actor, 350.0).kind == "gave_up", "two within 100 s"
+
+
+def test_an_actor_that_starts_an_engine_in_mid_run_is_given_the_time_of_a_start(actor: SupervisedActor):
+    get_ready(actor, 0.0)
+    process, writer = actor.process, actor.ring.writer()
+    for state, silence_s, is_stuck in ((WriterState.RESETTING, 99.0, False), (WriterState.ACTING, 31.0, True)):
+        writer.beat(state)
+        actor.watch(0.0, 1.0)
+        actor.watch(0.0, silence_s)
+        assert process.dumped == is_stuck
+
+
+def test_after_a_stable_life_the_next_start_comes_soon(actor: SupervisedActor):
+    assert end(actor, 0.0).message.endswith("in 0.50 s")
+    for begin, lived_s, wait in ((200.0, 5.0, "1.00 s"), (400.0, 15.0, "0.25 s")):
+        actor.start()
+        get_ready(actor, begin)
+        assert end(actor, begin + lived_s).message.endswith(f"in {wait}")
