@@ -25,7 +25,6 @@ class Staleness:
     """How old the parameters were that chose the actions, in versions behind the newest; all 0 of no decisions."""
 
     mean: float
-    median: int
     p95: int
     max: int
 
@@ -109,12 +108,12 @@ class Ingest:
         ages, self._ages = self._ages, Counter()
         num_decisions = ages.total()
         if num_decisions == 0:
-            return Staleness(mean=0.0, median=0, p95=0, max=0)
+            return Staleness(mean=0.0, p95=0, max=0)
         values = sorted(ages)
         up_to = np.cumsum([ages[value] for value in values])
-        median, p95 = (values[int(np.searchsorted(up_to, share * num_decisions))] for share in (0.5, 0.95))
+        p95 = values[int(np.searchsorted(up_to, 0.95 * num_decisions))]
         mean = sum(value * count for value, count in ages.items()) / num_decisions
-        return Staleness(mean=mean, median=median, p95=p95, max=values[-1])
+        return Staleness(mean=mean, p95=p95, max=values[-1])
 
     def state(self) -> list[bool]:
         """What a checkpoint keeps: whether each lane is in the middle of an episode."""
