@@ -73,13 +73,23 @@ def segmentation_loss(
     return (weights * losses).sum() / weights.sum()
 
 
+def learning_rate(num_steps: int, done: float) -> float:
+    """Adam's step, which rises over the first `_WARMUP_STEPS` gradient steps and falls by a cosine to 0 at the end.
+
+    Args:
+        num_steps: gradient steps that were done.
+        done: how much of the training that is, 0 to 1.
+    """
+    return _LEARNING_RATE * min(1.0, (num_steps + 1) / _WARMUP_STEPS) * (1 + np.cos(np.pi * done)) / 2
+
+
 def train_segmentation(
     batches: Iterable[tuple[np.ndarray, np.ndarray]],
     class_weights: np.ndarray,
     key: PRNGKeyArray,
     share_done: Callable[[int, float], float],
 ) -> Params:
-    """Trains a network by Adam. Its step rises over the first 100 gradient steps and falls by a cosine to 0 at the end.
+    """Trains a network by Adam, whose step is `learning_rate`.
 
     Args:
         batches: (screens u8[B H W 3], labels u8[B H W]), without end; all of one shape.
@@ -110,8 +120,7 @@ def train_segmentation(
             state = optimizer.init(params)
         if (done := share_done(num_steps, float(last))) >= 1.0:
             return params
-        rate = _LEARNING_RATE * min(1.0, (num_steps + 1) / _WARMUP_STEPS) * (1 + np.cos(np.pi * done)) / 2
-        params, state, last = step(params, state, screens, labels, np.float32(rate))
+        params, state, last = step(params, state, screens, labels, np.float32(learning_rate(num_steps, done)))
     return params
 
 

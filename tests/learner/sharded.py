@@ -165,18 +165,26 @@ def test_a_batch_is_of_complete_transitions_with_the_probabilities_and_weights_o
         np.testing.assert_allclose(info.weights, [w / max(raw) for w in raw], rtol=1e-5)
 
 
+def alike():
+    """Records that are the same in every lane."""
+    return [replace(record, lane=lane) for record in records(120, lanes=(0,)) for lane in range(4)]
+
+
+def test_devices_draw_by_keys_of_their_own():
+    _, info = Placed(4, alike()).draw(jax.random.key(0), 1.0, batch_size=64)
+    assert len(np.unique(info.slots.reshape(4, -1) % 40, axis=0)) == 4
+
+
 def test_where_all_devices_have_the_same_sum_of_priorities_a_draw_is_that_of_one_tree():
-    spec = replace(REPLAY_SPEC, num_newest=0)
-    stream = [replace(record, lane=lane) for record in records(120, lanes=(0,)) for lane in range(4)]
-    placed, one = Placed(4, stream, spec=spec), Placed(1, stream, spec=spec)
-    leaves = np.float64(np.asarray(sum_tree.get(one.replay.tree, jnp.arange(spec.num_slots))))
+    placed, one = Placed(4, alike()), Placed(1, alike())
+    leaves = np.float64(np.asarray(sum_tree.get(one.replay.tree, jnp.arange(REPLAY_SPEC.num_slots))))
     wanted = leaves / leaves.sum()
-    counts = np.zeros(spec.num_slots)
+    counts = np.zeros(REPLAY_SPEC.num_slots)
     for seed in range(40):
         _, info = placed.draw(jax.random.key(seed), 1.0, batch_size=128)
         np.testing.assert_allclose(info.probabilities, wanted[info.slots], rtol=1e-5)
         np.testing.assert_allclose(info.weights, 1.0, rtol=1e-5)
-        counts += np.bincount(info.slots, minlength=spec.num_slots)
+        counts += np.bincount(info.slots, minlength=REPLAY_SPEC.num_slots)
     assert not counts[leaves == 0].any()
     drawn = counts[leaves > 0]
     assert stats.chisquare(drawn, drawn.sum() * wanted[leaves > 0]).pvalue > 1e-3
@@ -272,28 +280,28 @@ def same_newest(state: ReplayState, devices: int) -> set[int]:
     return found | ({160} if len(found) < 4 else set())
 
 
-def learner_of(devices: int, tmp_path, restored: Restored | None = None) -> OffPolicyLearner:
+def learner_of(devices: int, tmp_path, restored: Restored | None = None, agent=AGENT) -> OffPolicyLearner:
     spec = replace(REPLAY_SPEC, num_newest=4)
-    return parts_of(devices, spec=spec).make(jax.random.key(5), TASKS, tmp_path, restored)
+    return parts_of(devices, agent, spec).make(jax.random.key(5), TASKS, tmp_path, restored)
 
 
 def saved(learner: OffPolicyLearner, tmp_path) -> Restored:
-    """Written, and read as a run does that has one device."""
+    """Written and read; shapes are the same for any number of devices."""
     checkpoint.write(tmp_path / "1", snapshot(learner.arrays()), learner.state())
-    arrays, host = checkpoint.read(tmp_path / "1", parts_of(1, spec=learner._parts.replay_spec).array_shapes())
+    arrays, host = checkpoint.read(tmp_path / "1", learner._parts.array_shapes())
     return Restored(num_updates=0, arrays=arrays, host=host, damage=[])
 
 
 def test_a_checkpoint_goes_on_with_any_number_of_devices(tmp_path):
     """1 -> 2 -> 4 -> 1: the same records, priorities, parameters; and learning goes on."""
     stream = records(400, replace(REPLAY_SPEC, num_newest=4))
-    learner = learner_of(1, tmp_path)
+    learner = learner_of(1, tmp_path, agent=LinearQ())
     learner.add([step_block(stream)], 0)
     for devices in (2, 4, 1):
         for _ in range(3):
             assert learner.update() == 1
         before = saved(learner, tmp_path)
-        learner = learner_of(devices, tmp_path, before)
+        learner = learner_of(devices, tmp_path, before, LinearQ())
         after = snapshot(learner.arrays())
         assert same_newest(before.arrays["replay"], devices) == set(after["replay"].newest)
         for tree in (before.arrays, after):

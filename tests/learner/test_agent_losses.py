@@ -120,6 +120,7 @@ def test_quantiles_and_munchausen_are_their_equations_in_float64(num_quantiles: 
         distributional=num_quantiles > 0,
         num_quantiles=num_quantiles,
         munchausen=munchausen,
+        munchausen_alpha=0.7,
         munchausen_temperature=0.5,
     )
     agent, _, evaluate, loss = jitted(config)
@@ -136,7 +137,7 @@ def test_quantiles_and_munchausen_are_their_equations_in_float64(num_quantiles: 
             log_pi_t = np.log(reference.softmax(z_t[i].mean(-1) / 0.5))
             log_pi_past = np.log(reference.softmax(z_past[i].mean(-1) / 0.5))
             value = sum(np.exp(log_pi_t[a]) * (z_t[i, a] - 0.5 * log_pi_t[a]) for a in range(A))
-            reward = float(b.r_t[i]) + 0.9 * max(-1.0, 0.5 * log_pi_past[action])
+            reward = float(b.r_t[i]) + 0.7 * max(-1.0, 0.5 * log_pi_past[action])
         else:
             value, reward = z_t[i, z_choice[i].mean(-1).argmax()], float(b.r_t[i])
         targets = reward + discount * value

@@ -280,6 +280,16 @@ def test_the_newest_transitions_stand_at_the_tail_of_the_batch():
     np.testing.assert_array_equal(info.probabilities[-3:], 1)
 
 
+def test_a_newest_transition_that_was_overwritten_is_in_no_batch():
+    """Streams that break off after their first record put nothing newer in its place."""
+    replayed = Replay(make_spec(num_lanes=2, capacity=40, n_steps=2, num_newest=3), batch_size=8)
+    replayed.add([record(0, first=t == 0) for t in range(5)])
+    replayed.add([record(0, first=True)] * 20)
+    replayed.add([record(1, first=t == 0) for t in range(3)])
+    _, info = replayed.sample()
+    assert set(info.slots.tolist()) == {20}
+
+
 def test_an_empty_replay_refuses_to_be_sampled():
     replayed = Replay(make_spec())
     replayed.add([record(first=t == 0) for t in range(3)])

@@ -151,19 +151,20 @@ class Float64Learner:
         return losses, norm
 
 
-def ppo_loss(learner: Float64Learner, w: np.ndarray) -> np.ndarray:
+def ppo_loss(learner: Float64Learner, w: np.ndarray, config: PPOConfig = PPO_.config) -> np.ndarray:
     """Schulman et al. 2017, eq. 7 and 9; normalized advantages and clipped values as in OpenAI's code."""
     outputs = learner.phi @ w.T
     logits, v = outputs[:, :A], outputs[:, A]
     p = np.exp(logits) / np.exp(logits).sum(1, keepdims=True)
     v_old, log_p_old = learner.extras.T
     advantage = learner.returns - v_old
-    advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+    if config.normalize_advantages:
+        advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
     ratio = p[np.arange(len(p)), learner.action] / np.exp(log_p_old)
-    surrogate = np.minimum(ratio * advantage, np.clip(ratio, 0.8, 1.2) * advantage)
-    near = v_old + np.clip(v - v_old, -0.1, 0.1)
+    surrogate = np.minimum(ratio * advantage, np.clip(ratio, 1 - config.clip, 1 + config.clip) * advantage)
+    near = v_old + np.clip(v - v_old, -config.value_clip, config.value_clip)
     squared = np.maximum((v - learner.returns) ** 2, (near - learner.returns) ** 2) / 2
-    return -surrogate + 0.5 * squared + 0.01 * (p * np.log(p)).sum(1)
+    return -surrogate + config.value_weight * squared + config.entropy_weight * (p * np.log(p)).sum(1)
 
 
 def pqn_loss(learner: Float64Learner, w: np.ndarray) -> np.ndarray:
@@ -217,6 +218,47 @@ def test_updates_are_those_of_the_equations_in_float64(name: str, loss, tmp_path
         np.testing.assert_allclose(metrics[key], value, rtol=1e-3, atol=1e-5, err_msg=key)
     assert metrics.keys() - wanted.keys() == set(state.metrics.agent)
     assert float(state.metrics.loss) == 0.0
+
+
+def test_settings_of_ppos_loss_are_those_of_its_configuration(tmp_path: Path):
+    config = replace(
+        PPO_.config, clip=0.1, value_clip=0.3, value_weight=0.7, entropy_weight=0.3, normalize_advantages=False
+    )
+    agent, windows = LinearPPO(config, SPEC), made_up_windows(2)
+    state = fresh_state(agent)
+    w = np.asarray(state.params["w"], np.float64)
+    metrics, _ = read_metrics(compiled(agent)(state, windows, np.int32(1)), NAMES, tmp_path)
+    wanted = ppo_loss(Float64Learner(w, windows, None), w, config).mean()
+    np.testing.assert_allclose(metrics["loss"], wanted, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_metrics_of_agents_are_of_the_steps_that_were_taken(name: str, tmp_path: Path):
+    """Those that nobody took would have the largest values: their frames are white, and all weights are positive."""
+    agent, windows = AGENTS[name], made_up_windows(extras_of(AGENTS[name]))
+    windows = replace(windows, frames=np.where(windows.last[:, None], np.uint8(255), windows.frames // 2))
+    state = fresh_state(agent)
+    w = np.abs(np.asarray(state.params["w"], np.float64))
+    state = replace(state, params=jax.tree.map(jnp.abs, state.params))
+    metrics, _ = read_metrics(compiled(agent)(state, windows, np.int32(1)), NAMES, tmp_path)
+    oracle = Float64Learner(w, windows, None)
+    outputs, taken = oracle.phi @ w.T, (np.arange(len(oracle.phi)), oracle.action)
+    if name == "ppo":
+        logits, v = outputs[:, :A], outputs[:, A]
+        p = np.exp(logits) / np.exp(logits).sum(1, keepdims=True)
+        ratio = p[taken] / np.exp(oracle.extras[:, 1])
+        wanted = {
+            "entropy": -(p * np.log(p)).sum(1).mean(),
+            "value_mean": v.mean(),
+            "td_error": np.abs(oracle.returns - v).mean(),
+            "kl": (ratio - 1 - np.log(ratio)).mean(),
+            "clipped_share": (np.abs(ratio - 1) > 0.2).mean(),
+        }
+    else:
+        q = outputs[taken]
+        wanted = {"td_error": np.abs(oracle.returns - q).mean(), "q_mean": q.mean(), "q_max": q.max()}
+    for key, value in wanted.items():
+        np.testing.assert_allclose(metrics[key], value, rtol=1e-4, atol=1e-5, err_msg=key)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from learner import segmentation_views as views
 from learner.segmentation import (
     CELL,
     SegmentationNetwork,
+    learning_rate,
     normalized,
     segmentation_loss,
     train_segmentation,
@@ -66,6 +67,12 @@ def test_onnx_runtime_computes_what_the_network_does(tmp_path: Path, height: int
     assert expected.shape == (1, height // CELL, width // CELL, NUM_CLASSES)
     assert expected.std() > 0.01, "it would be no test if all answers were alike"
     np.testing.assert_allclose(np.moveaxis(found, 1, -1), expected, atol=1e-5)
+
+
+def test_the_learning_rate_rises_for_100_steps_and_falls_to_0():
+    """Half of a cosine's fall is half of the way."""
+    points = [(0, 0.0), (99, 0.0), (500, 0.5), (500, 1.0)]
+    assert [learning_rate(*point) for point in points] == pytest.approx([3e-5, 3e-3, 1.5e-3, 0.0], abs=1e-12)
 
 
 @pytest.mark.isa
