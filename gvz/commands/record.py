@@ -78,10 +78,8 @@ class Record:
                     if moment.frames >= num_tics:
                         return
 
-        rate, stop = (
-            Fraction(TICS_PER_SECOND, 1 if every_tic else player_spec.env.frame_skip),
-            StopRequest(at_once=True),
-        )
+        rate = Fraction(TICS_PER_SECOND, 1 if every_tic else player_spec.env.frame_skip)
+        stop = StopRequest(at_once=True)
         try:
             with stop, contextlib.closing(pictures()) as drawn:
                 write_video(self.out, drawn, rate)

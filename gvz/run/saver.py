@@ -73,10 +73,9 @@ class Saver:
         self._hear()
         counts, period = self._counts, self._config.period_updates
         due = counts.updates // period > counts.saved_updates // period
-        if group.num_common_saved is None and self._num_failed:
-            due = due or time.monotonic() > self._retry_at_s
-        elif group.num_common_saved is None and counts.updates > counts.saved_updates:
-            due = due or time.monotonic() > self._begun_at_s + self._config.period_s
+        if group.num_common_saved is None and self.behind:
+            due_at_s = self._retry_at_s if self._num_failed else self._begun_at_s + self._config.period_s
+            due = due or time.monotonic() > due_at_s
         if due and group.may_save():
             self._begin(group.num_common_saved)
 
