@@ -112,8 +112,8 @@ def test_the_page_says_how_many_sergeants_died_by_other_hands():
     )
     assert idle == (1, 0)
     assert (
-        f"{random[0]} guards died of which random play killed {random[1]}, {sweep[0]} of which the sweep killed "
-        f"{sweep[1]}, and {scripted[0]} of which the script killed {scripted[1]}."
+        f"With random play {random[0]} guards died, and it killed {random[1]} of them. With the sweep {sweep[0]} died "
+        f"({sweep[1]} by the sweep), with the script {scripted[0]} ({scripted[1]} by the script)."
     ) in page
 
 
