@@ -13,27 +13,28 @@ PICTURES = {
     "learner_update": "performance_learner.png",
     "growth": "performance_growth.png",
 }
-"""benchmark -> the plot of its CPU record, in docs/images"""
+"""benchmark -> the plot of its record of a CPU and the released engine, in docs/images"""
 RATE_OF = {"actors": ("decisions_per_s", "decisions/s"), "learner_update": ("updates_per_s", "gradient steps/s")}
 
 
 def draw(records: Sequence[Record], directory: Path) -> list[Path]:
-    """Draws the plots of all CPU records; returns the files."""
+    """Draws the plots of all records of a CPU and the released engine; returns the files."""
     files = []
     for made in records:
-        if made.device != "cpu" or made.benchmark not in PICTURES:
+        if made.variant or made.benchmark not in PICTURES:
             continue
         files.append(directory / PICTURES[made.benchmark])
         if made.benchmark == "growth":
-            _growth(made.rows, files[-1])
+            figure = growth(made.rows)
         else:
             quantity, unit = RATE_OF[made.benchmark]
             rates = [row for row in made.rows if row["kind"] == "rates"]
-            _bars([(row["name"], row[quantity]) for row in rates], unit, files[-1])
+            figure = _bars([(row["name"], row[quantity]) for row in rates], unit)
+        figure.savefig(files[-1], dpi=120, metadata={"Software": None})
     return files
 
 
-def _bars(bars: Sequence[tuple[str, Spread]], unit: str, out: Path) -> None:
+def _bars(bars: Sequence[tuple[str, Spread]], unit: str) -> Figure:
     """One bar each, with its range over the rounds."""
     figure = Figure(figsize=(8.0, 0.9 + 0.32 * len(bars)), layout="constrained")
     axes = figure.subplots()
@@ -44,10 +45,10 @@ def _bars(bars: Sequence[tuple[str, Spread]], unit: str, out: Path) -> None:
     axes.set_yticks(range(len(bars)), [name for name, _ in bars])
     axes.invert_yaxis()
     axes.set(xlabel=f"{unit}: median, with min and max of the rounds")
-    figure.savefig(out, dpi=120, metadata={"Software": None})
+    return figure
 
 
-def _growth(rows: Sequence[Row], out: Path) -> None:
+def growth(rows: Sequence[Row]) -> Figure:
     """One panel for each growing size; both axes are logarithmic, so linear growth has a slope of one."""
     panels: dict[str, list[str]] = {}
     found = curves(rows)
@@ -64,6 +65,17 @@ def _growth(rows: Sequence[Row], out: Path) -> None:
             ]
             axes.errorbar([point["x"] for point in points], medians, yerr=errors, marker="o", capsize=3, label=name)
         axes.set(xscale="log", yscale="log", xlabel=x_unit, ylabel=found[names[0]][0]["unit"])
+        sizes = sorted({point["x"] for name in names for point in found[name]})
+        axes.set_xticks(sizes, list(map(_short, sizes)))  # the axis's own labels may lie on each other
+        axes.set_xticks([], minor=True)
         axes.grid(visible=True, which="both", alpha=0.3)
         axes.legend(fontsize=7)
-    figure.savefig(out, dpi=120, metadata={"Software": None})
+    return figure
+
+
+def _short(size: float) -> str:
+    """Three digits: 18855064 -> 18.9M."""
+    for unit, letter in ((1e6, "M"), (1e3, "K")):
+        if size >= unit:
+            return f"{size / unit:.3g}{letter}"
+    return f"{size:g}"

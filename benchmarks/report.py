@@ -83,8 +83,9 @@ def section(records: Sequence[Record], benchmark: str) -> str:
     if not mine:
         return f"There is no record of this benchmark; `python -m benchmarks {benchmark}` makes one."
     parts = [part for made in mine for part in _parts(made)]
-    if benchmark in PICTURES and any(made.device == "cpu" for made in mine):
-        parts.append(f"![{benchmark}: the figures above as a plot](images/{PICTURES[benchmark]})")
+    if benchmark in PICTURES and any(not made.variant for made in mine):
+        which = "the figures above" if len(mine) == 1 else "the first of the records above"
+        parts.append(f"![{benchmark}: {which} as a plot](images/{PICTURES[benchmark]})")
     return "\n\n".join(parts)
 
 

@@ -1,6 +1,7 @@
 """Every benchmark's body runs, its record says what it measured, and docs/PERFORMANCE.md says what the records give."""
 
 import dataclasses
+import itertools
 import json
 import os
 import signal
@@ -288,3 +289,26 @@ def test_the_plots_are_drawn_from_records(tmp_path):
     assert [file.name for file in files] == ["performance_actors.png", "performance_growth.png"]
     assert all(file.stat().st_size > 1000 for file in files)
     assert "![" in report.section(records, "growth")
+
+
+def test_the_plot_of_a_benchmark_is_of_the_released_engine_whatever_else_was_measured(tmp_path):
+    rows, faster = ([rounds.rates("actor pool", decisions_per_s=[rate])] for rate in (2.0, 4.0))
+    alone, both = [made(rows, benchmark="actors")], []
+    both += [*alone, made(faster, benchmark="actors", versions={**alone[0].versions, "vizdoom": "1.3.2+gvz.1"})]
+    drawn = []
+    for records in (alone, both):
+        [file] = plots.draw(records, tmp_path)
+        drawn.append(file.read_bytes())
+    assert drawn[0] == drawn[1]
+    assert "![actors: the first of the records above as a plot]" in report.section(both, "actors")
+
+
+@pytest.mark.parametrize("sizes", [(6_728_248, 18_855_064, 53_162_552), (1, 2, 3, 4)])
+def test_the_sizes_below_a_plot_of_growth_do_not_lie_on_each_other(sizes):
+    figure = plots.growth([rounds.measured("step", "ms", [1.0, 2.0], x=x, x_unit="parameters") for x in sizes])
+    figure.draw_without_rendering()
+    axis = figure.axes[0].xaxis
+    labels = [label for minor in (False, True) for label in axis.get_ticklabels(minor=minor) if label.get_text()]
+    boxes = sorted((label.get_window_extent() for label in labels), key=lambda box: box.x0)
+    assert len(boxes) == len(sizes)
+    assert all(left.x1 < right.x0 for left, right in itertools.pairwise(boxes))
