@@ -18,7 +18,7 @@ from gvz.evaluation.statistics import (
     probability_of_improvement,
 )
 from gvz.experiments.base import Experiment, TrainingRun
-from gvz.experiments.inventory import run_directory
+from gvz.experiments.inventory import run_directory, standing_checkpoints
 from gvz.reports.curves import evaluation_curve, learning_curve, level_curves
 from gvz.reports.document import Block, Cell, Figure, Section, Table, count, missing, theirs, words
 from gvz.reports.draw import draw_curves
@@ -77,11 +77,10 @@ def column_scores(
     for run in column_runs(experiment, scenario, column):
         wanted = run.tasks if trained else _column_tasks(experiment, run, column)
         tasks |= dict.fromkeys(wanted)
-        rows = _episodes_of(results, asked, [run]).filter(
-            pl.col("num_updates").rank("dense", descending=True) <= experiment.table_checkpoints,
-            pl.col("task").is_in(wanted),
-        )
-        for by_task in pick(rows).values():
+        rows = _episodes_of(results, asked, [run])
+        checkpoints = standing_checkpoints(run, rows["num_updates"].drop_nulls().unique().sort().to_list())
+        last = pl.col("num_updates").is_in(checkpoints[-experiment.table_checkpoints :])
+        for by_task in pick(rows.filter(last, pl.col("task").is_in(wanted))).values():
             runs.setdefault(run.seed, {}).update(by_task)
     own = experiment.evaluate_on == "own"
     return Scores(runs=runs, wanted_seeds=experiment.seeds, agents_of_tasks=own), tuple(tasks)

@@ -1,14 +1,17 @@
 """Tables of experiments: hand-worked numbers, published ones beside them and apart, missing cells missing."""
 
 import dataclasses
+import json
 
 import pytest
 
 from gvz.experiments.base import experiment_named
+from gvz.experiments.inventory import run_directory
 from gvz.experiments.plan import Plan
 from gvz.reports.experiment_section import aggregate_table, comparison_table, experiment_section, result_table
 from gvz.reports.results import PlannedExperiment, read_results
 from gvz.tasks import parse_task
+from tests.reports.conftest import write_rows
 
 SEEDS = {1111: 0.0, 2222: 3.0, 3333: 6.0}
 
@@ -129,3 +132,23 @@ def test_an_experiment_without_any_results_is_a_table_of_missing_cells(tmp_path)
     assert len(rows) == 5
     assert {cell.text for row in rows for cell in row[2:]} == {"-"}
     assert {cell.note for row in rows for cell in row[2:]} == {"0 of 3 seeds"}
+
+
+def test_a_table_is_of_the_planned_checkpoints_whatever_others_were_evaluated(tmp_path, experiments_writer):
+    plan = Plan.of("rainbow_evaluation", scale=0.05, scenarios=("defend_the_center",))
+    experiments_writer(tmp_path, plan, lambda played: 100.0 * played.updates / played.run.total_updates)
+    ((run, *_), (asked, *_)) = plan.runs(), plan.experiments()
+    assert (len(run.checkpoints), asked.table_checkpoints) == (10, 2)
+    file = run_directory(tmp_path, run) / "evaluation.jsonl"
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    newest = [row for row in lines if row["num_updates"] == run.checkpoints[-1]]
+    another = {"player": "stopped and resumed", "num_updates": run.checkpoints[-2] + 7, "normalized_score": 0.0}
+
+    def table() -> list[str]:
+        results = read_results([tmp_path])
+        return [cell.text for cell in result_table(results, results.asked[0]).rows[0]]
+
+    before = table()
+    assert before[2].startswith("95.0 [")  # of 90 and 100
+    write_rows(file, [*lines, *({**row, **another} for row in newest)])
+    assert table() == before
