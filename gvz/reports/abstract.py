@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import polars as pl
 
+from gvz.evaluation.simple import SIMPLE_PLAYERS
 from gvz.evaluation.statistics import Estimate, difference
 from gvz.experiments.inventory import run_directory, run_progress
 from gvz.experiments.plan import Evaluation
@@ -45,7 +46,12 @@ def what_was_run(results: Results) -> list[str]:
         )
     tasks = results.episodes["task"].n_unique()
     players = results.episodes.filter(pl.col("run").is_null())["player"].unique().sort().to_list()
-    beside = f", among them players that do not learn: {', '.join(players)}" if players else ""
+    kinds = {
+        "players that do not learn": [player for player in players if player in SIMPLE_PLAYERS],
+        "players that no run here has trained": [player for player in players if player not in SIMPLE_PLAYERS],
+    }
+    beside = "; ".join(f"{kind}: {', '.join(names)}" for kind, names in kinds.items() if names)
+    beside = f", among them {beside}" if beside else ""
     sentences.append(f"{count(len(results.episodes), 'evaluation episode')} on {count(tasks, 'task')}{beside}.")
     return sentences
 
@@ -128,10 +134,7 @@ def caveats(results: Results) -> list[str]:
             if small[0] < 0.1
             else f"Scale {small[0]:g}: budgets and episodes are shrunk; not comparable with published numbers."
         )
-    seeds = {agent: set() for agent in results.agents.values()}
-    for run in results.runs:
-        seeds[results.agents[str(run.path)]].add(run.seed)
-    if few := sorted(agent for agent, one in seeds.items() if len(one) < ENOUGH_SEEDS):
+    if few := sorted(agent for agent, seeds in _training_seeds(results).items() if len(seeds) < ENOUGH_SEEDS):
         found.append(
             f"Fewer than {ENOUGH_SEEDS} training seeds of {', '.join(few)}: intervals over so few are too short, and "
             "differences between agents may be differences between seeds."
@@ -150,6 +153,18 @@ def caveats(results: Results) -> list[str]:
     for asked in results.asked:
         found += _incomplete(results, asked)
     return found
+
+
+def _training_seeds(results: Results) -> dict[str, set[int]]:
+    """Those of each trained agent that were evaluated, whether their run directories are there or not; of an agent
+    without any evaluation, those of its runs.
+    """
+    evaluated = results.episodes.drop_nulls("run")
+    found, places = set(evaluated.select("agent", "run_seed").rows()), set(evaluated["run_dir"])
+    others = {(results.agents[str(run.path)], run.seed) for run in results.runs if str(run.path) not in places}
+    agents = {agent for agent, _ in found}
+    found |= {(agent, seed) for agent, seed in others if agent not in agents}
+    return {agent: {seed for one, seed in found if one == agent} for agent, _ in found}
 
 
 def _incomplete(results: Results, asked: PlannedExperiment) -> list[str]:

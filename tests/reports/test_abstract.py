@@ -120,3 +120,25 @@ def test_what_cannot_be_told_apart_is_said(tmp_path):
         (tmp_path / f"{player}.jsonl").write_text("".join(json.dumps({"schema": 1, **row}) + "\n" for row in rows))
     (sentence,) = who_has_more(read_results([tmp_path]))
     assert sentence.startswith("Seek and Kill, default: no difference shown between idle and random (0.0 [")
+
+
+def test_few_seeds_are_a_caveat_of_records_without_run_directories_too(tmp_path):
+    gore = "defend_the_center/gore"
+
+    def rows(seeds: range) -> list[dict]:
+        trained = [(seed, n) for seed in seeds for n in range(10)]
+        return [evaluation_row(f"r/{s}", gore, n, 50.0, run="r", run_seed=s, num_updates=9) for s, n in trained]
+
+    write_rows(tmp_path / "rows.jsonl", rows(range(9)))
+    (few,) = caveats(read_results([tmp_path]))
+    assert few.startswith("Fewer than 10 training seeds of r: ")
+    write_rows(tmp_path / "rows.jsonl", rows(range(10)))
+    assert caveats(read_results([tmp_path])) == []
+
+
+def test_a_player_of_ones_own_is_not_called_one_that_does_not_learn(tmp_path):
+    gore = "defend_the_center/gore"
+    write_rows(tmp_path / "rows.jsonl", [evaluation_row(player, gore, 0, 50.0) for player in ("my PPO", "random")])
+    (sentence,) = what_was_run(read_results([tmp_path]))
+    beside = "among them players that do not learn: random; players that no run here has trained: my PPO."
+    assert sentence == f"2 evaluation episodes on 1 task, {beside}"
