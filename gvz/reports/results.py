@@ -48,12 +48,14 @@ def read_results(paths: Sequence[Path]) -> Results:
     Raises:
         ConfigError: a path does not exist.
     """
-    episodes, problems = collect_evaluations(paths)
+    # what two of them hold is read from the outer one, whose other parts are then named alike
+    from_outside = sorted(paths, key=lambda path: (path.is_file(), len(path.resolve().parts)))
+    episodes, problems = collect_evaluations(from_outside)
     episodes, of_other_seeds = _of_one_base_seed(episodes)
     problems += of_other_seeds
     runs: dict[Path, Run] = {}
     asked = []
-    for path in paths:
+    for path in from_outside:
         for config in files_below(path, "config.json") if path.is_dir() else []:
             of_group = (config.resolve().parents[1] / "config.json").exists()  # a further learner process of that run
             discarded = is_in_folder_of_run(config, path, ("discarded",))

@@ -268,6 +268,17 @@ def test_runs_on_another_disk_are_read_through_links(small, tmp_path):
     assert str(seed / "episode.mp4") in {link.text for link in linked.blocks[0].links}
 
 
+@pytest.mark.parametrize("name", ["", "evaluation.jsonl"])
+def test_a_run_that_is_given_beside_its_results_by_another_name_stays_in_its_experiment(small, tmp_path, name):
+    run = small / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111"
+    (tmp_path / "latest").symlink_to(run)
+    alone, both = read_results([small]), read_results([tmp_path / "latest" / name, small])
+    assert not both.problems
+    assert both.agents == alone.agents
+    assert [one.id for one in both.runs] == [one.id for one in alone.runs]
+    assert both.episodes.equals(alone.episodes)
+
+
 def test_a_plan_that_is_a_broken_link_is_told_of(tmp_path):
     (tmp_path / "plan.json").symlink_to(tmp_path / "nowhere")
     (problem,) = read_results([tmp_path]).problems
