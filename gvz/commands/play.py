@@ -77,8 +77,8 @@ class Play:
 
         if self.episodes is not None and self.episodes < 1:
             raise ConfigError(f"--episodes: got {self.episodes}, want at least 1")
-        if self.seed < 0:
-            raise ConfigError(f"--seed: got {self.seed}, want at least 0")
+        if not 0 <= self.seed < 2**63:  # what a report reads
+            raise ConfigError(f"--seed: got {self.seed}, want a number from 0 to 2^63 - 1")
         if not self.name.strip() or self.name in SIMPLE_PLAYERS:
             raise ConfigError(f"--name: got {self.name!r}, want a name of your own, not {', '.join(SIMPLE_PLAYERS)}")
 

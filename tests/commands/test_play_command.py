@@ -24,7 +24,8 @@ TASK = "defend_the_center/flying_enemies+stone_wall"
     [
         ("defend_the_center/gor", "unknown attribute 'gor' (did you mean 'gore'?)"),
         (f"{TASK} --episodes 0", "--episodes: got 0, want at least 1"),
-        (f"{TASK} --seed -1", "--seed: got -1, want at least 0"),
+        (f"{TASK} --seed -1", "--seed: got -1, want a number from 0 to 2^63 - 1"),
+        (f"{TASK} --seed {2**63}", f"--seed: got {2**63}, want a number from 0 to 2^63 - 1"),
         (f"{TASK} --name sweep", "--name: got 'sweep', want a name of your own, not random, idle, sweep, scripted"),
     ],
 )
