@@ -148,9 +148,9 @@ def task_table(
 
 
 def own_kills_table(scenario: Scenario, own: Mapping[str, Scores], tasks: Sequence[Task]) -> Table:
-    """Tasks and then levels as rows, agents as columns: the enemies that the agent killed itself."""
+    """Tasks and then levels, of named tasks alone, as rows, agents as columns: the enemies that the agent killed."""
     groups = [(task.name, task.level, [task.id]) for task in tasks]
-    by_level = [(level, [task.id for task in tasks if task.level == level]) for level in LEVELS]
+    by_level = [(level, [task.id for task in _named(scenario, tasks) if task.level == level]) for level in LEVELS]
     groups += [(f"mean of {len(ids)} tasks", level, ids) for level, ids in by_level if len(ids) > 1]
     return Table(
         id=f"{scenario.id}_own_kills",

@@ -50,6 +50,16 @@ def test_levels_are_means_of_named_tasks_alone(tmp_path):
     assert "dodge_projectiles_levels" not in [table.id for table in section.blocks[0].tables]
 
 
+def test_own_kills_by_level_are_of_named_tasks_alone(tmp_path):
+    rows = [evaluation_row(who, task.id, 0, 40.0, player_kills=6.0) for who in ("a", "b") for task in (BLUE, RED)]
+    rows.append(evaluation_row("a", "seek_and_kill/blue=0.5", 0, 40.0, player_kills=0.0))
+    write_rows(tmp_path / "rows.jsonl", rows)
+    (section,) = scenario_sections(read_results([tmp_path]), tmp_path)
+    (own_kills,) = (table for table in section.blocks[0].tables if table.id == "seek_and_kill_own_kills")
+    last = [cell.text for cell in own_kills.rows[-1]]
+    assert last == ["mean of 2 tasks", "1", "6.0 [6.0, 6.0]", "6.0 [6.0, 6.0]"]
+
+
 def test_a_task_is_solved_where_the_newest_checkpoint_of_every_seed_survived(tmp_path):
     """Final are the last two of five. An older one changes nothing, whether it survived or not."""
     survivors = {"gore": {(1, 5), (2, 5)}, "default": {(1, 5)}, "stone_wall": {(1, 4), (2, 4)}}
