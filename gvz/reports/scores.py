@@ -92,6 +92,12 @@ def estimate_groups(groups: Sequence[tuple[Scores, Sequence[str]]], statistic: S
     if not groups or not all(tasks and runs for (_, tasks), runs in zip(groups, cells, strict=True)):
         return missing(note)
     how: list[Redraw] = [redraw(scores, tasks) for scores, tasks in groups]
-    same_runs = len({(scores.policies, scores.complete_seeds(tasks)) for scores, tasks in groups}) == 1
-    together = same_runs and groups[0][0].policies != () and set(how) == {"runs"}
+    together = set(how) == {"runs"} and _of_same_runs(groups)
     return ours(bootstrap_runs(cells, statistic, redraw=how, together=together), note, digits)
+
+
+def _of_same_runs(groups: Sequence[tuple[Scores, Sequence[str]]]) -> bool:
+    """Every seed has a policy that played in all groups; one of them may have further checkpoints of the run."""
+    common = set.intersection(*(set(scores.policies) for scores, _ in groups))
+    seeds = {scores.complete_seeds(tasks) for scores, tasks in groups}
+    return len(seeds) == 1 and {seed for seed, _, _ in common} >= set(*seeds)

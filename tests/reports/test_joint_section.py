@@ -52,11 +52,23 @@ def test_one_scenario_needs_no_such_section(tmp_path):
 
 
 @pytest.mark.parametrize("one_run_plays_all", [True, False])
-def test_a_run_that_plays_all_scenarios_is_redrawn_with_all_its_scores(tmp_path, one_run_plays_all):
-    """Then the mean over scenarios varies as much as each scenario; independent runs even out."""
+@pytest.mark.parametrize("num_earlier", [0, 7])
+def test_a_run_that_plays_all_scenarios_is_redrawn_with_all_its_scores(tmp_path, one_run_plays_all, num_earlier):
+    """Then the mean over scenarios varies as much as each scenario; independent runs even out. More checkpoints of it
+    may have been evaluated in one of them.
+    """
     rows = [
         evaluation_row(
-            f"all/{seed}", task.id, 0, percent, run="all", run_seed=seed, num_updates=1,
+            f"all/{seed}@{9 - age}", task.id, 0, percent, run="all", run_seed=seed, num_updates=9 - age,
+            params=f"{seed} {age}",
+        )
+        for seed, percent in enumerate((40.0, 50.0, 60.0))
+        for task in named_tasks("seek_and_kill", split="test")
+        for age in range(1, num_earlier + 1)
+    ]  # fmt: skip
+    rows += [
+        evaluation_row(
+            f"all/{seed}", task.id, 0, percent, run="all", run_seed=seed, num_updates=9,
             params=str(seed) if one_run_plays_all else f"{seed} {scenario}",
         )
         for seed, percent in enumerate((40.0, 50.0, 60.0))
