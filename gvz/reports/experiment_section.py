@@ -2,7 +2,7 @@
 
 import itertools
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -250,10 +250,17 @@ def _learning_curves(results: Results, asked: PlannedExperiment, scenario: str, 
     return figures
 
 
-def what_id(text: str) -> str:
-    """A name as part of a file name; one that is too long is cut and told from others by a checksum."""
-    id = "".join(c if c.isalnum() else "_" for c in text)
-    return id if len(id) <= MAX_ID_LENGTH else f"{id[:MAX_ID_LENGTH]}_{zlib.crc32(text.encode()):08x}"
+def what_id(text: str, beside: Collection[str] = ()) -> str:
+    """A name as part of a file name. One that is too long is cut. Such a one, and one that would be as that of another
+    name `beside` it, has a checksum at its end.
+    """
+
+    def plain(name: str) -> str:
+        return "".join(c if c.isalnum() else "_" for c in name)
+
+    id = plain(text)
+    alone = all(plain(other) != id for other in beside if other != text)
+    return id if alone and len(id) <= MAX_ID_LENGTH else f"{id[:MAX_ID_LENGTH]}_{zlib.crc32(text.encode()):08x}"
 
 
 def _curves_by_level(results: Results, asked: PlannedExperiment, scenario: str, out: Path) -> list[Figure]:

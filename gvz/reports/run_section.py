@@ -35,7 +35,8 @@ def run_sections(results: Results, out: Path) -> list[Section]:
         sections.append(
             Section(id="configuration", title="Configuration", blocks=(Block(tables=(_configurations(results),)),))
         )
-    if figures := [_shares(run, out) for run in results.runs if run.curriculum != "fixed"]:
+    ids = [run.id for run in results.runs]
+    if figures := [_shares(run, ids, out) for run in results.runs if run.curriculum != "fixed"]:
         text = "Scores of these tasks over time are among the curves of their scenarios."
         sections.append(
             Section(id="curriculum", title="Curriculum", blocks=(Block(text=(text,), figures=tuple(figures)),))
@@ -43,11 +44,12 @@ def run_sections(results: Results, out: Path) -> list[Section]:
     return [*sections, Section(id="records", title="Raw records", blocks=(_links(results, out),))]
 
 
-def _shares(run: Run, out: Path) -> Figure:
-    """Which tasks were played when."""
+def _shares(run: Run, ids: Sequence[str], out: Path) -> Figure:
+    """Which tasks were played when. `ids` are those of all runs."""
     curves = [share_curve(run, task) for task in run.tasks]
     caption = f"{run.id}, curriculum {run.curriculum}: share of each task in the last {SHARE_EPISODES} episodes."
-    return draw_curves(out, f"shares_{what_id(run.id)}", run.id, curves, caption, what="share of episodes, %")
+    id = f"shares_{what_id(run.id, ids)}"
+    return draw_curves(out, id, run.id, curves, caption, what="share of episodes, %")
 
 
 def _rates(runs: Sequence[Run]) -> Table:

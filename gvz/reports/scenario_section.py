@@ -61,7 +61,7 @@ def _section(results: Results, scenario: Scenario, out: Path) -> Section:
         final = episodes.filter("final")
         pictures = [_heat_map(scenario, scores, tasks, out)]
         for agent, one in scores.items():
-            id = f"attributes_{scenario.id}_{what_id(agent)}"
+            id = f"attributes_{scenario.id}_{what_id(agent, agents)}"
             if figure := attribute_figure(scenario, agent, one, tasks, out, id):
                 pictures.append(figure)
         pictures += _histograms(scenario, final, agents, out)
@@ -261,7 +261,7 @@ def _learning(results: Results, scenario: Scenario, out: Path) -> list[Figure]:
             caption += (
                 "; dots: episodes." if len({run.seed for run in runs}) == 1 else "; band: training seeds redrawn."
             )
-            id = f"learning_{scenario.id}_{what_id(agent)}"
+            id = f"learning_{scenario.id}_{what_id(agent, agents)}"
             figures.append(draw_curves(out, id, agent, lines, caption, _chance(results, tasks)))
     return figures
 
@@ -290,5 +290,6 @@ def _evaluation(
             continue
         caption = f"{scenario.title}, {agent}: evaluation of every checkpoint by level, with 95% interval."
         curves = level_curves(rows, usual_tasks(rows))
-        figures.append(draw_curves(out, f"evaluation_{scenario.id}_{what_id(agent)}", agent, curves, caption))
+        id = f"evaluation_{scenario.id}_{what_id(agent, agents)}"
+        figures.append(draw_curves(out, id, agent, curves, caption))
     return figures

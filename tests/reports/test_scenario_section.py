@@ -120,3 +120,16 @@ def test_one_checkpoint_of_each_seed_is_no_curve(tmp_path, monkeypatch):
         write_rows(tmp_path / "rows.jsonl", rows if several else rows[:2])
         scenario_sections(read_results([tmp_path]), tmp_path)
         assert drawn == ["evaluation_seek_and_kill_r"] * several
+
+
+def test_agents_with_nearly_the_same_name_have_figures_of_their_own(tmp_path):
+    rows = [
+        evaluation_row(f"{run}/1@{updates}", BLUE.id, 0, 40.0, run=run, run_seed=1, num_updates=updates, params=run)
+        for run in ("a-b", "a_b")
+        for updates in (1, 2)
+    ]
+    write_rows(tmp_path / "rows.jsonl", rows)
+    (section,) = scenario_sections(read_results([tmp_path]), tmp_path)
+    curves = [figure.id for figure in section.blocks[-1].figures]
+    assert len(set(curves)) == 2
+    assert all((tmp_path / "figures" / f"{id}.png").is_file() for id in curves)
