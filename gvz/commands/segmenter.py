@@ -75,7 +75,7 @@ class TrainSegmenter:
         from gvz.tasks import named_tasks
 
         gate_tasks = named_tasks(self.scenario, split="gate")
-        unfinished = self.out.with_suffix(".unfinished")
+        unfinished, record_file = self.out.with_suffix(".unfinished"), self.out.with_suffix(".json")
         try:
             unfinished.touch()
         except OSError as error:
@@ -139,6 +139,7 @@ class TrainSegmenter:
                     "fewer --frames"
                 )
             write_onnx(params, unfinished, INPUT_HEIGHT, INPUT_WIDTH)
+            record_file.unlink(missing_ok=True)  # of a network that was there before
             unfinished.replace(self.out)
             until_trained.close()
             segment, scores = Segmenter(str(self.out)), {}
@@ -160,7 +161,7 @@ class TrainSegmenter:
             "machine": of_machine,
             "average_precision": {task: {k: round(v, 3) for k, v in found.items()} for task, found in scores.items()},
         }
-        self.out.with_suffix(".json").write_text(json.dumps(record, indent=2) + "\n")
+        record_file.write_text(json.dumps(record, indent=2) + "\n")
         print(f"{self.out}: {steps:,} gradient steps in {spent_s:,.0f} processor seconds", file=sys.stderr)
         for task, found in scores.items():
             print(f"{task}: " + ", ".join(f"{name} {value:.2f}" for name, value in found.items()))

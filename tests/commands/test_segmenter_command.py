@@ -1,12 +1,17 @@
 """gvz segmenter, as it is called."""
 
 import json
+import shutil
 
+import numpy as np
 import pytest
 
 from gvz import cli
 from gvz.commands import segmenter
+from gvz.core.errors import EngineError
 from gvz.env import DoomEnv
+from gvz.evaluation.segmentation import Labelled
+from gvz.segmentation import SEGMENTERS
 
 
 @pytest.mark.parametrize(
@@ -49,6 +54,24 @@ def test_without_a_gradient_step_there_is_no_network_and_an_old_one_stays(capsys
     assert cli.main(["segmenter", *flags.split()]) == 2
     assert "--processor-s: got 0.01, but the games alone took " in capsys.readouterr().err
     assert [(path, path.read_text()) for path in tmp_path.iterdir()] == [(file, "old")]
+
+
+def test_a_network_that_was_not_scored_has_no_record_of_the_one_before_it(capsys, tmp_path, monkeypatch):
+    def frames(task, number):
+        if task.level == 2:
+            raise EngineError("the engine died on a gate task")
+        shape = (number, 144, 256)
+        return Labelled(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8), np.zeros(shape, np.uint8))
+
+    monkeypatch.setattr("gvz.evaluation.segmentation.labelled_frames", frames)
+    monkeypatch.setattr("learner.segmentation.train_segmentation", lambda *given: given[-1](1, 0.5))
+    shipped = SEGMENTERS / "seek_and_kill.onnx"
+    monkeypatch.setattr("learner.segmentation.write_onnx", lambda *given: shutil.copy(shipped, given[1]))
+    file = tmp_path / "mine.onnx"
+    file.with_suffix(".json").write_text("of an older network")
+    assert cli.main(["segmenter", "--scenario", "seek_and_kill", "--out", str(file), "--frames", "1"]) != 0
+    assert "the engine died on a gate task" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [file]
 
 
 @pytest.mark.engine
