@@ -21,7 +21,7 @@ ENOUGH_SEEDS = 10
 ENOUGH_EPISODES = 10
 """of a task, for an interval over episodes"""
 MOST_NAMES = 3
-"""of runs in a sentence; the others are counted"""
+"""of runs or files in a sentence; the others are counted"""
 
 
 def what_was_run(results: Results) -> list[str]:

@@ -6,14 +6,14 @@ from importlib.metadata import version
 from pathlib import Path
 
 from gvz.core.errors import ConfigError
-from gvz.reports.abstract import caveats, what_was_run, who_has_more
+from gvz.reports.abstract import MOST_NAMES, caveats, what_was_run, who_has_more
 from gvz.reports.document import Block, Document, Section
 from gvz.reports.experiment_section import experiment_section
 from gvz.reports.joint_section import joint_sections
 from gvz.reports.results import read_results
 from gvz.reports.run_section import run_sections
 from gvz.reports.scenario_section import scenario_sections
-from gvz.reports.write import write_document
+from gvz.reports.write import leftovers, write_document
 
 _PACKAGES = ("gvizdoom", "vizdoom", "jax", "numpy", "polars", "matplotlib")
 
@@ -26,7 +26,7 @@ def make_report(paths: Sequence[Path], out: Path, title: str | None = None) -> t
         out: directory for report.html, report.md, tables/ and figures/.
         title: default: the names of `paths`.
 
-    Returns: the files written, figures aside, and what could not be read or is missing.
+    Returns: the files written, figures aside; and what could not be read, is missing, or is of an earlier report.
 
     Raises:
         ConfigError: a path does not exist, there is nothing in any of them, `out` cannot be written, or two of the
@@ -62,4 +62,8 @@ def make_report(paths: Sequence[Path], out: Path, title: str | None = None) -> t
         out=out,
         made_with=f"This report was made with Python {platform.python_version()}, {versions}.",
     )
-    return write_document(document), results.problems
+    files, problems = write_document(document), results.problems
+    if others := [file.name for file in leftovers(document)]:
+        names = ", ".join(others[:MOST_NAMES]) + (f" and {len(others) - MOST_NAMES} more" * (len(others) > MOST_NAMES))
+        problems += (f"{out}: holds tables or figures that are not of this report: {names}; they are left as they are",)
+    return files, problems

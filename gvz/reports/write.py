@@ -38,6 +38,18 @@ def write_document(document: Document) -> list[Path]:
     return [document.out / name for name in files]
 
 
+def leftovers(document: Document) -> list[Path]:
+    """Tables and figures in `document.out` that are not this document's: those of an earlier one, with other agents."""
+    blocks = [block for section in document.sections for block in section.blocks]
+    own = {"tables": {t.id for b in blocks for t in b.tables}, "figures": {f.id for b in blocks for f in b.figures}}
+    return [
+        file
+        for folder, suffixes in (("tables", (".csv", ".tex")), ("figures", (".svg", ".pdf", ".png")))
+        for file in sorted((document.out / folder).iterdir())
+        if file.suffix in suffixes and file.stem not in own[folder]
+    ]
+
+
 def to_html(document: Document) -> str:
     """The page. Nothing in it is loaded from elsewhere."""
     environment = jinja2.Environment(
@@ -91,7 +103,7 @@ def _markdown_table(table: Table) -> str:
 
 
 def to_csv(table: Table) -> str:
-    """The table for programs: a column with numbers is three, the value and the ends of its interval.
+    """The table for programs: a column with numbers is four, the value, the ends of its interval, and the note.
 
     A missing cell is empty; a published number has no interval.
     """

@@ -96,3 +96,15 @@ def test_results_of_one_experiment_twice_are_an_error(tmp_path):
         (tmp_path / name / "plan.json").write_text(plan)
     with pytest.raises(ConfigError, match="more than one of the paths has results of quick_comparison"):
         make_report([tmp_path / "a", tmp_path / "b"], tmp_path / "out")
+
+
+def test_figures_of_an_earlier_report_are_named_and_stay(tmp_path):
+    row = '{"schema": 1, "player": "random", "task": "seek_and_kill/red", "episode": 0, "seed": 1, "score": 3}\n'
+    (tmp_path / "random.jsonl").write_text(row)
+    (tmp_path / "figures").mkdir()
+    earlier = [tmp_path / "figures" / f"{n}.png" for n in range(5)]
+    for file in earlier:
+        file.touch()
+    _, (note,) = make_report([tmp_path / "random.jsonl"], tmp_path)
+    assert note.endswith("that are not of this report: 0.png, 1.png, 2.png and 2 more; they are left as they are")
+    assert all(file.exists() for file in earlier)

@@ -7,7 +7,7 @@ import pytest
 
 from gvz.evaluation.statistics import Estimate
 from gvz.reports.document import Block, Document, Figure, Link, Section, Table, missing, ours, theirs, words
-from gvz.reports.write import to_csv, to_html, to_latex, to_markdown, write_document
+from gvz.reports.write import leftovers, to_csv, to_html, to_latex, to_markdown, write_document
 
 TABLE = Table(
     id="t",
@@ -81,3 +81,13 @@ def test_everything_is_written(tmp_path):
 def test_a_table_whose_rows_have_not_its_columns_is_a_mistake():
     with pytest.raises(AssertionError, match="table t: rows and columns differ"):
         Table(id="t", caption="", columns=("a", "b"), rows=((words("1"),),))
+
+
+def test_tables_and_figures_of_an_earlier_report_are_found(tmp_path):
+    (tmp_path / "figures").mkdir()
+    write_document(document(tmp_path))
+    assert leftovers(document(tmp_path)) == []
+    others = [tmp_path / "tables" / "joint.csv", tmp_path / "figures" / "joint.png"]
+    for file in (*others, tmp_path / "figures" / "notes.txt"):
+        file.touch()
+    assert leftovers(document(tmp_path)) == others
