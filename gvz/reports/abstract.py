@@ -139,10 +139,9 @@ def caveats(results: Results) -> list[str]:
             f"Fewer than {ENOUGH_SEEDS} training seeds of {', '.join(few)}: intervals over so few are too short, and "
             "differences between agents may be differences between seeds."
         )
-    by_cell = (
-        results.episodes.filter("final").drop_nulls("normalized_score").group_by("agent", "run_seed", "task").len()
-    )
-    if few := sorted(set(by_cell.filter(pl.col("len") < ENOUGH_EPISODES)["agent"])):
+    by_cell = results.episodes.filter("final").drop_nulls("normalized_score").group_by("agent", "run_seed", "task")
+    different = by_cell.agg(pl.col("episode").n_unique())  # several checkpoints play the same ones
+    if few := sorted(set(different.filter(pl.col("episode") < ENOUGH_EPISODES)["agent"])):
         found.append(
             f"Fewer than {ENOUGH_EPISODES} evaluation episodes of some task by {', '.join(few)}: intervals over so few "
             "are too short."

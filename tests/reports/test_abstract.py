@@ -142,3 +142,14 @@ def test_a_player_of_ones_own_is_not_called_one_that_does_not_learn(tmp_path):
     (sentence,) = what_was_run(read_results([tmp_path]))
     beside = "among them players that do not learn: random; players that no run here has trained: my PPO."
     assert sentence == f"2 evaluation episodes on 1 task, {beside}"
+
+
+def test_few_episodes_are_a_caveat_however_many_checkpoints_played_them(tmp_path):
+    rows = [
+        evaluation_row(f"r/1@{updates}", "defend_the_center/gore", n, 50.0, run="r", run_seed=1, num_updates=updates)
+        for updates in range(20)
+        for n in range(2)
+    ]
+    write_rows(tmp_path / "rows.jsonl", rows)
+    _, few = caveats(read_results([tmp_path]))
+    assert few.startswith("Fewer than 10 evaluation episodes of some task by r: ")
