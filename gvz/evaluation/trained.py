@@ -38,7 +38,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Values:
-    """An agent's estimates: action values, which are discounted reward to come, or a policy and a value."""
+    """An agent's estimates: action values, which are discounted reward to come, or a policy and a value.
+
+    With `agent.scale_rewards` the reward is scaled, by a factor of the task's own.
+    """
 
     q_values: np.ndarray | None
     """f32[A], if the agent has them"""
