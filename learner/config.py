@@ -23,6 +23,8 @@ class Range(NamedTuple):
 
 
 Share = Annotated[float, Range(0.0, 1.0)]
+_Kept = Annotated[float | None, Range(0.0, 0.99999)]
+"""of a moving average: 1 would keep the first parameters for ever, and near 1 float32 rounds away what is added"""
 
 
 @cache
@@ -244,10 +246,10 @@ class LearnerConfig:
     """clip the global gradient norm; default off, as in the thesis"""
     weight_decay: Annotated[float, Range(0.0, 10.0)] = 0.0
     """Adam's decoupled decay of all weights (AdamW), times the learning rate"""
-    target_ema: Annotated[float | None, Range(0.0, 1.0)] = None
+    target_ema: _Kept = None
     """share of themselves that target parameters keep at a gradient step (0.995: a moving average); default: copies
     every target_period_updates"""
-    average_ema: Annotated[float | None, Range(0.0, 1.0)] = None
+    average_ema: _Kept = None
     """likewise of a moving average of the parameters, which checkpoints keep for evaluation; default: no average"""
     target_period_updates: Annotated[int, Range(1, MOST_UPDATES)] = 3_000
     """gradient steps between copies into the target network"""
@@ -290,7 +292,7 @@ class OnPolicyConfig:
     """Adam"""
     max_grad_norm: Annotated[float | None, Range(1e-12, 1e12)] = 0.5
     """clip the global gradient norm"""
-    average_ema: Annotated[float | None, Range(0.0, 1.0)] = None
+    average_ema: _Kept = None
     """share of itself that a moving average of the parameters keeps at a gradient step. Evaluation plays with the
     average; default: no average"""
     devices: int = 1

@@ -126,7 +126,7 @@ def categorical_q_learning(
 
     Returns:
         (cross-entropy, KL divergence), one each per sample. Both have the same gradient; the KL divergence is 0 for
-        a perfect prediction, so it is what priorities are made of (Hessel et al. 2018, "Multi-step learning": p_t is
+        a perfect prediction, so it is what priorities are made of (Hessel et al. 2018, "The Integrated Agent": p_t is
         proportional to the KL loss to the power omega).
 
     Source: thesis eq. 4.17 and 4.2.6; Bellemare et al. 2017, Algorithm 1; Hessel et al. 2018.

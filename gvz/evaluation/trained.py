@@ -38,7 +38,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Values:
-    """An agent's estimates: action values, which are discounted reward to come, or a policy and a value."""
+    """An agent's estimates: action values, which are discounted reward to come, or a policy and a value.
+
+    With `agent.scale_rewards` the reward is scaled, by a factor of the task's own.
+    """
 
     q_values: np.ndarray | None
     """f32[A], if the agent has them"""
@@ -49,7 +52,7 @@ class Values:
     policy: np.ndarray | None
     """f32[A], the probability of each action, if the agent learns a policy"""
     value: float | None
-    """of what it sees, if the agent has one; with action values, the largest of them"""
+    """of what it sees, if the agent has one; with action values, that of the action it chooses"""
 
 
 def read_run_config(run_dir: Path, own_files: OwnFiles = NO_OWN_FILES) -> RunConfig:
@@ -225,14 +228,15 @@ class TrainedPlayer:
         """Its estimates when it chose the last action."""
         if self._evaluation is None:
             return None
-        _, q_values, probabilities, atoms, policy, value = self._evaluation
-        of_state = q_values if value is None else value
+        action, q_values, probabilities, atoms, policy, value = self._evaluation
+        if value is None and q_values is not None:  # the largest may be of an action that the task forbids
+            value = np.asarray(q_values)[:, int(action[0])]
         return Values(
             q_values=None if q_values is None else np.asarray(q_values)[0],
             probabilities=None if probabilities is None else np.asarray(probabilities)[0],
             atoms=None if atoms is None else np.asarray(atoms),
             policy=None if policy is None else np.asarray(policy)[0],
-            value=None if of_state is None else float(np.asarray(of_state)[0].max()),
+            value=None if value is None else float(np.asarray(value)[0]),
         )
 
     def begin(self, env: "DoomEnv", observation: "Observation", info: dict[str, Any], seed: int) -> None:

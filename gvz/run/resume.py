@@ -64,7 +64,8 @@ def changed_schedules(old: RunConfig, new: RunConfig) -> list[str]:
     if isinstance(new.learner, OnPolicyConfig) and new.learner.learning_rate_decay:
         found.append("the learning rate, which falls to 0 at its end,")
     replay = new.replay
-    if replay is not None and replay.prioritized:
+    # a draw without priorities is not uniform where games or devices have equal shares of it, whatever they hold
+    if replay is not None and (replay.prioritized or replay.equal_shares or new.learner.devices > 1):
         first, last = replay.importance_sampling_exponent, replay.importance_sampling_exponent_end
         if first != last:
             found.append(f"the importance-sampling exponent, which goes from {first:g} to {last:g} by its end,")

@@ -89,10 +89,12 @@ class PPO(NetworkAgent):
 
 
 def _normalized(x: Float[Array, " B"], weight: Float[Array, " B"]) -> Float[Array, " B"]:
-    """Mean 0 and deviation 1 over the steps of weight 1."""
-    total = jnp.maximum(weight.sum(), 1.0)
-    centred = x - (weight * x).sum() / total
-    return centred / (jnp.sqrt((weight * centred**2).sum() / total) + 1e-8)
+    """Mean 0 and deviation 1 over the steps of weight 1. A single step has no deviation: its number stays as it is."""
+    total = weight.sum()
+    at_least_one = jnp.maximum(total, 1.0)
+    centred = x - (weight * x).sum() / at_least_one
+    normalized = centred / (jnp.sqrt((weight * centred**2).sum() / at_least_one) + 1e-8)
+    return jnp.where(total > 1.0, normalized, x)
 
 
 AGENT = PPO

@@ -268,3 +268,18 @@ def test_an_agent_without_distributions_has_values_alone(run):
     assert player.values.q_values.shape == (3,)
     assert player.values.q_values.argmax() == action
     assert (player.values.probabilities, player.values.atoms) == (None, None)
+
+
+def test_the_value_is_that_of_an_action_which_the_task_allows(run):
+    """`unified_v1` has 21 actions, of which Defend the Center allows 6. The others were never learned."""
+    config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, action_set="unified_v1"))
+    (run / "config.json").write_text(json.dumps(config_to_dict(config)))
+    write_policy(run, config, 20)
+    player, mask = TrainedPlayer(run, 20), np.array(config.table.action_masks[0])
+    frame = np.random.default_rng(0).integers(0, 256, config.env.frame_shape, dtype=np.uint8)
+    env = SimpleNamespace(task=config.table.tasks[0], config=config.env, action_masks=lambda: mask)
+    player.begin(env, frame, {"variables": {}}, 1)
+    action = player.act()
+    q_values = player.values.q_values
+    assert q_values.argmax() in np.flatnonzero(~mask), "the largest is of a forbidden action"
+    assert player.values.value == q_values[action] == q_values[mask].max()

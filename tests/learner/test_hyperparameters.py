@@ -10,7 +10,7 @@ from gvz.core.errors import ConfigError
 from gvz.run.config import RunConfig
 from gvz.run.config_files import configs_directory, load_config
 from learner.agents.configs.rainbow import RainbowConfig
-from learner.config import LearnerConfig, ReplayConfig
+from learner.config import LearnerConfig, OnPolicyConfig, ReplayConfig
 
 
 def settings(config: RunConfig) -> dict[str, object]:
@@ -107,6 +107,9 @@ def test_the_page_says_what_each_configuration_has_of_the_recipe():
         (lambda: RainbowConfig(v_min=2.0, v_max=1.0), r"got 2\.0, 1\.0, want v_min < v_max"),
         (lambda: ReplayConfig(min_priority=0.0), r"replay\.min_priority: got 0\.0, want 1e-08\.\.100"),
         (lambda: LearnerConfig(max_grad_norm=0.0), r"learner\.max_grad_norm: got 0\.0, want 1e-12\.\.1e\+12"),
+        (lambda: LearnerConfig(target_ema=1.0), r"learner\.target_ema: got 1\.0, want 0\.\.0\.99999"),
+        (lambda: LearnerConfig(average_ema=1.0), r"learner\.average_ema: got 1\.0, want 0\.\.0\.99999"),
+        (lambda: OnPolicyConfig(average_ema=1.0), r"learner\.average_ema: got 1\.0, want 0\.\.0\.99999"),
     ],
 )
 def test_values_out_of_range_are_refused_by_name(make, message: str):

@@ -232,6 +232,26 @@ def test_settings_of_ppos_loss_are_those_of_its_configuration(tmp_path: Path):
     np.testing.assert_allclose(metrics["loss"], wanted, rtol=1e-4)
 
 
+def test_a_minibatch_of_one_step_learns_from_its_advantage(tmp_path: Path):
+    """It has no deviation to be divided by. The policy that acted had the same probabilities: the ratio is 1."""
+    config = replace(CONFIG, num_minibatches=L * T, max_grad_norm=None)
+    agent = LinearPPO(replace(PPO_.config, value_weight=0.0, entropy_weight=0.0, value_clip=None), SPEC)
+    assert agent.config.normalize_advantages
+    no, state = np.zeros(L * W, bool), fresh_state(agent, config)
+    windows = replace(made_up_windows(2), frames=np.zeros((L * W, 4), np.uint8), last=no, terminated=no, first=no)
+    log_p = jax.nn.log_softmax(state.params["w"][:A, 4])
+    extras = np.stack([np.arange(L * W), np.asarray(log_p)[windows.action]], axis=1).astype(np.float32)
+    windows = replace(windows, extras=extras)
+    oracle = Float64Learner(np.asarray(state.params["w"]), windows, None)
+    metrics, _ = read_metrics(compiled(agent, config)(state, windows, np.int32(1)), NAMES, tmp_path)
+    advantages = oracle.returns - oracle.extras[:, 0]
+    assert np.abs(advantages).min() > 0.05
+    assert np.isclose(-metrics["policy_loss"], advantages, rtol=1e-4).sum() == 1
+    p = np.exp(np.asarray(log_p, np.float64))
+    wanted = [abs(a) * np.linalg.norm(np.eye(A)[i] - p) for a, i in zip(advantages, oracle.action, strict=True)]
+    assert np.isclose(metrics["grad_norm"], wanted, rtol=1e-3).sum() == 1
+
+
 @pytest.mark.parametrize("name", AGENTS)
 def test_metrics_of_agents_are_of_the_steps_that_were_taken(name: str, tmp_path: Path):
     """Those that nobody took would have the largest values: their frames are white, and all weights are positive."""

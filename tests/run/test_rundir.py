@@ -164,9 +164,11 @@ def test_what_goes_by_the_length_of_a_run_is_said_when_that_changes(tmp_path):
             "learner.total_updates: 200000 -> 400000: the importance-sampling exponent, which goes from 0.4 to 1 by "
             "its end, is from now on that of a run of 400000 gradient steps"
         )
-        constant = dataclasses.replace(CONFIG.replay, importance_sampling_exponent_end=0.4)
-        run.write_config(dataclasses.replace(CONFIG, replay=constant))
-        assert run.check_resumable(dataclasses.replace(CONFIG, replay=constant, learner=longer)) == []
+        plain, equal = ({"prioritized": False, "equal_shares": shares} for shares in (False, True))
+        for changes, notes in (({"importance_sampling_exponent_end": 0.4}, []), (plain, []), (equal, [note])):
+            other = dataclasses.replace(CONFIG, replay=dataclasses.replace(CONFIG.replay, **changes))
+            run.write_config(other)
+            assert run.check_resumable(dataclasses.replace(other, learner=longer)) == notes
         ppo = load_config("ppo_quick")
         ppo = dataclasses.replace(ppo, learner=dataclasses.replace(ppo.learner, learning_rate_decay=True))
         run.write_config(ppo)

@@ -25,7 +25,7 @@ class PPOConfig(AgentConfig):
     entropy_weight: Annotated[float, Range(0.0, 1e6)] = 0.01
     """c2, weight of the policy's entropy"""
     normalize_advantages: bool = True
-    """mean 0 and deviation 1 in every minibatch, as in OpenAI's code"""
+    """mean 0 and deviation 1 in every minibatch, as in OpenAI's code; a minibatch of one step stays as it is"""
 
 
 CONFIG = PPOConfig
