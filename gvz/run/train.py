@@ -71,7 +71,11 @@ class Trainer:
         self._saver = Saver(run, config.checkpoint, self._counts, self._snapshot, self._monitor.failed_save)
         self._clock, self._collected_s = AwakeClock(LONGEST_WAIT_S), 0.0
         self._pool = parts.make_pool(config, None if host is None else host["pool"])
-        self._send()
+        try:
+            self._send()
+        except BaseException:
+            self._pool.close(grace_s=0.0)
+            raise
 
     def run(self, stop: StopRequest) -> None:
         """Trains until the last update, the end of its processor time, or a stop; then writes a checkpoint.
