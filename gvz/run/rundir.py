@@ -112,10 +112,14 @@ class RunDir:
         """Adds a row to a record file. On a full disk rows wait in memory, and are written with the next one.
 
         Raises:
-            GvzError: too many rows wait.
+            GvzError: too many rows wait. ResumeError: what an earlier start has written cannot be read.
         """
         if name not in self._writers:
-            self._writers[name] = records.Writer(self.path / name)
+            file = self.path / name
+            if file.exists():
+                with disk_checked(self.path):
+                    records.cut_half_row(file)  # the disk was full, and the process was killed then
+            self._writers[name] = records.Writer(file)
         self._writers[name].append(row)
 
     def record_lengths(self) -> dict[str, int]:

@@ -371,6 +371,19 @@ def test_rows_wait_for_room_on_a_full_disk_and_none_is_lost_or_torn(tmp_path):
     assert rows == [{"schema": records.SCHEMA, **row} for row in wanted]
 
 
+def test_a_row_follows_no_half_row_of_a_process_that_was_killed_on_a_full_disk(tmp_path):
+    """Its checkpoint vouches for rows that it still had in memory, so a later cut can be within another row."""
+    file, vouched = tmp_path / "episodes.jsonl", {"episodes.jsonl": 80}
+    file.write_text('{"schema": 1, "row": 0}\n{"schema": 1, "row": 1}\n{"schema": ')
+    for start in (2, 3, 4):
+        with RunDir(tmp_path) as run:
+            run.truncate_records(vouched)
+            run.append(file.name, {"row": start})
+    rows, problems = records.read(file)
+    assert ([row["row"] for row in rows], problems) == ([0, 1, 2, 4], [])
+    assert (tmp_path / "discarded" / file.name).read_text() == '": 1, "row": 3}\n'
+
+
 def test_rows_that_wait_are_written_at_the_end_or_said_to_be_lost(tmp_path):
     with RunDir(tmp_path / "late") as run:
         with full_disk(0):
