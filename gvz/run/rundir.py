@@ -50,7 +50,7 @@ class RunDir:
             for made in (path.parent, path) if in_another else (path,):  # a mode does not hold for parents
                 made.mkdir(parents=True, exist_ok=True, mode=0o700)
             self._lock = os.fdopen(os.open(path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600), "a+")
-            locked = records.lock(self._lock)
+            locked = records.lock(self._lock) and records.is_at(self._lock, path / "lock")  # not moved by --fresh
         if not locked:
             self._lock.close()
             raise ResumeError(f"run directory {path}: another running process uses it; wait or use --run-dir")

@@ -34,6 +34,22 @@ def test_it_is_private_and_held_by_one(tmp_path):
     RunDir(tmp_path / "run").close()
 
 
+def test_a_directory_that_is_moved_before_it_is_locked_is_not_held(tmp_path, monkeypatch):
+    """As by `--fresh` in another process, which then makes a new one in its place."""
+    path, lock = tmp_path / "run", records.lock
+
+    def move_first(file, **options):
+        monkeypatch.undo()
+        path.rename(tmp_path / "moved")
+        path.mkdir()
+        return lock(file, **options)
+
+    monkeypatch.setattr(records, "lock", move_first)
+    with pytest.raises(ResumeError, match="another running process uses it"):
+        RunDir(path)
+    RunDir(path).close()
+
+
 def test_the_directory_of_process_0_is_private_also_if_another_process_of_the_group_makes_it(tmp_path):
     before = os.umask(0)
     with RunDir(tmp_path / "runs" / "one" / "process_1", in_another=True):
