@@ -165,7 +165,14 @@ def test_two_processes_with_one_number_and_strangers_are_turned_away(monkeypatch
     monkeypatch.setattr(relay, "HELLO_TIMEOUT_S", 0.2)
     address = "127.0.0.1", free_port("127.0.0.1")
     the_relay = Relay(address, 2)
-    for said in (b"GET / HTTP/1.1\r\n\r\n", b'{"kind": "hello"}\n', b"[]\n", b"\xff\xfe\n", b""):
+    for said in (
+        b"GET / HTTP/1.1\r\n\r\n",
+        b'{"kind": "hello"}\n',
+        b"[]\n",
+        b"[" * 100_000 + b"\n",
+        b"\xff\xfe\n",
+        b"",
+    ):
         with socket.create_connection(address) as stranger:
             stranger.sendall(said)
             stranger.settimeout(30)
