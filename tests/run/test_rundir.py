@@ -34,22 +34,6 @@ def test_it_is_private_and_held_by_one(tmp_path):
     RunDir(tmp_path / "run").close()
 
 
-def test_a_directory_that_is_moved_before_it_is_locked_is_not_held(tmp_path, monkeypatch):
-    """As by `--fresh` in another process, which then makes a new one in its place."""
-    path, lock = tmp_path / "run", records.lock
-
-    def move_first(file, **options):
-        monkeypatch.undo()
-        path.rename(tmp_path / "moved")
-        path.mkdir()
-        return lock(file, **options)
-
-    monkeypatch.setattr(records, "lock", move_first)
-    with pytest.raises(ResumeError, match="another running process uses it"):
-        RunDir(path)
-    RunDir(path).close()
-
-
 def test_the_directory_of_process_0_is_private_also_if_another_process_of_the_group_makes_it(tmp_path):
     before = os.umask(0)
     with RunDir(tmp_path / "runs" / "one" / "process_1", in_another=True):
@@ -385,19 +369,6 @@ def test_rows_wait_for_room_on_a_full_disk_and_none_is_lost_or_torn(tmp_path):
     rows, problems = records.read(tmp_path / "metrics.jsonl")
     assert problems == []
     assert rows == [{"schema": records.SCHEMA, **row} for row in wanted]
-
-
-def test_a_row_follows_no_half_row_of_a_process_that_was_killed_on_a_full_disk(tmp_path):
-    """Its checkpoint vouches for rows that it still had in memory, so a later cut can be within another row."""
-    file, vouched = tmp_path / "episodes.jsonl", {"episodes.jsonl": 80}
-    file.write_text('{"schema": 1, "row": 0}\n{"schema": 1, "row": 1}\n{"schema": ')
-    for start in (2, 3, 4):
-        with RunDir(tmp_path) as run:
-            run.truncate_records(vouched)
-            run.append(file.name, {"row": start})
-    rows, problems = records.read(file)
-    assert ([row["row"] for row in rows], problems) == ([0, 1, 2, 4], [])
-    assert (tmp_path / "discarded" / file.name).read_text() == '": 1, "row": 3}\n'
 
 
 def test_rows_that_wait_are_written_at_the_end_or_said_to_be_lost(tmp_path):
