@@ -112,13 +112,15 @@ class Trainer:
 
     def close(self, *, abandon_save: bool = False) -> None:
         """Ends every actor, waits for the checkpoint (or abandons both), closes the records. Can be repeated."""
-        if abandon_save:
-            self._saver.abandon()
-        self._pool.close(grace_s=0.0 if abandon_save else STOP_TIMEOUT_S)
         try:
-            self._saver.wait()
+            self._pool.close(grace_s=0.0 if abandon_save else STOP_TIMEOUT_S)
         finally:
-            self._telemetry.close()
+            try:
+                if abandon_save:  # last: the thread that writes says a lot about files that are gone
+                    self._saver.abandon()
+                self._saver.wait()
+            finally:
+                self._telemetry.close()
 
     def _is_done(self) -> bool:
         """Processor time is looked at with every row of metrics: a row more or less is how exact its limit is."""

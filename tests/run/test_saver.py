@@ -1,5 +1,7 @@
 """The checkpoints of a run over its life: when they are written, and which stay."""
 
+import shutil
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +13,7 @@ from gvz.core.durable import saved_steps
 from gvz.run.config import CheckpointConfig
 from gvz.run.monitor import Counts
 from gvz.run.saver import Saver, Snapshot
+from learner import checkpoint
 
 STATE = {"w": np.zeros(2, np.float32)}
 
@@ -18,11 +21,11 @@ STATE = {"w": np.zeros(2, np.float32)}
 ALONE: Any = SimpleNamespace(num_common_saved=None, may_save=lambda: True)
 
 
-def started(path: Path, num_updates: int, period_s: float = 900.0) -> tuple[Saver, Counts]:
+def started(path: Path, num_updates: int, keep: int = 2) -> tuple[Saver, Counts]:
     counts = Counts(updates=num_updates, saved_updates=num_updates)
     run: Any = SimpleNamespace(path=path, checkpoints=path / "checkpoints")
     snapshot = Snapshot(STATE, STATE, {})
-    config = CheckpointConfig(period_updates=1000, period_s=period_s, keep=2)
+    config = CheckpointConfig(period_updates=1000, period_s=900.0, keep=keep)
     return Saver(run, config, counts, lambda: snapshot, lambda *_: None), counts
 
 
@@ -67,3 +70,37 @@ def test_last_checkpoints_of_a_process_that_ends_alone_leave_the_one_that_all_ha
     counts.updates = 2300
     saver.save_last(ALONE, lambda: None)
     assert saved_steps(tmp_path / "checkpoints") == [2200, 2300]
+
+
+def test_a_checkpoint_that_is_given_up_takes_no_place_of_a_whole_one(tmp_path, monkeypatch):
+    """A second Ctrl-C removes its files while the thread has just written the last of them."""
+    saver, counts = started(tmp_path, 0, keep=1)
+    counts.updates = 1000
+    saver.save_last(ALONE, lambda: None)
+    written, removing = threading.Event(), threading.Event()
+    fsync_tree, rmtree = checkpoint.fsync_tree, shutil.rmtree
+
+    def wait_for_the_removal(directory: Path) -> None:
+        fsync_tree(directory)
+        if directory.parent.name == "checkpoints":
+            written.set()
+            assert removing.wait(30)
+
+    def remove_in_two_parts(path: Path, **options: bool) -> None:
+        if threading.current_thread() is threading.main_thread():
+            (path / "host.msgpack").unlink()
+            removing.set()
+            thread.join(30)
+        rmtree(path, **options)
+
+    monkeypatch.setattr(checkpoint, "fsync_tree", wait_for_the_removal)
+    monkeypatch.setattr(shutil, "rmtree", remove_in_two_parts)
+    counts.updates = 2000
+    saver.save_when_due(ALONE)
+    thread = next(thread for thread in threading.enumerate() if thread.name == "checkpoint 2000")
+    assert written.wait(30)
+    saver.abandon()
+    assert not thread.is_alive()
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["1000"]
+    checkpoint.verify(tmp_path / "checkpoints" / "1000")
+    assert saver.wait() == "", "nobody is told that it is tried again"
