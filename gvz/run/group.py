@@ -112,8 +112,9 @@ class Several:
         group = config.group
         host, port = group.address
         coordinator = resolve(host, "group.coordinator")
-        require_private(coordinator, "group.coordinator", _PRIVATE)
-        _check_own_address(coordinator)
+        for address in coordinator:  # which of them is used is the libraries' matter
+            require_private(address, "group.coordinator", _PRIVATE)
+        _check_own_address(coordinator[0])
         self._process, self._num_processes = group.own_id, group.num_processes
         say(f"learner process {self._process} of {self._num_processes}: waiting for the others at {host}:{port}")
         hello: dict[str, Any] = {"config": _settings(config), "versions": machine.versions(_MUST_AGREE)}
@@ -236,10 +237,11 @@ def _check_own_address(coordinator: str) -> None:
     name = socket.gethostname()
     where = f"group: own host name {name!r}"
     own = resolve(name, where)
-    require_private(own, where, f"{_PRIVATE}, which /etc/hosts can give to {name}")
-    if ipaddress.ip_address(own).is_loopback and not ipaddress.ip_address(coordinator).is_loopback:
+    for address in own:
+        require_private(address, where, f"{_PRIVATE}, which /etc/hosts can give to {name}")
+    if ipaddress.ip_address(own[0]).is_loopback and not ipaddress.ip_address(coordinator).is_loopback:
         raise ConfigError(
-            f"{where}: got {own}, where other machines find only themselves, want an address of a private network; "
+            f"{where}: got {own[0]}, where other machines find only themselves, want an address of a private network; "
             f"change the line of {name} in /etc/hosts, or begin group.coordinator with 127.0.0.1 if all processes are "
             "on this machine"
         )

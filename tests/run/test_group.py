@@ -285,6 +285,21 @@ def test_a_coordinator_that_is_public_or_unknown_is_refused_before_anything_list
         WithoutDevices(replace(CONFIG, group=group), lambda _: None)
 
 
+@pytest.mark.parametrize(("name", "what"), [("both", r"\.coordinator"), ("doom7", ": own host name 'doom7'")])
+def test_a_name_with_a_public_address_beside_a_private_one_is_refused(name, what, monkeypatch):
+    """The relay listens at IPv4, where the first address may be of IPv6."""
+    known = {name: ["fd00::1", "8.8.8.8"]}
+    monkeypatch.setattr(socket, "gethostname", lambda: "doom7")
+    monkeypatch.setattr(
+        socket,
+        "getaddrinfo",
+        lambda host, *_, **__: [(None, None, 6, "", (ip, 0)) for ip in known.get(host, ["10.0.0.1"])],
+    )
+    group = GroupConfig(num_processes=2, process_id=0, coordinator="both:1")
+    with pytest.raises(ConfigError, match=rf"^group{what}: 8\.8\.8\.8 is a public address"):
+        WithoutDevices(replace(CONFIG, group=group), lambda _: None)
+
+
 @pytest.mark.parametrize(
     ("own", "coordinator", "message"),
     [
@@ -313,7 +328,7 @@ def test_debians_address_of_an_own_host_name_is_good_enough_on_one_machine(monke
 def named(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """This machine's name has this address."""
     monkeypatch.setattr(socket, "gethostname", lambda: "doom7")
-    monkeypatch.setattr("gvz.run.group.resolve", lambda host, _: address if host == "doom7" else host)
+    monkeypatch.setattr("gvz.run.group.resolve", lambda host, _: [address] if host == "doom7" else [host])
 
 
 def test_a_fresh_start_of_a_group_is_refused(tmp_path, capsys):
