@@ -167,7 +167,7 @@ class RunDir:
 
     @contextlib.contextmanager
     def _discarding_evaluations(self, num_updates: int, *, policies_too: bool) -> Generator[None]:
-        """Moves the rows of later policies. Within it no evaluation begins."""
+        """Within it no evaluation begins; at its end the rows of later policies are moved."""
 
         def is_later(row: dict[str, Any]) -> bool:
             return isinstance(row.get("num_updates"), int) and row["num_updates"] > num_updates
@@ -182,8 +182,8 @@ class RunDir:
                     f"{file} is being written by another process, and the run, which goes on from update "
                     f"{num_updates}, discards later policies and their evaluation; wait until that process has ended"
                 )
-            records.move_rows(file, is_later, self.path / "discarded" / EVALUATION_RECORDS)
             yield
+            records.move_rows(file, is_later, self.path / "discarded" / EVALUATION_RECORDS)  # last: unlocks the file
 
     def close(self) -> None:
         """Closes the record files and releases the lock. Can be repeated.

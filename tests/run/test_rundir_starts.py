@@ -4,6 +4,7 @@ import pytest
 
 from gvz.core import records
 from gvz.core.errors import ResumeError
+from gvz.run import rundir
 from gvz.run.rundir import RunDir
 
 
@@ -34,3 +35,24 @@ def test_a_row_follows_no_half_row_of_a_process_that_was_killed_on_a_full_disk(t
     rows, problems = records.read(file)
     assert ([row["row"] for row in rows], problems) == ([0, 1, 2, 4], [])
     assert (tmp_path / "discarded" / file.name).read_text() == '": 1, "row": 3}\n'
+
+
+def test_no_evaluation_begins_before_later_policies_are_discarded(tmp_path, monkeypatch):
+    """Its rows would be of a policy that the run never had."""
+    file, move = tmp_path / "evaluation.jsonl", rundir._move_into
+    file.write_text('{"schema": 1, "num_updates": 20}\n')
+    (tmp_path / "policies" / "20").mkdir(parents=True)
+    began = []
+
+    def move_beside_an_evaluation(folder, directory):
+        evaluation = records.Writer(file)
+        began.append(evaluation.lock())
+        evaluation.close()
+        move(folder, directory)
+
+    monkeypatch.setattr(rundir, "_move_into", move_beside_an_evaluation)
+    with RunDir(tmp_path) as run:
+        run.discard_after(10)
+    assert began == [False]
+    assert file.read_text() == ""
+    assert not list((tmp_path / "policies").iterdir())
