@@ -275,7 +275,12 @@ class Checkpointer:
             WaitTimeoutError: the earlier save does not end.
         """
         self.wait()
-        copies = [snapshot(params), snapshot(arrays)]  # the thread takes them out, so that it can let go of them
+        failed = f"checkpoint {self._checkpoints / str(num_updates)} could not be written"
+        try:
+            copies = [snapshot(params), snapshot(arrays)]  # the thread takes them out, so that it can let go of them
+        except MemoryError as error:
+            self._outcome = f"{failed}: there is no memory for a copy of its arrays: {error}"
+            return
 
         def work() -> None:
             try:
@@ -293,8 +298,13 @@ class Checkpointer:
             copies.clear()
             release_freed_memory()
 
-        self._thread = threading.Thread(target=work, name=f"checkpoint {num_updates}", daemon=True)
-        self._thread.start()
+        thread = threading.Thread(target=work, name=f"checkpoint {num_updates}", daemon=True)
+        try:
+            thread.start()
+        except RuntimeError as error:  # too many threads and processes
+            self._outcome = f"{failed}: {error}"
+            return
+        self._thread = thread
 
     def outcome(self) -> str | None:
         """How the last save ended, told once: why it failed, or "" if it is written. None: nothing new has ended."""

@@ -3,11 +3,13 @@
 import shutil
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from gvz.core.durable import saved_steps
 from gvz.run.config import CheckpointConfig
@@ -21,12 +23,14 @@ STATE = {"w": np.zeros(2, np.float32)}
 ALONE: Any = SimpleNamespace(num_common_saved=None, may_save=lambda: True)
 
 
-def started(path: Path, num_updates: int, keep: int = 2) -> tuple[Saver, Counts]:
+def started(
+    path: Path, num_updates: int, keep: int = 2, report: Callable[[str, float], None] = lambda *_: None
+) -> tuple[Saver, Counts]:
     counts = Counts(updates=num_updates, saved_updates=num_updates)
     run: Any = SimpleNamespace(path=path, checkpoints=path / "checkpoints")
     snapshot = Snapshot(STATE, STATE, {})
     config = CheckpointConfig(period_updates=1000, period_s=900.0, keep=keep)
-    return Saver(run, config, counts, lambda: snapshot, lambda *_: None), counts
+    return Saver(run, config, counts, lambda: snapshot, report), counts
 
 
 def test_a_slow_run_is_saved_after_a_time_and_still_at_the_multiples(tmp_path, monkeypatch):
@@ -104,3 +108,29 @@ def test_a_checkpoint_that_is_given_up_takes_no_place_of_a_whole_one(tmp_path, m
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["1000"]
     checkpoint.verify(tmp_path / "checkpoints" / "1000")
     assert saver.wait() == "", "nobody is told that it is tried again"
+
+
+@pytest.mark.parametrize(
+    ("where", "error", "said"),
+    [
+        ((threading.Thread, "start"), RuntimeError("can't start new thread"), "written: can't start new thread"),
+        ((checkpoint, "snapshot"), MemoryError("8 GiB"), "there is no memory for a copy of its arrays: 8 GiB"),
+    ],
+    ids=["thread", "memory"],
+)
+def test_a_save_that_cannot_begin_is_reported_and_tried_again(tmp_path, monkeypatch, where, error, said):
+    def fail(*_: object) -> None:
+        raise error
+
+    failures: list[str] = []
+    saver, counts = started(tmp_path, 0, report=lambda failure, _: failures.append(failure))
+    counts.updates = 1000
+    with monkeypatch.context() as short:
+        short.setattr(*where, fail)
+        saver.save_when_due(ALONE)
+        assert saver.wait() == failures[0]
+    assert said in failures[0]
+    assert saver.behind
+    saver.save_last(ALONE, lambda: None)
+    assert saved_steps(tmp_path / "checkpoints") == [1000]
+    assert len(failures) == 1
