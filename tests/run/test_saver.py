@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from gvz.core.durable import saved_steps
+from gvz.core.errors import ResumeError
 from gvz.run.config import CheckpointConfig
 from gvz.run.monitor import Counts
 from gvz.run.saver import Saver, Snapshot
@@ -108,6 +109,13 @@ def test_a_checkpoint_that_is_given_up_takes_no_place_of_a_whole_one(tmp_path, m
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["1000"]
     checkpoint.verify(tmp_path / "checkpoints" / "1000")
     assert saver.wait() == "", "nobody is told that it is tried again"
+
+
+@pytest.mark.parametrize("folder", ["checkpoints", "policies"])
+def test_folders_that_cannot_be_made_are_told_in_one_line(tmp_path, folder):
+    (tmp_path / folder).touch()
+    with pytest.raises(ResumeError, match=f"^run directory {tmp_path}: File exists; mend this"):
+        started(tmp_path, 0)
 
 
 @pytest.mark.parametrize(
