@@ -8,6 +8,7 @@ import contextlib
 import json
 import socket
 import threading
+import time
 from typing import Any
 
 MAX_LINE_BYTES = 2**20
@@ -109,6 +110,19 @@ def free_port(host: str) -> int:
     """A port that nobody listens to now."""
     with socket.create_server((host, 0)) as server:
         return server.getsockname()[1]
+
+
+def wait_for_listener(address: tuple[str, int], timeout_s: float) -> None:
+    """Returns when somebody listens there. Raises OSError: why there is no connection after this time."""
+    deadline_s = time.monotonic() + timeout_s
+    while True:
+        try:
+            socket.create_connection(address, timeout=timeout_s).close()
+            return
+        except OSError:
+            if time.monotonic() > deadline_s:
+                raise
+            time.sleep(0.1)
 
 
 def encode(message: dict[str, Any]) -> bytes:

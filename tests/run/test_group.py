@@ -205,6 +205,33 @@ def test_waits_for_the_others_are_bounded_and_say_for_whom(monkeypatch):
     the_relay.close()
 
 
+def test_a_process_that_cannot_reach_jax_in_process_0_says_so(monkeypatch):
+    """As behind a firewall that lets the coordinator's port through alone."""
+
+    def join_in_process_1(self: Several, host: str, port: int) -> None:
+        if self._process == 1:
+            Several._join_jax(self, host, port)
+
+    monkeypatch.setattr(WithoutDevices, "_join_jax", join_in_process_1)
+    monkeypatch.setattr("gvz.run.group.JAX_TIMEOUT_S", 0.3)
+    first, second = joined(2)
+    first._opened.close()
+    assert isinstance(second, WaitTimeoutError)
+    assert str(second).startswith("group: waited 0 s for JAX's coordinator at 127.0.0.1:")
+    assert str(second).endswith("(Connection refused); let learner processes reach all ports of each other's hosts")
+
+
+def test_jax_in_process_0_may_come_late():
+    address = "127.0.0.1", free_port("127.0.0.1")
+    waiting = threading.Thread(target=relay.wait_for_listener, args=(address, 30.0))
+    waiting.start()
+    waiting.join(0.3)
+    assert waiting.is_alive()
+    with socket.create_server(address):
+        waiting.join(30)
+    assert not waiting.is_alive()
+
+
 def test_a_forwarded_connection_outlives_the_other_end():
     with socket.create_server(("127.0.0.1", 0)) as server:
         near = socket.create_connection(("127.0.0.1", Forward(server.getsockname()[:2]).port))
