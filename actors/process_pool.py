@@ -153,9 +153,10 @@ class ProcessPool(Pool):
         try:
             end_all([actor.process for actor in self._actors if actor.process is not None], grace_s)
         finally:
+            inference, self._inference = self._inference, None  # one that was abandoned is not waited for later
             try:
-                if self._inference is not None:
-                    self._inference.close(abandon=grace_s == 0.0)
+                if inference is not None:
+                    inference.close(abandon=grace_s == 0.0)
             finally:
                 for actor in self._actors:
                     actor.free()

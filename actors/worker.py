@@ -128,7 +128,6 @@ def main() -> int:
             os.close(inherited)
         worker.run()
     except Exception as error:  # the process boundary: whatever it is, the learner is to hear of it
-        traceback.print_exc()
         kind = "engine_start" if isinstance(error, EngineError) else "exception"
         message = f"{type(error).__name__}: {error}"
         channel.send(
@@ -141,6 +140,8 @@ def main() -> int:
                 fatal=True,
             )
         )
+        with contextlib.suppress(OSError):  # the disk with the log is full
+            traceback.print_exc()
         return 1
     finally:
         channel.close()

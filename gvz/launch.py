@@ -15,7 +15,7 @@ import tyro
 
 from gvz.core.errors import ConfigError, GvzError
 from gvz.core.libraries import require_learner
-from gvz.core.stop import StopRequest, exit_at_once
+from gvz.core.stop import StopRequest, exit_at_once, say
 from gvz.run.config import RunConfig, with_agent
 from gvz.run.config_files import load_config
 from gvz.run.rundir import RunDir, move_aside
@@ -97,11 +97,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if launch.fresh and launch.run.group.num_processes > 1:
                 raise ConfigError("--fresh: got it for a group of learner processes; give all another --run-dir")
             if launch.fresh and (moved := move_aside(directory)) is not None:
-                print(f"moved the old run to {moved}", file=sys.stderr)
+                say(f"moved the old run to {moved}")
             with RunDir(Path(directory), in_another=launch.run.group.own_id > 0) as run:
                 config = resumed_config(run, launch.run)
                 for note in run.check_resumable(config):
-                    print(note, file=sys.stderr)
+                    say(note)
                 stop.importing = True
                 from gvz.run.train import train  # imports jax, so only after the input is checked
 
@@ -110,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except GvzError as error:
             if in_group:  # a normal end would wait for the other processes
                 exit_at_once(error.exit_code, f"error: {error}")
-            print(f"error: {error}", file=sys.stderr)
+            say(f"error: {error}")
             return error.exit_code
         except KeyboardInterrupt:  # it would wait for a thread that writes a checkpoint
             exit_at_once(stop.exit_code, "stopped at once")

@@ -17,6 +17,8 @@ import logging
 import os
 import shutil
 import threading
+from collections.abc import Callable, Generator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -112,8 +114,15 @@ def _blocks(leaves: list[np.ndarray]) -> dict[str, np.ndarray]:
     return blocks
 
 
-def write(directory: Path, arrays: Any, host: dict[str, Any]) -> None:
+def write(
+    directory: Path,
+    arrays: Any,
+    host: dict[str, Any],
+    finishing: Callable[[], AbstractContextManager[object]] = nullcontext,
+) -> None:
     """Writes `arrays` (numpy leaves) and `host` (msgpack types) to `directory`, whole or not at all.
+
+    The directory appears within `finishing()`, which may raise an error instead.
 
     Raises:
         CheckpointError: the disk is full, permission is missing, or the like; nothing is left behind.
@@ -134,10 +143,11 @@ def write(directory: Path, arrays: Any, host: dict[str, Any]) -> None:
         }
         (writing / "manifest.json").write_text(json.dumps(manifest))
         fsync_tree(writing)
-        if directory.exists():
-            shutil.rmtree(directory)
-        writing.rename(directory)
-        fsync(directory.parent)
+        with finishing():
+            if directory.exists():
+                shutil.rmtree(directory)
+            writing.rename(directory)
+            fsync(directory.parent)
     except Exception as error:  # orbax and tensorstore raise many unrelated classes for one full disk
         shutil.rmtree(writing, ignore_errors=True)
         raise CheckpointError(
@@ -241,6 +251,7 @@ class Checkpointer:
         self._checkpoints, self._policies, self._keep = run_path / "checkpoints", run_path / "policies", keep
         self._thread: threading.Thread | None = None
         self._outcome: str | None = None
+        self._ends, self._abandoned = threading.Lock(), False
         for folder in (self._checkpoints, self._policies):
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         fsync(run_path)
@@ -264,12 +275,17 @@ class Checkpointer:
             WaitTimeoutError: the earlier save does not end.
         """
         self.wait()
-        copies = [snapshot(params), snapshot(arrays)]  # the thread takes them out, so that it can let go of them
+        failed = f"checkpoint {self._checkpoints / str(num_updates)} could not be written"
+        try:
+            copies = [snapshot(params), snapshot(arrays)]  # the thread takes them out, so that it can let go of them
+        except MemoryError as error:
+            self._outcome = f"{failed}: there is no memory for a copy of its arrays: {error}"
+            return
 
         def work() -> None:
             try:
-                write(self._policies / str(num_updates), copies.pop(0), {"num_updates": num_updates})
-                write(self._checkpoints / str(num_updates), copies.pop(0), host)
+                write(self._policies / str(num_updates), copies.pop(0), {"num_updates": num_updates}, self._finishing)
+                write(self._checkpoints / str(num_updates), copies.pop(0), host, self._finishing)
                 # what is newer was damaged when the run went on from an older one: it takes no place among the kept
                 steps = [step for step in saved_steps(self._checkpoints) if step <= num_updates]
                 for step in steps[: -self._keep]:
@@ -278,12 +294,17 @@ class Checkpointer:
                     shutil.rmtree(self._checkpoints / str(step), ignore_errors=True)
                 self._outcome = ""
             except CheckpointError as error:
-                self._outcome = str(error)
+                self._outcome = None if self._abandoned else str(error)
             copies.clear()
             release_freed_memory()
 
-        self._thread = threading.Thread(target=work, name=f"checkpoint {num_updates}", daemon=True)
-        self._thread.start()
+        thread = threading.Thread(target=work, name=f"checkpoint {num_updates}", daemon=True)
+        try:
+            thread.start()
+        except RuntimeError as error:  # too many threads and processes
+            self._outcome = f"{failed}: {error}"
+            return
+        self._thread = thread
 
     def outcome(self) -> str | None:
         """How the last save ended, told once: why it failed, or "" if it is written. None: nothing new has ended."""
@@ -308,9 +329,19 @@ class Checkpointer:
             self._thread = None
 
     def abandon(self) -> None:
-        """Gives up what is being written; for a process that exits at once."""
+        """Gives up what is being written; for a process that exits at once. The thread may still be at work."""
         self._thread = None
+        with self._ends:
+            self._abandoned = True
         self._remove_unfinished()
+
+    @contextmanager
+    def _finishing(self) -> Generator[None]:
+        """Nothing appears of which `abandon` may have removed a part."""
+        with self._ends:
+            if self._abandoned:
+                raise CheckpointError("it was given up")
+            yield
 
     def _remove_unfinished(self) -> None:
         for folder in (self._checkpoints, self._policies):

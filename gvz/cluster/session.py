@@ -65,7 +65,8 @@ def connect(address: str, *, shm_bytes: int = 0, public: bool = False, alike: bo
     host, port = parse_address(address)
     if importlib.util.find_spec("ray") is None:
         raise ConfigError(f"cluster {address}: Ray is not installed; pip install 'gvizdoom[cluster]'")
-    ip = resolve(host, f"cluster {address}")
+    found = resolve(host, f"cluster {address}")
+    ip = next((ip for ip in found if ":" not in ip), found[0])  # Ray listens at IPv4 unless it is told otherwise
     if not public:
         require_private(ip, f"cluster {address}", _PRIVATE)
     require_token(os.environ)

@@ -6,14 +6,14 @@ import socket
 from gvz.core.errors import ConfigError
 
 
-def resolve(host: str, where: str) -> str:
-    """The IP address of a host.
+def resolve(host: str, where: str) -> list[str]:
+    """The IP addresses of a host, at least one, in the order in which this machine prefers them.
 
     Raises:
         ConfigError: no machine has this name; the message begins with `where`.
     """
     try:
-        return str(socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0])
+        return [str(found[4][0]) for found in socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)]
     except OSError as error:
         raise ConfigError(f"{where}: no machine has the name {host!r} ({error.strerror or error})") from error
 

@@ -45,7 +45,7 @@ class Writer:
             OSError: the file cannot be opened.
         """
         file = self._opened()
-        return lock(file) and os.path.samestat(os.fstat(file.fileno()), self._path.stat())
+        return lock(file) and is_at(file, self._path)
 
     def append(self, row: dict[str, Any]) -> None:
         """Adds a row.
@@ -111,6 +111,14 @@ def lock(file: IO[Any], *, wait: bool = False) -> bool:
     except BlockingIOError:
         return False
     return True
+
+
+def is_at(file: IO[Any], path: Path) -> bool:
+    """Whether an open file still has this path: another one may have taken its place before it was locked."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
 
 
 def unlock(file: IO[Any]) -> None:

@@ -55,13 +55,18 @@ class StopRequest:
         return 0 if self.signal is None else 128 + self.signal
 
 
+def say(message: str) -> None:
+    """A line on standard error, if that can be written: what nobody can see is no reason to end otherwise."""
+    with contextlib.suppress(OSError):
+        print(message, file=sys.stderr)
+
+
 def exit_at_once(code: int, message: str) -> NoReturn:
     """Ends this process without the waits of a normal end: for threads, and for the other processes of a group.
 
     The message goes to standard error, if that can be written.
     """
-    with contextlib.suppress(OSError):
-        print(message, file=sys.stderr)
+    say(message)
     for stream in filter(None, (sys.stdout, sys.stderr)):  # a closed one is None
         with contextlib.suppress(OSError):
             stream.flush()

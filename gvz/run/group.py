@@ -17,18 +17,20 @@ import jax
 
 from gvz.core.addresses import require_private, resolve
 from gvz.core.env_config import leaves
-from gvz.core.errors import ConfigError, GvzError
+from gvz.core.errors import ConfigError, GvzError, WaitTimeoutError
 from gvz.core.stop import StopRequest
 from gvz.run import machine
 from gvz.run.config import RunConfig
 from gvz.run.link import Link
-from gvz.run.relay import Forward, Relay, free_port
+from gvz.run.relay import Forward, Relay, free_port, wait_for_listener
 from learner.checkpoint import Restored
 
 DECISION_WAIT_S = 0.02
 """longest wait for the others' proposals before the loop looks after its actors again"""
 ANSWER_TIMEOUT_S = 1800.0
 """for reading and writing checkpoints"""
+JAX_TIMEOUT_S = 120.0
+"""for JAX in process 0 to listen, which takes a second on an idle core"""
 FAILURE_WAIT_S = 5.0
 """for the news that a process is gone, after an error that this may have caused"""
 _OWN = ("group.process_id", "run_dir", "name", "max_processor_s", "log.", "actors.")
@@ -112,8 +114,9 @@ class Several:
         group = config.group
         host, port = group.address
         coordinator = resolve(host, "group.coordinator")
-        require_private(coordinator, "group.coordinator", _PRIVATE)
-        _check_own_address(coordinator)
+        for address in coordinator:  # which of them is used is the libraries' matter
+            require_private(address, "group.coordinator", _PRIVATE)
+        _check_own_address(coordinator[0])
         self._process, self._num_processes = group.own_id, group.num_processes
         say(f"learner process {self._process} of {self._num_processes}: waiting for the others at {host}:{port}")
         hello: dict[str, Any] = {"config": _settings(config), "versions": machine.versions(_MUST_AGREE)}
@@ -144,6 +147,15 @@ class Several:
             ) from error
 
     def _join_jax(self, host: str, port: int) -> None:
+        if self._process > 0:  # JAX would wait for minutes, and then end this process with a page of C++
+            try:
+                wait_for_listener((host, port), JAX_TIMEOUT_S)
+            except OSError as error:
+                raise WaitTimeoutError(
+                    f"group: waited {JAX_TIMEOUT_S:.0f} s for JAX's coordinator at {host}:{port}, a free port beside "
+                    f"group.coordinator ({error.strerror or error}); let learner processes reach all ports of each "
+                    "other's hosts"
+                ) from error
         near = f"{host}:{port}" if self._process == 0 else f"127.0.0.1:{Forward((host, port)).port}"
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
         jax.distributed.initialize(
@@ -236,10 +248,11 @@ def _check_own_address(coordinator: str) -> None:
     name = socket.gethostname()
     where = f"group: own host name {name!r}"
     own = resolve(name, where)
-    require_private(own, where, f"{_PRIVATE}, which /etc/hosts can give to {name}")
-    if ipaddress.ip_address(own).is_loopback and not ipaddress.ip_address(coordinator).is_loopback:
+    for address in own:
+        require_private(address, where, f"{_PRIVATE}, which /etc/hosts can give to {name}")
+    if ipaddress.ip_address(own[0]).is_loopback and not ipaddress.ip_address(coordinator).is_loopback:
         raise ConfigError(
-            f"{where}: got {own}, where other machines find only themselves, want an address of a private network; "
+            f"{where}: got {own[0]}, where other machines find only themselves, want an address of a private network; "
             f"change the line of {name} in /etc/hosts, or begin group.coordinator with 127.0.0.1 if all processes are "
             "on this machine"
         )

@@ -8,6 +8,7 @@ import contextlib
 import json
 import socket
 import threading
+import time
 from typing import Any
 
 MAX_LINE_BYTES = 2**20
@@ -111,13 +112,29 @@ def free_port(host: str) -> int:
         return server.getsockname()[1]
 
 
+def wait_for_listener(address: tuple[str, int], timeout_s: float) -> None:
+    """Returns when somebody listens there. Raises OSError: why there is no connection after this time."""
+    deadline_s = time.monotonic() + timeout_s
+    while True:
+        try:
+            socket.create_connection(address, timeout=timeout_s).close()
+            return
+        except OSError:
+            if time.monotonic() > deadline_s:
+                raise
+            time.sleep(0.1)
+
+
 def encode(message: dict[str, Any]) -> bytes:
     return json.dumps(message).encode() + b"\n"
 
 
 def decode(line: bytes) -> dict[str, Any]:
     """Raises ValueError: it is no message."""
-    message = json.loads(line)
+    try:
+        message = json.loads(line)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
     if not isinstance(message, dict):
         raise ValueError("not a message")
     return message

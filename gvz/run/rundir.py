@@ -50,7 +50,7 @@ class RunDir:
             for made in (path.parent, path) if in_another else (path,):  # a mode does not hold for parents
                 made.mkdir(parents=True, exist_ok=True, mode=0o700)
             self._lock = os.fdopen(os.open(path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600), "a+")
-            locked = records.lock(self._lock)
+            locked = records.lock(self._lock) and records.is_at(self._lock, path / "lock")  # not moved by --fresh
         if not locked:
             self._lock.close()
             raise ResumeError(f"run directory {path}: another running process uses it; wait or use --run-dir")
@@ -112,10 +112,14 @@ class RunDir:
         """Adds a row to a record file. On a full disk rows wait in memory, and are written with the next one.
 
         Raises:
-            GvzError: too many rows wait.
+            GvzError: too many rows wait. ResumeError: what an earlier start has written cannot be read.
         """
         if name not in self._writers:
-            self._writers[name] = records.Writer(self.path / name)
+            file = self.path / name
+            if file.exists():
+                with disk_checked(self.path):
+                    records.cut_half_row(file)  # the disk was full, and the process was killed then
+            self._writers[name] = records.Writer(file)
         self._writers[name].append(row)
 
     def record_lengths(self) -> dict[str, int]:
@@ -163,7 +167,7 @@ class RunDir:
 
     @contextlib.contextmanager
     def _discarding_evaluations(self, num_updates: int, *, policies_too: bool) -> Generator[None]:
-        """Moves the rows of later policies. Within it no evaluation begins."""
+        """Within it no evaluation begins; at its end the rows of later policies are moved."""
 
         def is_later(row: dict[str, Any]) -> bool:
             return isinstance(row.get("num_updates"), int) and row["num_updates"] > num_updates
@@ -178,8 +182,8 @@ class RunDir:
                     f"{file} is being written by another process, and the run, which goes on from update "
                     f"{num_updates}, discards later policies and their evaluation; wait until that process has ended"
                 )
-            records.move_rows(file, is_later, self.path / "discarded" / EVALUATION_RECORDS)
             yield
+            records.move_rows(file, is_later, self.path / "discarded" / EVALUATION_RECORDS)  # last: unlocks the file
 
     def close(self) -> None:
         """Closes the record files and releases the lock. Can be repeated.

@@ -9,7 +9,7 @@ from gvz.core.errors import CheckpointError
 from gvz.run.config import CheckpointConfig
 from gvz.run.group import Group
 from gvz.run.monitor import Counts
-from gvz.run.rundir import RunDir
+from gvz.run.rundir import RunDir, disk_checked
 from learner.checkpoint import Checkpointer
 
 SAVE_RETRY_S, LONGEST_SAVE_RETRY_S = 60.0, 3600.0
@@ -44,9 +44,13 @@ class Saver:
             counts: of the run; `saved_updates` is kept here.
             take: gives the state of the run now.
             report: is told why a save failed, and the seconds until it is tried again.
+
+        Raises:
+            ResumeError: the folders of checkpoints and policies cannot be made.
         """
         self._checkpoints, self._config, self._counts = run.checkpoints, config, counts
-        self._checkpointer = Checkpointer(run.path, keep=config.keep)
+        with disk_checked(run.path):
+            self._checkpointer = Checkpointer(run.path, keep=config.keep)
         self._take, self._report = take, report
         self._num_failed, self._retry_at_s, self._begun_at_s = 0, 0.0, time.monotonic()
         self.num_saved = counts.saved_updates

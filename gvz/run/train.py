@@ -71,7 +71,11 @@ class Trainer:
         self._saver = Saver(run, config.checkpoint, self._counts, self._snapshot, self._monitor.failed_save)
         self._clock, self._collected_s = AwakeClock(LONGEST_WAIT_S), 0.0
         self._pool = parts.make_pool(config, None if host is None else host["pool"])
-        self._send()
+        try:
+            self._send()
+        except BaseException:
+            self._pool.close(grace_s=0.0)
+            raise
 
     def run(self, stop: StopRequest) -> None:
         """Trains until the last update, the end of its processor time, or a stop; then writes a checkpoint.
@@ -108,13 +112,15 @@ class Trainer:
 
     def close(self, *, abandon_save: bool = False) -> None:
         """Ends every actor, waits for the checkpoint (or abandons both), closes the records. Can be repeated."""
-        if abandon_save:
-            self._saver.abandon()
-        self._pool.close(grace_s=0.0 if abandon_save else STOP_TIMEOUT_S)
         try:
-            self._saver.wait()
+            self._pool.close(grace_s=0.0 if abandon_save else STOP_TIMEOUT_S)
         finally:
-            self._telemetry.close()
+            try:
+                if abandon_save:  # last: the thread that writes says a lot about files that are gone
+                    self._saver.abandon()
+                self._saver.wait()
+            finally:
+                self._telemetry.close()
 
     def _is_done(self) -> bool:
         """Processor time is looked at with every row of metrics: a row more or less is how exact its limit is."""

@@ -14,12 +14,12 @@ import pytest
 from fake_env import config
 from watched_pool import DEADLINE_S, Run, alive, segments
 
-from actors import supervisor
+from actors import inference, supervisor
 from actors.config import ActorsConfig
 from actors.inline import InlinePool
 from actors.pool import PoolConfig
 from actors.process_pool import ProcessPool
-from gvz.core.errors import WorkerError
+from gvz.core.errors import WaitTimeoutError, WorkerError
 from gvz.transport.messages import ParamsHeader, StepBlock
 from gvz.transport.ring import WriterState
 
@@ -161,6 +161,24 @@ def test_what_goes_wrong_in_choosing_actions_ends_the_learners_loop(tmp_path: Pa
         with pytest.raises(WorkerError, match=said) as raised:  # at which a run saves itself
             Run(pool, asking(tmp_path)).until(lambda: False)
         assert isinstance(raised.value.__cause__, RuntimeError)
+
+
+def test_a_pool_that_was_closed_at_once_never_waits_for_the_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """As after a second Ctrl-C, where a run closes its pool at once, and then once more in order."""
+    monkeypatch.setattr(inference, "_STOP_TIMEOUT_S", 0.0)
+    policy = FramePolicy()
+    policy.may_go_on.clear()
+    try:
+        pool = ProcessPool(asking(tmp_path, num_actors=1), None, lambda _: policy)
+        publish(pool)
+        pool.close(grace_s=0.0)
+        pool.close()
+        pool = ProcessPool(asking(tmp_path, num_actors=1), None, lambda _: policy)
+        publish(pool)
+        with pytest.raises(WaitTimeoutError, match="for its device to choose"):
+            pool.close()
+    finally:
+        policy.may_go_on.set()
 
 
 def test_choices_of_a_resumed_pool_have_another_seed(tmp_path: Path):

@@ -22,8 +22,9 @@ from gvz.core import records
 from gvz.core.errors import WaitTimeoutError
 from gvz.transport.broadcast import BroadcastWriter
 from gvz.transport.channel import Channel
-from gvz.transport.messages import ActorSpec, ParamsHeader, Ready, Stop
+from gvz.transport.messages import ActorSpec, Fault, ParamsHeader, Ready, Stop
 from gvz.transport.ring import RingReader, WriterState
+from tests.full_disk import full_disk
 from tests.waiting import make_pause
 
 LAYOUT, NUM_PARAMS = 5, 4
@@ -99,6 +100,19 @@ def test_a_first_message_that_is_no_spec_is_refused():
 def test_a_worker_whose_parent_has_gone_ends_at_once():
     done = start(None, os.getpid() + 1)
     assert (done.returncode, done.stderr) == (1, "")
+
+
+def test_what_it_fails_of_is_said_also_where_the_disk_with_its_log_is_full(tmp_path: Path, ring: RingReader):
+    pool_config = config(tmp_path, {"fault": "no_start"}, num_actors=1)
+    with full_disk(0):  # the process inherits it
+        process = start_actor(pool_config.actor_specs(lanes_to_begin_with(pool_config, None))[0], ring, None)
+    try:
+        assert process.wait(60)
+        (fault,) = process.channel.receive()
+        assert isinstance(fault, Fault)
+        assert (fault.kind, fault.message, fault.fatal) == ("exception", "RuntimeError: no engine today", True)
+    finally:
+        process.end(grace_s=0.0)
 
 
 def test_told_to_stop_it_ends_well(spec: ActorSpec, ring: RingReader, monkeypatch: pytest.MonkeyPatch):

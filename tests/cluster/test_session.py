@@ -77,6 +77,14 @@ def test_a_public_address_is_refused_before_anything_is_sent_there():
     assert "8.8.8.8 is a public address" in refusal("8.8.8.8:6379")
 
 
+@pytest.mark.usefixtures("token")
+def test_of_a_name_with_addresses_of_both_kinds_that_of_ipv4_is_used(monkeypatch):
+    """As `localhost` in many containers, where Ray is not at ::1."""
+    found = [(None, None, 6, "", (ip, 0)) for ip in ("::1", "8.8.8.8")]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+    assert "8.8.8.8 is a public address" in refusal("both:6379")
+
+
 @pytest.mark.parametrize("ip", ["127.0.0.1", "10.1.2.3", "192.168.0.7", "172.20.0.2", "100.64.1.1", "fd00::1"])
 def test_private_addresses_are_allowed(ip):
     addresses.require_private(ip, "here", "")

@@ -165,7 +165,14 @@ def test_two_processes_with_one_number_and_strangers_are_turned_away(monkeypatch
     monkeypatch.setattr(relay, "HELLO_TIMEOUT_S", 0.2)
     address = "127.0.0.1", free_port("127.0.0.1")
     the_relay = Relay(address, 2)
-    for said in (b"GET / HTTP/1.1\r\n\r\n", b'{"kind": "hello"}\n', b"[]\n", b"\xff\xfe\n", b""):
+    for said in (
+        b"GET / HTTP/1.1\r\n\r\n",
+        b'{"kind": "hello"}\n',
+        b"[]\n",
+        b"[" * 100_000 + b"\n",
+        b"\xff\xfe\n",
+        b"",
+    ):
         with socket.create_connection(address) as stranger:
             stranger.sendall(said)
             stranger.settimeout(30)
@@ -196,6 +203,33 @@ def test_waits_for_the_others_are_bounded_and_say_for_whom(monkeypatch):
         link.Link(address, 0, 3, {})
     until_no_link_is_open()
     the_relay.close()
+
+
+def test_a_process_that_cannot_reach_jax_in_process_0_says_so(monkeypatch):
+    """As behind a firewall that lets the coordinator's port through alone."""
+
+    def join_in_process_1(self: Several, host: str, port: int) -> None:
+        if self._process == 1:
+            Several._join_jax(self, host, port)
+
+    monkeypatch.setattr(WithoutDevices, "_join_jax", join_in_process_1)
+    monkeypatch.setattr("gvz.run.group.JAX_TIMEOUT_S", 0.3)
+    first, second = joined(2)
+    first._opened.close()
+    assert isinstance(second, WaitTimeoutError)
+    assert str(second).startswith("group: waited 0 s for JAX's coordinator at 127.0.0.1:")
+    assert str(second).endswith("(Connection refused); let learner processes reach all ports of each other's hosts")
+
+
+def test_jax_in_process_0_may_come_late():
+    address = "127.0.0.1", free_port("127.0.0.1")
+    waiting = threading.Thread(target=relay.wait_for_listener, args=(address, 30.0))
+    waiting.start()
+    waiting.join(0.3)
+    assert waiting.is_alive()
+    with socket.create_server(address):
+        waiting.join(30)
+    assert not waiting.is_alive()
 
 
 def test_a_forwarded_connection_outlives_the_other_end():
@@ -278,6 +312,21 @@ def test_a_coordinator_that_is_public_or_unknown_is_refused_before_anything_list
         WithoutDevices(replace(CONFIG, group=group), lambda _: None)
 
 
+@pytest.mark.parametrize(("name", "what"), [("both", r"\.coordinator"), ("doom7", ": own host name 'doom7'")])
+def test_a_name_with_a_public_address_beside_a_private_one_is_refused(name, what, monkeypatch):
+    """The relay listens at IPv4, where the first address may be of IPv6."""
+    known = {name: ["fd00::1", "8.8.8.8"]}
+    monkeypatch.setattr(socket, "gethostname", lambda: "doom7")
+    monkeypatch.setattr(
+        socket,
+        "getaddrinfo",
+        lambda host, *_, **__: [(None, None, 6, "", (ip, 0)) for ip in known.get(host, ["10.0.0.1"])],
+    )
+    group = GroupConfig(num_processes=2, process_id=0, coordinator="both:1")
+    with pytest.raises(ConfigError, match=rf"^group{what}: 8\.8\.8\.8 is a public address"):
+        WithoutDevices(replace(CONFIG, group=group), lambda _: None)
+
+
 @pytest.mark.parametrize(
     ("own", "coordinator", "message"),
     [
@@ -306,7 +355,7 @@ def test_debians_address_of_an_own_host_name_is_good_enough_on_one_machine(monke
 def named(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """This machine's name has this address."""
     monkeypatch.setattr(socket, "gethostname", lambda: "doom7")
-    monkeypatch.setattr("gvz.run.group.resolve", lambda host, _: address if host == "doom7" else host)
+    monkeypatch.setattr("gvz.run.group.resolve", lambda host, _: [address] if host == "doom7" else [host])
 
 
 def test_a_fresh_start_of_a_group_is_refused(tmp_path, capsys):

@@ -110,6 +110,12 @@ def test_progress_that_nobody_can_see_stops_nothing(where, unbuffered):
     assert (done.returncode, done.stdout) == (0, "goes on\n")
 
 
+def test_an_error_that_nobody_can_see_has_its_exit_code():
+    with Path("/dev/full").open("w") as stderr:
+        done = subprocess.run([sys.executable, "-m", "gvz.launch", "--config", "none"], stderr=stderr, check=False)
+    assert done.returncode == 2
+
+
 @pytest.mark.parametrize("width", [60, 80, 120])
 def test_on_a_terminal_the_panel_has_every_number(width):
     out = io.StringIO()

@@ -1,16 +1,22 @@
 """The checkpoints of a run over its life: when they are written, and which stay."""
 
+import shutil
+import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from gvz.core.durable import saved_steps
+from gvz.core.errors import ResumeError
 from gvz.run.config import CheckpointConfig
 from gvz.run.monitor import Counts
 from gvz.run.saver import Saver, Snapshot
+from learner import checkpoint
 
 STATE = {"w": np.zeros(2, np.float32)}
 
@@ -18,12 +24,14 @@ STATE = {"w": np.zeros(2, np.float32)}
 ALONE: Any = SimpleNamespace(num_common_saved=None, may_save=lambda: True)
 
 
-def started(path: Path, num_updates: int, period_s: float = 900.0) -> tuple[Saver, Counts]:
+def started(
+    path: Path, num_updates: int, keep: int = 2, report: Callable[[str, float], None] = lambda *_: None
+) -> tuple[Saver, Counts]:
     counts = Counts(updates=num_updates, saved_updates=num_updates)
     run: Any = SimpleNamespace(path=path, checkpoints=path / "checkpoints")
     snapshot = Snapshot(STATE, STATE, {})
-    config = CheckpointConfig(period_updates=1000, period_s=period_s, keep=2)
-    return Saver(run, config, counts, lambda: snapshot, lambda *_: None), counts
+    config = CheckpointConfig(period_updates=1000, period_s=900.0, keep=keep)
+    return Saver(run, config, counts, lambda: snapshot, report), counts
 
 
 def test_a_slow_run_is_saved_after_a_time_and_still_at_the_multiples(tmp_path, monkeypatch):
@@ -67,3 +75,70 @@ def test_last_checkpoints_of_a_process_that_ends_alone_leave_the_one_that_all_ha
     counts.updates = 2300
     saver.save_last(ALONE, lambda: None)
     assert saved_steps(tmp_path / "checkpoints") == [2200, 2300]
+
+
+def test_a_checkpoint_that_is_given_up_takes_no_place_of_a_whole_one(tmp_path, monkeypatch):
+    """A second Ctrl-C removes its files while the thread has just written the last of them."""
+    saver, counts = started(tmp_path, 0, keep=1)
+    counts.updates = 1000
+    saver.save_last(ALONE, lambda: None)
+    written, removing = threading.Event(), threading.Event()
+    fsync_tree, rmtree = checkpoint.fsync_tree, shutil.rmtree
+
+    def wait_for_the_removal(directory: Path) -> None:
+        fsync_tree(directory)
+        if directory.parent.name == "checkpoints":
+            written.set()
+            assert removing.wait(30)
+
+    def remove_in_two_parts(path: Path, **options: bool) -> None:
+        if threading.current_thread() is threading.main_thread():
+            (path / "host.msgpack").unlink()
+            removing.set()
+            thread.join(30)
+        rmtree(path, **options)
+
+    monkeypatch.setattr(checkpoint, "fsync_tree", wait_for_the_removal)
+    monkeypatch.setattr(shutil, "rmtree", remove_in_two_parts)
+    counts.updates = 2000
+    saver.save_when_due(ALONE)
+    thread = next(thread for thread in threading.enumerate() if thread.name == "checkpoint 2000")
+    assert written.wait(30)
+    saver.abandon()
+    assert not thread.is_alive()
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["1000"]
+    checkpoint.verify(tmp_path / "checkpoints" / "1000")
+    assert saver.wait() == "", "nobody is told that it is tried again"
+
+
+@pytest.mark.parametrize("folder", ["checkpoints", "policies"])
+def test_folders_that_cannot_be_made_are_told_in_one_line(tmp_path, folder):
+    (tmp_path / folder).touch()
+    with pytest.raises(ResumeError, match=f"^run directory {tmp_path}: File exists; mend this"):
+        started(tmp_path, 0)
+
+
+@pytest.mark.parametrize(
+    ("where", "error", "said"),
+    [
+        ((threading.Thread, "start"), RuntimeError("can't start new thread"), "written: can't start new thread"),
+        ((checkpoint, "snapshot"), MemoryError("8 GiB"), "there is no memory for a copy of its arrays: 8 GiB"),
+    ],
+    ids=["thread", "memory"],
+)
+def test_a_save_that_cannot_begin_is_reported_and_tried_again(tmp_path, monkeypatch, where, error, said):
+    def fail(*_: object) -> None:
+        raise error
+
+    failures: list[str] = []
+    saver, counts = started(tmp_path, 0, report=lambda failure, _: failures.append(failure))
+    counts.updates = 1000
+    with monkeypatch.context() as short:
+        short.setattr(*where, fail)
+        saver.save_when_due(ALONE)
+        assert saver.wait() == failures[0]
+    assert said in failures[0]
+    assert saver.behind
+    saver.save_last(ALONE, lambda: None)
+    assert saved_steps(tmp_path / "checkpoints") == [1000]
+    assert len(failures) == 1

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import msgpack
 import numpy as np
+import psutil
 import pytest
 
 from actors.config import ActorsConfig
@@ -191,6 +192,9 @@ def test_an_epsilon_that_is_no_probability_ends_a_run_which_is_saved_first(tmp_p
         go_on(tmp_path, config, 120)
     (saved,) = saved_steps(tmp_path / "checkpoints")
     assert saved > 0
+    with pytest.raises(ConfigError, match=said):
+        go_on(tmp_path, config, 120)
+    assert psutil.Process().children(recursive=True) == [], "games that had begun have ended"
     smallest = 0.0  # the user mends it
     go_on(tmp_path, config, 120)
 

@@ -1,0 +1,58 @@
+"""A run directory and the processes that use it one after another, or at once."""
+
+import pytest
+
+from gvz.core import records
+from gvz.core.errors import ResumeError
+from gvz.run import rundir
+from gvz.run.rundir import RunDir
+
+
+def test_a_directory_that_is_moved_before_it_is_locked_is_not_held(tmp_path, monkeypatch):
+    """As by `--fresh` in another process, which then makes a new one in its place."""
+    path, lock = tmp_path / "run", records.lock
+
+    def move_first(file, **options):
+        monkeypatch.undo()
+        path.rename(tmp_path / "moved")
+        path.mkdir()
+        return lock(file, **options)
+
+    monkeypatch.setattr(records, "lock", move_first)
+    with pytest.raises(ResumeError, match="another running process uses it"):
+        RunDir(path)
+    RunDir(path).close()
+
+
+def test_a_row_follows_no_half_row_of_a_process_that_was_killed_on_a_full_disk(tmp_path):
+    """Its checkpoint vouches for rows that it still had in memory, so a later cut can be within another row."""
+    file, vouched = tmp_path / "episodes.jsonl", {"episodes.jsonl": 80}
+    file.write_text('{"schema": 1, "row": 0}\n{"schema": 1, "row": 1}\n{"schema": ')
+    for start in (2, 3, 4):
+        with RunDir(tmp_path) as run:
+            run.truncate_records(vouched)
+            run.append(file.name, {"row": start})
+    rows, problems = records.read(file)
+    assert ([row["row"] for row in rows], problems) == ([0, 1, 2, 4], [])
+    assert (tmp_path / "discarded" / file.name).read_text() == '": 1, "row": 3}\n'
+
+
+def test_no_evaluation_begins_before_later_policies_are_discarded(tmp_path, monkeypatch):
+    """Its rows would be of a policy that the run never had."""
+    file, move = tmp_path / "evaluation.jsonl", rundir._move_into
+    file.write_text('{"schema": 1, "num_updates": 20}\n')
+    (tmp_path / "policies" / "20").mkdir(parents=True)
+    began = []
+
+    def move_beside_an_evaluation(folder, directory):
+        evaluation = records.Writer(file)
+        began.append(evaluation.lock())
+        evaluation.close()
+        move(folder, directory)
+
+    monkeypatch.setattr(rundir, "_move_into", move_beside_an_evaluation)
+    with RunDir(tmp_path) as run:
+        run.discard_after(10)
+    assert began == [False]
+    assert file.read_text() == ""
+    assert not list((tmp_path / "policies").iterdir())
