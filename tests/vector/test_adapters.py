@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import gvz
+from gvz.core.errors import ConfigError
 from gvz.vector.adapters.tianshou import TianshouVectorEnv
 
 
@@ -18,6 +19,14 @@ class FakeVecEnv:
 
     def __init__(self, num_envs: int, *_: object):
         self.num_envs, self._seeds = num_envs, [None] * num_envs
+        self.metadata = {"render_modes": []}
+        self._reset_options()
+
+    def set_options(self, options: dict | list[dict]) -> None:
+        self._options = [options] * self.num_envs if isinstance(options, dict) else options
+
+    def _reset_options(self) -> None:
+        self._options = [{} for _ in range(self.num_envs)]
 
     def _reset_seeds(self) -> None:
         self._seeds = [None] * self.num_envs
@@ -89,6 +98,38 @@ def test_stable_baselines3_can_render(sb3_vec_env):
     assert len(images) == 2
     assert images[0].shape[2] == 3
     assert images[0].dtype == np.uint8
+    envs.close()
+
+
+@pytest.mark.engine
+def test_a_video_of_stable_baselines3_has_the_speed_of_the_game(sb3_vec_env):
+    """VecVideoRecorder takes it from the metadata, or else 30 pictures per second."""
+    envs = sb3_vec_env(gvz.make_vec("defend_the_center/gore", 1, autoreset_mode="SameStep", frame_skip=5))
+    assert envs.metadata["render_fps"] == 7
+    envs.close()
+
+
+@pytest.mark.engine
+def test_stable_baselines3_chooses_the_seed_of_the_next_episodes(sb3_vec_env):
+    envs = sb3_vec_env(gvz.make_vec("seek_and_kill/default", 2, autoreset_mode="SameStep"))
+    envs.set_options({"episode_seed": 5})
+    frames = envs.reset()
+    assert (frames[0] == frames[1]).all()
+    assert (envs.reset() != frames).any(axis=(1, 2, 3)).all(), "an option is for one reset"
+    for options, message in (
+        ([{"episode_seed": 5}, {}], "want the same for all games"),
+        ({"reset_mask": np.ones(2, bool)}, "unknown options"),
+    ):
+        envs.set_options(options)
+        with pytest.raises(ValueError, match=message):
+            envs.reset()
+    envs.close()
+
+
+def test_stable_baselines3_steps_all_games_together(sb3_vec_env):
+    envs = gvz.make_vec("defend_the_center/default", 2, batch_size=1, autoreset_mode="SameStep")
+    with pytest.raises(ConfigError, match="got envs with batch_size 1; leave it out"):
+        sb3_vec_env(envs)
     envs.close()
 
 
