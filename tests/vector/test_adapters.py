@@ -164,3 +164,22 @@ def test_tianshou_seeds_its_games_and_is_told_that_an_episode_ended_because_its_
     assert truncated.all()
     assert infos[0]["engine_crash"]
     envs.close()
+
+
+@pytest.mark.engine
+def test_tianshou_can_render():
+    """Its collectors do, if `collect` has `render`."""
+    for mode, shapes in ((None, []), ("rgb_array", [(144, 256, 3)])):
+        made = gvz.make_vec("seek_and_kill/red", 1, batch_size=1, autoreset_mode="Disabled", render_mode=mode)
+        envs = TianshouVectorEnv(made)
+        envs.reset()
+        assert [screen.shape for screen in envs.render()] == shapes
+        envs.close()
+
+
+def test_buffers_are_refused_where_tianshous_frames_are_stacked():
+    fields = {"batch_size": 1, "autoreset_mode": "Disabled", "buffers": ("depth",)}
+    envs = gvz.make_vec("seek_and_kill/red", 1, **fields)
+    with pytest.raises(ConfigError, match="TianshouVectorEnv: got envs with buffers, want none"):
+        TianshouVectorEnv(envs)
+    envs.close()
