@@ -1,5 +1,5 @@
 """Engines that die under an environment: the episode is cut and marked, the next one whole, the end an error.
-A reset that is interrupted.
+Calls that are interrupted.
 """
 
 import numpy as np
@@ -84,17 +84,26 @@ def test_another_map_than_the_tasks_is_an_error():
     env.close()
 
 
-def test_an_interrupted_reset_leaves_no_episode_to_play(monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize(
+    ("call", "owner", "method"),
+    [("reset", Engine, "new_episode"), ("reset", DoomEnv, "_observe"), ("step", Engine, "advance")],
+)
+def test_an_interrupted_call_leaves_no_episode_to_play(
+    call: str, owner: type, method: str, monkeypatch: pytest.MonkeyPatch
+):
+    """The caller has no observation of it. After a step that nobody knows of, a score could be above the bound."""
     env = DoomEnv("defend_the_center/default")
     env.reset(seed=1)
+    whole = getattr(owner, method)
 
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
+    def interrupted(*arguments: object) -> None:
+        whole(*arguments)
+        raise KeyboardInterrupt  # Python raises it when the library's call has come back
 
     with monkeypatch.context() as patched:
-        patched.setattr(Engine, "new_episode", interrupted)
+        patched.setattr(owner, method, interrupted)
         with pytest.raises(KeyboardInterrupt):
-            env.reset(seed=2)
+            env.reset(seed=2) if call == "reset" else env.step(TURN)
     with pytest.raises(ResetNeeded):
         env.step(TURN)
     assert env.reset(seed=1)[1]["episode_frames"] == 0
