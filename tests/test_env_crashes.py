@@ -2,6 +2,9 @@
 Calls that are interrupted.
 """
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
@@ -108,6 +111,18 @@ def test_an_interrupted_call_leaves_no_episode_to_play(
         env.step(TURN)
     assert env.reset(seed=1)[1]["episode_frames"] == 0
     env.close()
+
+
+def test_a_working_directory_that_was_removed_is_an_error():
+    """ViZDoom would abort the whole process."""
+    code = (
+        "import os, tempfile; from gvz.core.errors import EngineError; from gvz.env import DoomEnv\n"
+        "place = tempfile.mkdtemp(); os.chdir(place); os.rmdir(place)\n"
+        "try: DoomEnv('defend_the_center/default')\n"
+        "except EngineError as error: print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.stdout.startswith("the working directory was removed; change to another"), done.stderr
 
 
 def test_close_may_be_repeated_and_reset_starts_anew():
