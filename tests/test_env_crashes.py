@@ -2,6 +2,7 @@
 Calls that are interrupted.
 """
 
+import shutil
 import subprocess
 import sys
 
@@ -49,6 +50,19 @@ def test_an_engine_that_died_between_episodes_is_replaced():
     assert "crash" in info["engine_error"]
     assert fingerprint(env, 7) == whole
     assert env.reset()[1]["engine_crash"] is False
+    env.close()
+
+
+def test_an_engine_whose_files_were_removed_is_replaced():
+    """As programs do that clean /tmp up."""
+    env = DoomEnv("defend_the_center/default")
+    whole = fingerprint(env, 7)
+    assert env._engine is not None
+    shutil.rmtree(env._engine.log.parent)
+    _, info = env.reset(options={"episode_seed": 7})
+    assert info["engine_crash"] is True
+    assert "No such file" in info["engine_error"]
+    assert fingerprint(env, 7) == whole
     env.close()
 
 

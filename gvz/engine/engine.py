@@ -121,7 +121,7 @@ class Engine:
         its things are those of the configured file.
 
         Raises:
-            EngineError: the engine died or did not answer, or the player is dead at once.
+            EngineError: the engine died or did not answer, its files cannot be written, or the player is dead at once.
         """
         with self._answering("new_episode"):
             if self.log.stat().st_size > _LOG_BYTES:
@@ -236,7 +236,7 @@ class Engine:
         self.deadline = engine_process.deadline(self.config.step_timeout_s)
         try:
             yield
-        except _vizdoom_errors() as error:
+        except (*_vizdoom_errors(), OSError) as error:  # its files: somebody removed them
             raise self._dead(what, error) from error
         finally:
             self.deadline = None
