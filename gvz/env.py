@@ -182,13 +182,13 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         self._start_tic = engine.tic()
         self._read(engine)
         self._rewarder.reset(self._variables)
-        self._playing = True
         if self.render_mode == "human":
             self._show(tics=0)
         observation = self._observe(engine)
         info = self._info(dict.fromkeys(self._rewarder.weights, 0.0), False, False)
         if crash is not None:
             info |= {"engine_crash": True, "engine_error": str(crash)}
+        self._playing = True
         return observation, info
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -212,6 +212,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         if self._repeat_rng.random() >= self.config.repeat_action_probability or self._held is None:
             self._held = self._actions[chosen]
         tics = min(self.config.frame_skip, self._timeout_frames - self._frames)
+        self._playing = False  # if this call is interrupted, the game is ahead of what its caller knows
         try:
             terminated = not engine.advance(self._held, tics)
         except EngineError as error:
@@ -219,12 +220,12 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         self._read(engine)
         truncated = not terminated and self._frames >= self._timeout_frames
         if terminated or truncated:
-            self._playing = False
             self._crashes = 0
         if self.render_mode == "human":
             self._show(tics)
         observation, components = self._observe(engine), self._rewarder.step(self._variables, terminated)
         info = self._info(components, terminated, truncated)
+        self._playing = not (terminated or truncated)
         return observation, sum(components.values()), terminated, truncated, info
 
     def action_masks(self) -> np.ndarray:
@@ -315,7 +316,6 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         """The engine died: the episode is truncated after the last decision."""
         assert self._observation is not None
         self._note_crash(error)
-        self._playing = False
         info = self._info(dict.fromkeys(self._rewarder.weights, 0.0), False, True)
         return deepcopy(self._observation), 0.0, False, True, {**info, "engine_crash": True, "engine_error": str(error)}
 

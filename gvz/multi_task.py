@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
+from gvz.actions import Buttons
 from gvz.core.env_config import EPISODE_SEEDS, EnvConfig, given_episode_seed, typed
 from gvz.core.errors import ConfigError, TaskError
 from gvz.env import Action, DoomEnv
@@ -46,11 +47,13 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             **options: arguments of DoomEnv.
 
         Raises:
-            ConfigError: no task, one twice, or tasks whose actions differ.
+            ConfigError: no task, one twice, tasks whose actions differ, or a sampler that is no function.
             TaskError, EngineError: as DoomEnv.
         """
         if typed(int, max_engines, "max_engines") < 1:
             raise ConfigError(f"max_engines: got {max_engines}, want at least 1")
+        if sampler is not None and not callable(sampler):
+            raise ConfigError(f"sampler: got {sampler!r}, want a function of a random number generator, or None")
         games = [DoomEnv(task, **options) for task in tasks]
         self._games = {game.task.id: game for game in games}
         if not games or len(self._games) < len(games):
@@ -83,6 +86,11 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
     def config(self) -> EnvConfig:
         """Sizes, action set and profile: the same in all tasks."""
         return self._game.config
+
+    @property
+    def action_meanings(self) -> tuple[Buttons, ...]:
+        """The buttons that each action holds in the present episode's task."""
+        return self._game.action_meanings
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None

@@ -20,6 +20,8 @@ class Window:
     """
 
     _num_open = 0
+    _shown: tuple[tuple[int, int], str] = ((0, 0), "")
+    """size and title of the one that was drawn last"""
 
     def __init__(self, title: str, width: int, height: int):
         """Opens the window, for frames of this width and height, pixels.
@@ -35,9 +37,10 @@ class Window:
         self._down: list[str] = []
         self._released: set[str] = set()
         scale = max(1, -(-_MIN_HEIGHT // height))
+        self._size, self._title = (width * scale, height * scale), title
         try:
             pygame.display.init()
-            pygame.display.set_mode((width * scale, height * scale))
+            pygame.display.set_mode(self._size)
             driver = pygame.display.get_driver()
             if driver in _UNSEEN_DRIVERS and "SDL_VIDEODRIVER" not in os.environ:
                 pygame.display.quit()
@@ -45,11 +48,18 @@ class Window:
         except pygame.error as error:
             raise ResourceError(f"render_mode human: no window can be opened ({error}); use rgb_array") from error
         pygame.display.set_caption(title)
+        Window._shown = self._size, title
         self._open = True
         Window._num_open += 1
 
     def show(self, frame: np.ndarray) -> None:
         """Draws a frame, uint8 [H, W, 3]."""
+        size, title = Window._shown
+        if size != self._size:  # another game has drawn since
+            self._pygame.display.set_mode(self._size)
+        if title != self._title:
+            self._pygame.display.set_caption(self._title)
+        Window._shown = self._size, self._title
         picture = self._pygame.surfarray.make_surface(frame.swapaxes(0, 1))
         surface = self._pygame.display.get_surface()
         assert surface is not None, "it is there as long as a Window is open"

@@ -1,6 +1,10 @@
 """Engines that die under an environment: the episode is cut and marked, the next one whole, the end an error.
-A reset that is interrupted.
+Calls that are interrupted.
 """
+
+import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -49,6 +53,19 @@ def test_an_engine_that_died_between_episodes_is_replaced():
     env.close()
 
 
+def test_an_engine_whose_files_were_removed_is_replaced():
+    """As programs do that clean /tmp up."""
+    env = DoomEnv("defend_the_center/default")
+    whole = fingerprint(env, 7)
+    assert env._engine is not None
+    shutil.rmtree(env._engine.log.parent)
+    _, info = env.reset(options={"episode_seed": 7})
+    assert info["engine_crash"] is True
+    assert "No such file" in info["engine_error"]
+    assert fingerprint(env, 7) == whole
+    env.close()
+
+
 def test_crash_upon_crash_is_an_error():
     env = DoomEnv("defend_the_center/default")
 
@@ -84,21 +101,42 @@ def test_another_map_than_the_tasks_is_an_error():
     env.close()
 
 
-def test_an_interrupted_reset_leaves_no_episode_to_play(monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize(
+    ("call", "owner", "method"),
+    [("reset", Engine, "new_episode"), ("reset", DoomEnv, "_observe"), ("step", Engine, "advance")],
+)
+def test_an_interrupted_call_leaves_no_episode_to_play(
+    call: str, owner: type, method: str, monkeypatch: pytest.MonkeyPatch
+):
+    """The caller has no observation of it. After a step that nobody knows of, a score could be above the bound."""
     env = DoomEnv("defend_the_center/default")
     env.reset(seed=1)
+    whole = getattr(owner, method)
 
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
+    def interrupted(*arguments: object) -> None:
+        whole(*arguments)
+        raise KeyboardInterrupt  # Python raises it when the library's call has come back
 
     with monkeypatch.context() as patched:
-        patched.setattr(Engine, "new_episode", interrupted)
+        patched.setattr(owner, method, interrupted)
         with pytest.raises(KeyboardInterrupt):
-            env.reset(seed=2)
+            env.reset(seed=2) if call == "reset" else env.step(TURN)
     with pytest.raises(ResetNeeded):
         env.step(TURN)
     assert env.reset(seed=1)[1]["episode_frames"] == 0
     env.close()
+
+
+def test_a_working_directory_that_was_removed_is_an_error():
+    """ViZDoom would abort the whole process."""
+    code = (
+        "import os, tempfile; from gvz.core.errors import EngineError; from gvz.env import DoomEnv\n"
+        "place = tempfile.mkdtemp(); os.chdir(place); os.rmdir(place)\n"
+        "try: DoomEnv('defend_the_center/default')\n"
+        "except EngineError as error: print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.stdout.startswith("the working directory was removed; change to another"), done.stderr
 
 
 def test_close_may_be_repeated_and_reset_starts_anew():

@@ -35,6 +35,7 @@ def test_an_episode_is_the_single_environments():
         assert info == same_info
         assert info["task"] == several.task.id == task
         assert (several.action_masks() == alone.action_masks()).all()
+        assert several.action_meanings == alone.action_meanings
         assert len(several._running) <= 2
         alone.close()
     several.close()
@@ -105,6 +106,8 @@ def test_bad_input_is_named():
     for number, message in ((0, "got 0, want at least 1"), (1.5, "got 1.5, want int")):
         with pytest.raises(ConfigError, match=f"max_engines: {message}"):
             gvz.make(TASKS, action_set="unified_v1", max_engines=number)
+    with pytest.raises(ConfigError, match="sampler: got 'uniform', want a function of a random number generator"):
+        gvz.make(TASKS, action_set="unified_v1", sampler="uniform")
     env = gvz.make(TASKS, action_set="unified_v1")
     with pytest.raises(
         TaskError, match="got task 'defend_the_center/gore', want one of defend_the_center/default, seek"

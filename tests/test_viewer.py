@@ -70,3 +70,16 @@ def test_a_window_stays_until_the_last_game_that_draws_in_it_is_closed(monkeypat
         second.show(frame)
     second.close()
     assert not pygame.display.get_init()
+
+
+def test_a_window_has_the_size_and_the_title_of_the_game_that_draws(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    import pygame
+
+    first, second = Window("first", 64, 48), Window("second", 96, 48)
+    for window, title, width in ((first, "first", 640), (second, "second", 960), (first, "first", 640)):
+        window.show(np.zeros((48, width // 10, 3), np.uint8))
+        assert pygame.display.get_caption()[0] == title
+        assert pygame.display.get_surface().get_size() == (width, 480)
+    first.close()
+    second.close()

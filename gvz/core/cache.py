@@ -8,7 +8,7 @@ from platformdirs import user_cache_path
 
 def cache_directory() -> Path:
     """$GVZ_CACHE_DIR, or else the user's cache directory; it need not exist yet."""
-    return Path(os.environ.get("GVZ_CACHE_DIR") or user_cache_path("gvizdoom"))
+    return Path(os.environ.get("GVZ_CACHE_DIR") or user_cache_path("gvizdoom")).absolute()
 
 
 def xla_cache_directory() -> Path:

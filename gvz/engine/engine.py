@@ -13,6 +13,7 @@ import contextlib
 import mmap
 import os
 import signal
+import sys
 import weakref
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
@@ -120,7 +121,7 @@ class Engine:
         its things are those of the configured file.
 
         Raises:
-            EngineError: the engine died or did not answer, or the player is dead at once.
+            EngineError: the engine died or did not answer, its files cannot be written, or the player is dead at once.
         """
         with self._answering("new_episode"):
             if self.log.stat().st_size > _LOG_BYTES:
@@ -235,7 +236,7 @@ class Engine:
         self.deadline = engine_process.deadline(self.config.step_timeout_s)
         try:
             yield
-        except _vizdoom_errors() as error:
+        except (*_vizdoom_errors(), OSError) as error:  # its files: somebody removed them
             raise self._dead(what, error) from error
         finally:
             self.deadline = None
@@ -258,6 +259,15 @@ def check_config(config: EngineConfig) -> None:
     _make_game(config)
 
 
+def _require_working_directory() -> None:
+    """ViZDoom aborts the process that imports it where there is none. Later it does without."""
+    try:
+        if "vizdoom" not in sys.modules:
+            Path.cwd()
+    except FileNotFoundError as error:
+        raise EngineError("the working directory was removed; change to another, or ViZDoom would abort") from error
+
+
 def screen_resolutions() -> tuple[tuple[int, int], ...]:
     """Every (width, height) the engine can render, smallest first."""
     import vizdoom
@@ -269,6 +279,7 @@ def screen_resolutions() -> tuple[tuple[int, int], ...]:
 
 def _make_game(config: EngineConfig) -> "DoomGame":
     """A game that is configured but not started. Nothing of it depends on the working directory or the user."""
+    _require_working_directory()
     import vizdoom
 
     if (config.width, config.height) not in screen_resolutions():

@@ -17,6 +17,7 @@ from typing import NoReturn
 
 from gvz.core import janitor
 from gvz.core.errors import EngineError, WadError
+from gvz.core.libraries import import_path
 from gvz.engine.engine import Engine, EngineConfig
 from gvz.engine.process import log_tail, one_of
 from gvz.wad.lumps import MAP_NAME, read_wad
@@ -51,9 +52,12 @@ def probe_wad(wad: Path, timeout_s: float = _TIMEOUT_S) -> str:
     with janitor.temporary_directory() as directory:
         log = directory / "engine.log"
         arguments = (os.getpid(), wad, log, timeout_s)
-        command = [sys.executable, "-m", "gvz.engine.probe", *map(str, arguments)]
+        command = [sys.executable, "-P", "-m", "gvz.engine.probe", *map(str, arguments)]
+        environment = {**os.environ, "PYTHONPATH": import_path()}
         try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
+            done = subprocess.run(
+                command, env=environment, capture_output=True, text=True, timeout=timeout_s, check=False
+            )
         except subprocess.TimeoutExpired as error:
             raise EngineError(f"{wad}: not loaded within {timeout_s:g} s{log_tail(log)}") from error
         finally:
@@ -61,7 +65,7 @@ def probe_wad(wad: Path, timeout_s: float = _TIMEOUT_S) -> str:
         text = log.read_text(errors="replace") if log.exists() else ""
         faults = _faults(text)
         if done.returncode < 0 and not faults:
-            faults = _faults(_output_of_engine_alone(command))
+            faults = _faults(_output_of_engine_alone(command, environment))
         if done.returncode != 0 or faults:
             what = f"the engine crashed (exit code {done.returncode})" if done.returncode < 0 else "cannot be played"
             lines = faults[:8] or done.stderr.strip().splitlines()[-1:] or ["it does not say why"]
@@ -76,13 +80,18 @@ def _faults(text: str) -> list[str]:
     return [line for last, line in pairs if _FAULTS.search(_DIRECTORY.sub("", line)) or _SCRIPT_ERROR in last]
 
 
-def _output_of_engine_alone(command: list[str]) -> str:
+def _output_of_engine_alone(command: list[str], environment: dict[str, str]) -> str:
     """What the engine prints when no client starts it: one that ends while it starts is killed with its client, which
     crashes, often before it has printed the cause.
     """
     with contextlib.suppress(subprocess.TimeoutExpired):
         done = subprocess.run(
-            [*command, "alone"], stdin=subprocess.DEVNULL, capture_output=True, timeout=_ALONE_S, check=False
+            [*command, "alone"],
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=_ALONE_S,
+            check=False,
         )
         return (done.stdout + done.stderr).decode(errors="replace")
     return ""

@@ -235,6 +235,17 @@ def watch(one: Watched) -> None:
             _watcher.start()
 
 
+def _forget_watched() -> None:
+    """In a fork, whose parent watches these: a call that another thread was in has no end here, and its engine would be
+    killed; the lock may be held by a thread that is not here.
+    """
+    global _watched, _watched_lock
+    _watched, _watched_lock = weakref.WeakSet(), threading.Lock()
+
+
+os.register_at_fork(after_in_child=_forget_watched)
+
+
 def deadline(timeout_s: float) -> float:
     """For `Watched.deadline`: it is reached no earlier than in this time."""
     return _clock.now_s + timeout_s + _WATCH_PERIOD_S  # the clock may be a period behind

@@ -22,6 +22,7 @@ from types import FrameType, MappingProxyType
 from typing import IO
 
 from gvz.core import janitor
+from gvz.core.libraries import import_path
 from gvz.transport.channel import Channel
 from gvz.transport.messages import Message, Stop
 
@@ -87,7 +88,6 @@ class ChildProcess:
             environment: variables beside our own.
         """
         self._who = who
-        path = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path)
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             with theirs:
@@ -98,7 +98,7 @@ class ChildProcess:
                     stdout=log,
                     stderr=log,
                     cwd=directory,
-                    env={**os.environ, **environment, **one_core(), "PYTHONPATH": path},
+                    env={**os.environ, **environment, **one_core(), "PYTHONPATH": import_path()},
                     pass_fds=passed,
                     process_group=0,
                 )

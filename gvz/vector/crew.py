@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import IO, Any
 
 import msgspec
+from gymnasium.error import ClosedEnvironmentError
 
 from gvz.core import errors, janitor
 from gvz.core.errors import GvzError, TransportError, WorkerError
@@ -133,6 +134,7 @@ class Crew:
         """The next `count` outcomes, in the order in which they come.
 
         Raises:
+            ClosedEnvironmentError: `close` was called meanwhile.
             GvzError: what a worker raised.
             WorkerError: a worker died too often, or raised what is no error of ours.
         """
@@ -186,6 +188,7 @@ class Crew:
         for worker in busy:
             poll.register(worker.process.channel, select.POLLIN)
         poll.poll(1000 * _POLL_S)
+        self._require_open()
         for worker in busy:
             silent_s = worker.silent_s(int(self._frames.progress[worker.spec.worker]))
             if silent_s > SILENCE_TIMEOUT_S:
@@ -219,7 +222,12 @@ class Crew:
         self._last_infos[game] = info
         self._outcomes.append(outcome)
 
+    def _require_open(self) -> None:
+        if not self._workers:  # a signal's handler or another thread has closed it while this call waited
+            raise ClosedEnvironmentError("the vector environment was closed in the middle of a call")
+
     def _replace_dead(self, worker: _Worker) -> None:
+        self._require_open()
         worker.process.wait(_STOP_TIMEOUT_S)
         self._replace(worker, worker.process.exit_text() or "closed its channel")
 

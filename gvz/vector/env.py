@@ -113,7 +113,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._action_masks = np.array([envs[ids[game % len(ids)]].action_masks() for game in range(self.num_envs)])
         self._config, self._copy = first.config, copy
-        self._rngs: list[np.random.Generator | None] = [None] * self.num_envs
+        self._rngs = [seeding.np_random() for _ in range(self.num_envs)]  # and their seeds
         self._next_seeds: list[int | None] = [None] * self.num_envs  # drawn, and not used by an episode yet
         self._begun, self._ended, self._pending = np.zeros((3, self.num_envs), bool)
         self._halves = np.zeros(self.num_envs, np.intp)  # where each game's last observation is
@@ -172,7 +172,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             self._halves[mask] = 1 - half  # answers that are dropped are written over
         for game in np.flatnonzero(mask).tolist():
             if seeds[game] is not None:
-                self._rngs[game], self._next_seeds[game] = seeding.np_random(seeds[game])[0], None
+                self._rngs[game], self._next_seeds[game] = seeding.np_random(seeds[game]), None
         self._send(np.flatnonzero(mask), [None] * int(mask.sum()), episode_seed)
         outcomes = {outcome.game: outcome for outcome in self._receive(int(mask.sum()))}
         if not self._copy:
@@ -244,6 +244,11 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         """Games that have an action and whose answer `recv` has not taken."""
         return int(self._pending.sum())
 
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The seed of each game's sequence of episodes, also if `reset` was given none; as SyncVectorEnv has it."""
+        return tuple(seed for _, seed in self._rngs)
+
     def render(self) -> tuple[np.ndarray, ...] | None:
         """The last rendered screen of every game, uint8[render_height, render_width, 3]; None without a render mode.
 
@@ -305,9 +310,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
 
     def _seed(self, game: int) -> int:
         """Of the game's next episode; the same until an episode has begun with it. As `DoomEnv` draws it."""
-        rng = self._rngs[game]
-        if rng is None:
-            rng = self._rngs[game] = seeding.np_random()[0]
+        rng, _ = self._rngs[game]
         if (seed := self._next_seeds[game]) is None:
             seed = self._next_seeds[game] = int(rng.integers(EPISODE_SEEDS))
         return seed

@@ -153,6 +153,22 @@ def test_a_forked_childs_exit_leaves_the_parents_engine_alone(ending: str):
     assert done.returncode == 0, done.stderr
 
 
+def test_a_fork_does_not_watch_its_parents_engines():
+    """It has the parent's call and the parent's lock as they were, without the threads that would end both."""
+    done = run(
+        "import os, signal, warnings; from gvz.engine import process\n"
+        "warnings.simplefilter('ignore')  # Python 3.12 warns of any fork beside threads\n"
+        "engine = Engine(config); engine.new_episode(1)\n"
+        "with process._watched_lock:\n"
+        "    engine.deadline = process.deadline(30.0); child = os.fork()\n"
+        "if child == 0: signal.alarm(20); process._kill_overdue(float('inf')); os._exit(0)\n"
+        "engine.deadline = None\n"
+        "assert os.waitpid(child, 0)[1] == 0\n"
+        "assert engine.step([], 4) is not None\n"
+    )
+    assert done.returncode == 0, done.stderr
+
+
 def test_nothing_is_written_into_the_working_directory_or_home(tmp_path: Path):
     done = run("Engine(config).new_episode(1)", cwd=tmp_path, env={**os.environ, "HOME": str(tmp_path)})
     assert done.returncode == 0, done.stderr

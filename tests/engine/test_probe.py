@@ -39,6 +39,21 @@ def test_a_file_that_crashes_the_engine_is_an_error_with_its_log(tmp_path: Path,
     assert not list(janitor.runtime_dir().glob("*.json")), "the crashed client's engine was not cleared away"
 
 
+def test_files_of_the_working_directory_are_not_executed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Python would import the user's random.py instead of its own."""
+    (tmp_path / "random.py").write_text("raise SystemExit('the one of the working directory')")
+    monkeypatch.chdir(tmp_path)
+    assert "adding" in probe_wad(STOCK_WAD)
+
+
+def test_gvz_is_found_where_the_program_found_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """In a notebook, sys.path may be the only one that knows the place."""
+    (tmp_path / "sitecustomize.py").write_text(f"open({str(tmp_path / 'found')!r}, 'w').close()")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    probe_wad(STOCK_WAD)
+    assert (tmp_path / "found").exists()
+
+
 @pytest.mark.parametrize(
     ("decorate", "message"),
     [

@@ -203,6 +203,14 @@ def test_without_the_variable_the_users_cache_directory_is_used(tmp_path: Path, 
     assert compile_task(parse_task("seek_and_kill/red")).wad_path.parent == tmp_path / "home" / "gvizdoom"
 
 
+def test_a_map_is_found_when_the_program_has_gone_to_another_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("GVZ_CACHE_DIR", "maps")
+    monkeypatch.chdir(tmp_path)
+    wad = compile_task(parse_task("seek_and_kill/red")).wad_path
+    monkeypatch.chdir("/")
+    assert wad.exists()
+
+
 def test_a_cache_that_cannot_be_written_is_an_error_with_the_way_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path / "file" / "below"))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import gvz
+from gvz.core.errors import ConfigError
 from gvz.vector.adapters.tianshou import TianshouVectorEnv
 
 
@@ -18,6 +19,14 @@ class FakeVecEnv:
 
     def __init__(self, num_envs: int, *_: object):
         self.num_envs, self._seeds = num_envs, [None] * num_envs
+        self.metadata = {"render_modes": []}
+        self._reset_options()
+
+    def set_options(self, options: dict | list[dict]) -> None:
+        self._options = [options] * self.num_envs if isinstance(options, dict) else options
+
+    def _reset_options(self) -> None:
+        self._options = [{} for _ in range(self.num_envs)]
 
     def _reset_seeds(self) -> None:
         self._seeds = [None] * self.num_envs
@@ -93,6 +102,38 @@ def test_stable_baselines3_can_render(sb3_vec_env):
 
 
 @pytest.mark.engine
+def test_a_video_of_stable_baselines3_has_the_speed_of_the_game(sb3_vec_env):
+    """VecVideoRecorder takes it from the metadata, or else 30 pictures per second."""
+    envs = sb3_vec_env(gvz.make_vec("defend_the_center/gore", 1, autoreset_mode="SameStep", frame_skip=5))
+    assert envs.metadata["render_fps"] == 7
+    envs.close()
+
+
+@pytest.mark.engine
+def test_stable_baselines3_chooses_the_seed_of_the_next_episodes(sb3_vec_env):
+    envs = sb3_vec_env(gvz.make_vec("seek_and_kill/default", 2, autoreset_mode="SameStep"))
+    envs.set_options({"episode_seed": 5})
+    frames = envs.reset()
+    assert (frames[0] == frames[1]).all()
+    assert (envs.reset() != frames).any(axis=(1, 2, 3)).all(), "an option is for one reset"
+    for options, message in (
+        ([{"episode_seed": 5}, {}], "want the same for all games"),
+        ({"reset_mask": np.ones(2, bool)}, "unknown options"),
+    ):
+        envs.set_options(options)
+        with pytest.raises(ValueError, match=message):
+            envs.reset()
+    envs.close()
+
+
+def test_stable_baselines3_steps_all_games_together(sb3_vec_env):
+    envs = gvz.make_vec("defend_the_center/default", 2, batch_size=1, autoreset_mode="SameStep")
+    with pytest.raises(ConfigError, match="got envs with batch_size 1; leave it out"):
+        sb3_vec_env(envs)
+    envs.close()
+
+
+@pytest.mark.engine
 def test_stable_baselines3_is_told_that_an_episode_ended_because_its_engine_died(sb3_vec_env):
     envs = sb3_vec_env(gvz.make_vec("defend_the_center/default", 2, num_workers=1, autoreset_mode="SameStep"))
     envs.reset()
@@ -122,4 +163,23 @@ def test_tianshou_seeds_its_games_and_is_told_that_an_episode_ended_because_its_
     _, _, _, truncated, infos = envs.step(np.zeros(1, np.int64), np.array([0]))
     assert truncated.all()
     assert infos[0]["engine_crash"]
+    envs.close()
+
+
+@pytest.mark.engine
+def test_tianshou_can_render():
+    """Its collectors do, if `collect` has `render`."""
+    for mode, shapes in ((None, []), ("rgb_array", [(144, 256, 3)])):
+        made = gvz.make_vec("seek_and_kill/red", 1, batch_size=1, autoreset_mode="Disabled", render_mode=mode)
+        envs = TianshouVectorEnv(made)
+        envs.reset()
+        assert [screen.shape for screen in envs.render()] == shapes
+        envs.close()
+
+
+def test_buffers_are_refused_where_tianshous_frames_are_stacked():
+    fields = {"batch_size": 1, "autoreset_mode": "Disabled", "buffers": ("depth",)}
+    envs = gvz.make_vec("seek_and_kill/red", 1, **fields)
+    with pytest.raises(ConfigError, match="TianshouVectorEnv: got envs with buffers, want none"):
+        TianshouVectorEnv(envs)
     envs.close()

@@ -72,6 +72,7 @@ def test_it_equals_gymnasiums_over_the_same_games(mode: AutoresetMode, action_se
             (observations, infos), wanted = ours.reset(**start), theirs.reset(**start)
             assert_same(observations, wanted[0])
             assert_same(without_ids(infos), wanted[1])
+            assert ours.np_random_seed == theirs.np_random_seed == ((7, 8, 9) if start == {"seed": 7} else (3, 8, 5))
             for _ in range(30):
                 actions = ours.action_space.sample()
                 *batch, infos = ours.step(actions)
@@ -211,6 +212,15 @@ def test_views_show_the_shared_memory_and_last_until_the_call_after_the_next_one
     assert view.shape == (2, 84, 84, 3), "a view outlives the environment"
     with pytest.raises(ClosedEnvironmentError, match="send: the vector environment was closed"):
         views.step(np.array([1, 1]))
+
+
+@pytest.mark.engine
+def test_a_seed_that_nobody_gave_can_be_read_and_used_again(envs: DoomVectorEnv):
+    made = gvz.make_vec("defend_the_center/default", 3, num_workers=1)
+    drawn = made.reset()[1]["episode_seed"]
+    assert len(set(made.np_random_seed)) == 3
+    np.testing.assert_array_equal(envs.reset(seed=made.np_random_seed)[1]["episode_seed"], drawn)
+    made.close()
 
 
 @pytest.mark.engine

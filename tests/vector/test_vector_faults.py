@@ -177,6 +177,25 @@ def test_an_error_of_a_worker_is_raised_here_and_closes_everything(monkeypatch: 
     assert not any(psutil.pid_exists(pid) for pid in pids)
 
 
+@pytest.mark.parametrize("by", ["handler", "thread"])
+def test_a_call_that_waits_ends_when_the_environment_is_closed(by: str, monkeypatch: pytest.MonkeyPatch):
+    envs = gvz.make_vec(TASK, 1)
+    envs.reset(seed=1)
+    (pid,) = envs._crew.pids
+    os.kill(pid, signal.SIGSTOP)
+    monkeypatch.setattr(crew, "_STOP_TIMEOUT_S", 0.2)
+    before = signal.signal(signal.SIGUSR2, lambda *_: envs.close())
+    closing = threading.Timer(0.5, envs.close if by == "thread" else lambda: os.kill(os.getpid(), signal.SIGUSR2))
+    closing.start()
+    try:
+        with pytest.raises(ClosedEnvironmentError, match="was closed in the middle of a call"):
+            envs.step(TURN[:1])
+    finally:
+        closing.join()
+        signal.signal(signal.SIGUSR2, before)
+    assert not psutil.pid_exists(pid)
+
+
 def test_an_interrupted_call_closes_everything():
     envs = gvz.make_vec(TASK, 2, num_workers=2)
     pids = envs._crew.pids

@@ -7,6 +7,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
+from gvz.core.env_config import given_episode_seed
 from gvz.core.errors import ConfigError
 from gvz.vector.env import DoomVectorEnv
 
@@ -21,7 +22,7 @@ class Sb3VecEnv(VecEnv):
         envs: of `gvz.make_vec(..., autoreset_mode="SameStep")`; closed together with this object.
 
     Raises:
-        ConfigError: another autoreset mode.
+        ConfigError: another autoreset mode, or a batch size.
     """
 
     def __init__(self, envs: DoomVectorEnv):
@@ -31,13 +32,28 @@ class Sb3VecEnv(VecEnv):
                 f'Sb3VecEnv: got envs with autoreset_mode {mode.value!r}; want autoreset_mode="SameStep", because '
                 "Stable-Baselines3 expects an episode's first observation together with the end of the last one"
             )
+        if envs.batch_size != envs.num_envs:
+            raise ConfigError(
+                f"Sb3VecEnv: got envs with batch_size {envs.batch_size}; leave it out, because Stable-Baselines3 steps "
+                f"all {envs.num_envs} games together"
+            )
         self.envs, self.render_mode = envs, envs.render_mode
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
+        self.metadata = envs.metadata  # VecVideoRecorder takes the pictures per second from it
 
     def reset(self) -> np.ndarray:
-        """First observations, u8[N, 84, 84, C], with the seeds of `seed()` if it was called before."""
-        observations, _ = self.envs.reset(seed=self._seeds)
+        """First observations, u8[N, 84, 84, C]; with the seeds of `seed()` and the `episode_seed` of `set_options()`
+        if these were called before.
+
+        Raises:
+            ValueError: an option that is not `episode_seed`, or another one for each game.
+        """
+        episode_seeds = {given_episode_seed(options) for options in self._options}
+        if len(episode_seeds) != 1:
+            raise ConfigError(f"Sb3VecEnv.set_options: got {self._options}, want the same for all games")
+        observations, _ = self.envs.reset(seed=self._seeds, options={"episode_seed": episode_seeds.pop()})
         self._reset_seeds()
+        self._reset_options()
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:

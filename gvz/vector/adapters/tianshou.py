@@ -24,7 +24,7 @@ class TianshouVectorEnv:
         num_stack: frames of an observation.
 
     Raises:
-        ConfigError: another batch size or autoreset mode.
+        ConfigError: another batch size or autoreset mode, or buffers.
     """
 
     is_async = False
@@ -36,9 +36,12 @@ class TianshouVectorEnv:
                 f"TianshouVectorEnv: got envs with batch_size {envs.batch_size} and autoreset_mode {mode.value!r}; "
                 'want batch_size=1 and autoreset_mode="Disabled", because Tianshou steps and resets any set of games'
             )
+        shape = envs.single_observation_space.shape
+        if shape is None:
+            raise ConfigError("TianshouVectorEnv: got envs with buffers, want none: it stacks the frames of the screen")
         self.envs, self.env_num = envs, envs.num_envs
         self.action_space = [envs.single_action_space] * envs.num_envs
-        self._stacks = np.zeros((envs.num_envs, num_stack, *envs.single_observation_space.shape), np.uint8)
+        self._stacks = np.zeros((envs.num_envs, num_stack, *shape), np.uint8)
 
     def __len__(self) -> int:
         return self.env_num
@@ -76,6 +79,10 @@ class TianshouVectorEnv:
             truncated,
             np.array([_info(game, answers[game][-1], 0) for game in id]),
         )
+
+    def render(self) -> Sequence[np.ndarray]:
+        """The screens of all games, u8[H, W, 3] each; none without a render mode."""
+        return self.envs.render() or ()
 
     def close(self) -> None:
         """Ends the games and their processes."""
