@@ -13,6 +13,7 @@ import tyro
 import gvz
 from gvz.core.errors import EXIT_INTERRUPTED, GvzError
 from gvz.core.registry import discover
+from gvz.core.stop import say
 
 EXIT_BROKEN_PIPE = 141
 """exit code that a shell shows for a program that SIGPIPE ended"""
@@ -32,10 +33,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return code
     except GvzError as error:
-        print(f"error: {error}", file=sys.stderr)
+        say(f"error: {error}")
         return error.exit_code
     except KeyboardInterrupt:  # of a command that has nothing to say about it
-        print("interrupted", file=sys.stderr)
+        say("interrupted")
         return EXIT_INTERRUPTED
     except BrokenPipeError:  # the reader of our output has closed it: gvz tasks | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python flushes once more at the end
@@ -44,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if error.errno not in _OF_THE_DISK:
             raise
         where = f"{error.filename}: " if error.filename else ""
-        print(f"error: {where}{error.strerror}; make room or give a place that you can write to", file=sys.stderr)
+        say(f"error: {where}{error.strerror}; make room or give a place that you can write to")
         return 1
 
 

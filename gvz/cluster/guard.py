@@ -16,7 +16,7 @@ PASSED_ON = {signal.SIGINT, signal.SIGTERM}
 def main() -> int:
     """Starts the job and waits for its end."""
     signal.pthread_sigmask(signal.SIG_BLOCK, PASSED_ON)  # until there is somebody to pass them on to
-    command = [sys.executable, "-m", "gvz.experiments.child", str(os.getpid()), *sys.argv[1:]]
+    command = [sys.executable, "-P", "-m", "gvz.experiments.child", str(os.getpid()), *sys.argv[1:]]
     job = subprocess.Popen(command, close_fds=False)  # the locks of its cores
 
     def pass_on(number: int, frame: FrameType | None) -> None:

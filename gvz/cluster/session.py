@@ -21,6 +21,7 @@ import psutil
 from gvz.cluster.nodes import Node, check_nodes, survey
 from gvz.core.addresses import require_private, resolve
 from gvz.core.errors import ConfigError
+from gvz.core.libraries import import_path
 
 ANSWER_TIMEOUT_S = 10.0
 """for a connection of TCP to the address"""
@@ -140,8 +141,8 @@ def _require_answer(address: str, ip: str, port: int) -> None:
 
 def _probe(address: str, where: str, mode: str) -> dict[str, Any]:
     """What the cluster says of itself to a client with this mode of authentication (gvz/cluster/probe.py)."""
-    command = [sys.executable, "-m", "gvz.cluster.probe", where]
-    environment = {**os.environ, "RAY_AUTH_MODE": mode}
+    command = [sys.executable, "-P", "-m", "gvz.cluster.probe", where]
+    environment = {**os.environ, "RAY_AUTH_MODE": mode, "PYTHONPATH": import_path()}
     try:
         done = subprocess.run(
             command, capture_output=True, text=True, timeout=PROBE_TIMEOUT_S, env=environment, check=True

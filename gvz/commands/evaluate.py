@@ -97,6 +97,9 @@ class Evaluate:
             raise ConfigError(f"evaluate: got --player {self.player} and also {self.run_dirs[0]}, want one of them")
         if self.player is None and not self.run_dirs:
             raise ConfigError("evaluate: want --player or run directories (before --tasks, which takes what follows)")
+        of_runs = {"--agent": self.agent, "--encoder": self.encoder, "--checkpoints": self.checkpoints != ("newest",)}
+        if self.player is not None and (given := [flag for flag, value in of_runs.items() if value]):
+            raise ConfigError(f"{given[0]}: got it beside --player {self.player}, want it with run directories alone")
         if not self.checkpoints:
             raise ConfigError("--checkpoints: got none, want newest, all, last5 (or another number), or gradient steps")
         for name, value in (("episodes", self.episodes), ("workers", workers)):

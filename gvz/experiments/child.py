@@ -14,4 +14,4 @@ if __name__ == "__main__":
     die_with_parent(int(sys.argv[1]), signal.SIGTERM)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
     os.sched_setaffinity(0, {int(core) for core in sys.argv[2].split(",")})
-    os.execv(sys.executable, [sys.executable, *sys.argv[3:]])
+    os.execv(sys.executable, [sys.executable, "-P", *sys.argv[3:]])

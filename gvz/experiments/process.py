@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import IO, Protocol
 
 from gvz.core import janitor, records
+from gvz.core.libraries import import_path
 from gvz.experiments import inventory
 
 TAKEN = -1
@@ -70,6 +71,7 @@ class LocalProcess:
         self._process = subprocess.Popen(
             [
                 sys.executable,
+                "-P",
                 "-m",
                 "gvz.experiments.child",
                 str(os.getpid()),
@@ -80,7 +82,7 @@ class LocalProcess:
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
-            env={**environment, "PYTHONUNBUFFERED": "1"},
+            env={**environment, "PYTHONUNBUFFERED": "1", "PYTHONPATH": import_path()},
             pass_fds=kept,
             start_new_session=True,  # the terminal's Ctrl-C is for us, who then stop it in order
         )

@@ -22,6 +22,8 @@ from tests.waiting import wait_until
         ("", "evaluate: want --player or run directories (before --tasks, which takes what follows)"),
         ("{run} --player idle", "evaluate: got --player idle and also "),
         ("{run} --checkpoints", "--checkpoints: got none, want newest, all, last5"),
+        ("--player idle --checkpoints all", "--checkpoints: got it beside --player idle, want it with run directories"),
+        ("--player idle --agent mine.py", "--agent: got it beside --player idle, want it with run directories alone"),
         ("--player idle --seeds 0 0", "--seeds: got [0, 0], want different numbers"),
         ("--player idle --seeds 9223372036854775808", "--seeds: got [9223372036854775808], want different numbers"),
         ("{above}", "did you mean {run}?"),

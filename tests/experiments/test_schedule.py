@@ -111,6 +111,13 @@ def test_a_job_stays_on_its_cores_and_has_its_slot_s_environment(tmp_path):
     assert f"[{CORES[0]}] 7" in log(job)
 
 
+def test_a_job_executes_no_file_of_the_working_directory(tmp_path, monkeypatch):
+    (tmp_path / "random.py").write_text("raise SystemExit(9)")
+    monkeypatch.chdir(tmp_path)
+    job = Program(id="job", results=tmp_path, first="import random; random.random()")
+    assert run_jobs([job], Machine([SLOT])) == 0
+
+
 def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("gvz.experiments.schedule.LOCKED_TIMEOUT_S", 1.0)
     job = Program(id="held", results=tmp_path, first="import time; time.sleep(60)")
