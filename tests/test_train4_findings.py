@@ -15,10 +15,11 @@ AGENTS = {
     "4 tasks": ("general_train4", "rainbow_segmented+train4_network"),
     "8 tasks": ("general_short", "rainbow_segmented"),
 }
-LONGER = ("defend_the_center", "health_gathering")
+LONGER = ("defend_the_center", "health_gathering", "seek_and_kill")
 SAID = (
     ("defend_the_center", "fuzzy_enemies+gore+stone_wall"),
     ("health_gathering", "poison+resized_kits+shaded_kits"),
+    ("seek_and_kill", "blue+shadows"),
 )
 STEPS = "general_train4{}/runs/**/metrics.jsonl.gz"
 
