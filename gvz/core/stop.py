@@ -1,6 +1,8 @@
 """Ctrl-C and SIGTERM: the first asks the loop to finish its update, a second one ends it at once. Standard library."""
 
+import atexit
 import contextlib
+import functools
 import os
 import signal
 import sys
@@ -57,8 +59,16 @@ class StopRequest:
 
 def say(message: str) -> None:
     """A line on standard error, if that can be written: what nobody can see is no reason to end otherwise."""
-    with contextlib.suppress(OSError):
+    try:
         print(message, file=sys.stderr)
+    except OSError:
+        _flush_to_nowhere_at_exit()
+
+
+@functools.cache
+def _flush_to_nowhere_at_exit() -> None:
+    """Python flushes once more when it ends; if that fails, its exit code is 120."""
+    atexit.register(lambda: os.dup2(os.open(os.devnull, os.O_WRONLY), 2))
 
 
 def exit_at_once(code: int, message: str) -> NoReturn:

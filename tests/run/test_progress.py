@@ -110,9 +110,12 @@ def test_progress_that_nobody_can_see_stops_nothing(where, unbuffered):
     assert (done.returncode, done.stdout) == (0, "goes on\n")
 
 
-def test_an_error_that_nobody_can_see_has_its_exit_code():
+@pytest.mark.parametrize("command", [("gvz.launch", "--config", "none"), ("gvz.cli", "evaluate")])
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_an_error_that_nobody_can_see_has_its_exit_code(command, unbuffered):
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     with Path("/dev/full").open("w") as stderr:
-        done = subprocess.run([sys.executable, "-m", "gvz.launch", "--config", "none"], stderr=stderr, check=False)
+        done = subprocess.run([sys.executable, "-m", *command], stderr=stderr, env=environment, check=False)
     assert done.returncode == 2
 
 
