@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from benchmarks.record import Record
 from benchmarks.rounds import Row, Spread, curves
@@ -66,16 +67,11 @@ def growth(rows: Sequence[Row]) -> Figure:
             axes.errorbar([point["x"] for point in points], medians, yerr=errors, marker="o", capsize=3, label=name)
         axes.set(xscale="log", yscale="log", xlabel=x_unit, ylabel=found[names[0]][0]["unit"])
         sizes = sorted({point["x"] for name in names for point in found[name]})
-        axes.set_xticks(sizes, list(map(_short, sizes)))  # the axis's own labels may lie on each other
+        short = EngFormatter(sep="")
+        axes.set_xticks(
+            sizes, [short(float(f"{size:.3g}")) for size in sizes]
+        )  # the axis's own labels may lie on each other
         axes.set_xticks([], minor=True)
         axes.grid(visible=True, which="both", alpha=0.3)
         axes.legend(fontsize=7)
     return figure
-
-
-def _short(size: float) -> str:
-    """Three digits: 18855064 -> 18.9M."""
-    for unit, letter in ((1e6, "M"), (1e3, "K")):
-        if size >= unit:
-            return f"{size / unit:.3g}{letter}"
-    return f"{size:g}"

@@ -24,7 +24,7 @@ class Range(NamedTuple):
 
 Share = Annotated[float, Range(0.0, 1.0)]
 _Kept = Annotated[float | None, Range(0.0, 0.99999)]
-"""of a moving average: 1 would keep the first parameters for ever, and near 1 float32 rounds away what is added"""
+"""share of itself that a moving average keeps. With 1 it never changes; near 1, float32 rounds its changes to 0."""
 
 
 @cache

@@ -116,11 +116,12 @@ def wait_for_listener(address: tuple[str, int], timeout_s: float) -> None:
     """Returns when somebody listens there. Raises OSError: why there is no connection after this time."""
     deadline_s = time.monotonic() + timeout_s
     while True:
+        left_s = deadline_s - time.monotonic()
         try:
-            socket.create_connection(address, timeout=timeout_s).close()
+            socket.create_connection(address, timeout=max(left_s, 0.1)).close()
             return
         except OSError:
-            if time.monotonic() > deadline_s:
+            if left_s < 0:
                 raise
             time.sleep(0.1)
 
