@@ -163,6 +163,17 @@ def test_no_target_reads_the_value_of_a_masked_action(parts: dict, agent_file: P
         assert np.array_equal(before.priority, after.priority) == is_equal
 
 
+def test_a_masked_action_is_never_chosen(agent_name: str):
+    """The best action of every sample is masked."""
+    agent, act, evaluate, _ = jitted(plain_config(agent_name))
+    params, obs = made_up_params(agent, 0), batch().obs_t
+    best = np.asarray(evaluate(params, obs).action)
+    masked = replace(obs, mask=jnp.asarray(best[:, None] != np.arange(A)))
+    chosen = [evaluate(params, masked).action]
+    chosen += [act(params, jax.random.key(n), masked, jnp.float32(n % 2))[0] for n in range(20)]
+    assert not any(np.any(action == best) for action in chosen)
+
+
 def test_parts_that_do_not_fit_together_are_refused():
     with pytest.raises(ConfigError, match=r"agent\.hidden_input_share: got 0\.2 with nothing to hide"):
         replace(RAINBOW, hidden_input_share=0.2)

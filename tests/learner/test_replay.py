@@ -188,14 +188,17 @@ def test_returns_and_discounts_by_hand():
     assert set(np.flatnonzero(replayed.leaves())) == set(slots.tolist())
 
 
-def test_rewards_are_scaled_by_task_when_they_are_read():
-    spec = make_spec(num_lanes=2, capacity=40, discount=0.5, num_tasks=2, reward_scales=(3.0, 0.25))
+def test_rewards_are_scaled_and_actions_masked_by_task_when_they_are_read():
+    masks = ((True, True, False), (False, True, True))
+    spec = make_spec(num_lanes=2, discount=0.5, num_tasks=2, reward_scales=(3.0, 0.25), action_masks=masks)
     replayed = Replay(spec)
     for lane in range(2):
         replayed.add([record(lane, reward=r, first=t == 0, task=lane) for t, r in enumerate([0, 1, 2, 4, 8])])
-    batch = jax.jit(replay._transitions, static_argnums=0)(spec, replayed.state, jnp.array([0, 1, 20, 21]))
+    batch = jax.jit(replay._transitions, static_argnums=0)(spec, replayed.state, jnp.array([0, 1, 50, 51]))
     np.testing.assert_array_equal(batch.r_t, [3 * 3, 3 * 6, 3 / 4, 6 / 4])
     np.testing.assert_array_equal(replayed.state.store.reward[:5], [0, 1, 2, 4, 8])
+    for obs in (batch.obs_tm1, batch.obs_t):
+        np.testing.assert_array_equal(obs.mask, np.repeat(masks, 2, axis=0))
 
 
 def test_new_transitions_enter_with_the_largest_priority_ever():
@@ -223,9 +226,9 @@ def test_an_overwritten_slot_stays_undrawable():
     replayed.add([record(first=t == 0) for t in range(20)])
     assert replayed.leaves()[3] > 0
     replayed.add([record()] * 2)
-    replayed.update([0, 1, 3, 4, 19, 10], [5.0] * 6)
+    replayed.update([0, 1, 3, 4, 19, 10], [9.0] * 5 + [5.0])
     assert set(np.flatnonzero(replayed.leaves())) == {*range(5, 19)}, "0..4 read frames 0 and 1; 19 has no window yet"
-    assert float(replayed.state.max_priority) == pytest.approx(5.01**0.6)
+    assert float(replayed.state.max_priority) == pytest.approx(5.01**0.6), "of what can be drawn"
 
 
 def test_a_stack_that_begins_after_the_write_head_stays_drawable():

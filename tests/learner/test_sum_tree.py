@@ -186,6 +186,37 @@ def test_a_leaf_below_the_rounding_step_of_the_total_gets_its_share():
     assert len(np.unique(small % 32)) > 16
 
 
+def draw_of(tree: SumTree, monkeypatch: pytest.MonkeyPatch, point: float, finer_bits: float) -> tuple[int, float]:
+    """The last leaf that is drawn, and its probability, if all random numbers of a draw are these."""
+    numbers = np.float32([[point], [finer_bits]])
+    monkeypatch.setattr(jax.random, "uniform", lambda _, shape: jnp.broadcast_to(numbers, shape))
+    indices, probabilities = sum_tree.sample(tree, jax.random.key(0), 4)
+    return int(indices[-1]), float(probabilities[-1])
+
+
+@pytest.mark.parametrize("num_groups", [1, 4])
+def test_the_finer_bits_reach_from_one_point_to_the_next(num_groups: int, monkeypatch: pytest.MonkeyPatch):
+    """The last point of a batch of 4 is a multiple of 2^-24 of the total, which is that of all groups: 2^-22 of one of
+    four. A group is as above, where 2^-24 are 16 leaves.
+    """
+    group = np.float32([2.0**20, *[2.0**-8] * 4096])
+    size = len(group) * num_groups
+    tree = set_leaves(sum_tree.init(size, num_groups), np.arange(size), np.tile(group, num_groups))
+    point = 1 - 4 / num_groups * 2.0**-19
+    leaves = [draw_of(tree, monkeypatch, point, bits)[0] for bits in (0.0, 1 - 2.0**-24)]
+    assert np.diff(leaves) == pytest.approx(16 * num_groups, abs=2)
+
+
+@pytest.mark.parametrize("num_groups", [1, 3])
+def test_a_point_that_rounds_to_the_end_of_the_last_part_draws_the_last_leaf(
+    num_groups: int, monkeypatch: pytest.MonkeyPatch
+):
+    """3 and the largest float below 1 are 4 in float32, and 4 / 4 is the end of all leaves."""
+    tree = set_leaves(sum_tree.init(30, num_groups), np.arange(30), np.ones(30, np.float32))
+    almost_one = 1 - 2.0**-24
+    assert draw_of(tree, monkeypatch, almost_one, almost_one) == (29, pytest.approx(1 / 30))
+
+
 def test_a_target_at_the_end_of_a_row_finds_the_last_positive_child():
     """Rounding can carry a target to the sum of its row; one draw in 10^5 or less, so the row is asked directly."""
     row = np.zeros((4, FANOUT), np.float32)
