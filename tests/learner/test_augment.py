@@ -59,8 +59,8 @@ def test_frames_of_a_stack_share_their_noise_and_samples_have_their_own(name: st
 @pytest.mark.parametrize(("name", "channels"), KINDS)
 def test_the_share_of_clean_samples_is_exact_and_they_are_drawn_at_random(name: str, channels: int):
     frames = stacks(20, channels)
-    clean = [(run(name, frames, channels, 1.0, 0.75, seed) == frames).all((1, 2, 3)) for seed in (1, 2)]
-    # shifts, inversion and grey may leave a sample as it is by chance; the others do not
+    clean = [(run(name, frames, channels, 1.0, 0.74, seed) == frames).all((1, 2, 3)) for seed in (1, 2)]
+    # 14.8 of 20 are 15; shifts, inversion and grey may leave a sample as it is by chance; the others do not
     assert all(mask.sum() >= 15 for mask in clean)
     if name in ("random_conv", "contrast", "gamma"):
         assert all(mask.sum() == 15 for mask in clean)

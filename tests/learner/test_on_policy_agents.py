@@ -118,16 +118,19 @@ def test_masked_actions_are_never_taken_and_have_finite_gradients(name: str):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grads))
 
 
-def test_ppo_samples_its_policy_and_records_value_and_probability():
+@pytest.mark.parametrize("epsilon", [0.0, 0.3])
+def test_ppo_samples_its_policy_and_records_value_and_probability(epsilon: float):
+    """With probability epsilon an action is uniformly random; what is recorded counts this in."""
     agent, _, evaluate, _ = jitted("ppo")
     params, obs, K = made_up_params(agent, 3), observation(), 3000
-    actions, extras = jax.jit(jax.vmap(lambda key: agent.act(params, key, obs, jnp.float32(0.0))))(
+    actions, extras = jax.jit(jax.vmap(lambda key: agent.act(params, key, obs, jnp.float32(epsilon))))(
         jax.random.split(jax.random.key(0), K)
     )
     evaluation = evaluate(params, obs)
     assert evaluation.q_values is None
     probabilities = np.asarray(evaluation.policy)
     np.testing.assert_allclose(probabilities.sum(1), 1.0, rtol=1e-5)
+    probabilities = (1 - epsilon) * probabilities + epsilon / A
     shares = np.stack([(np.asarray(actions) == a).mean(0) for a in range(A)], axis=1)
     np.testing.assert_allclose(shares, probabilities, atol=5 * np.sqrt(0.25 / K))
     taken = probabilities[np.arange(B), np.asarray(actions)]

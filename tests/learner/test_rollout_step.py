@@ -20,7 +20,8 @@ from learner.agents.configs.pqn import PQNConfig
 from learner.agents.ppo import PPO
 from learner.agents.pqn import PQN
 from learner.config import OnPolicyConfig
-from learner.rollouts import RolloutSpec
+from learner.on_policy import OnPolicyParts
+from learner.rollouts import Rollout, RolloutSpec
 from learner.store import Store
 from learner.train_step import read_metrics
 
@@ -314,6 +315,17 @@ def test_a_rollout_in_minibatches_is_learnt_from_in_another_order_each_time():
         ends.append(np.asarray(compiled(agent, config)(state, made_up_windows(1), np.int32(18)).params["w"]))
     np.testing.assert_array_equal(ends[0], ends[1])
     assert np.abs(ends[0] - ends[2]).max() > 1e-6
+
+
+def test_the_last_rollout_is_learnt_from_until_the_run_has_its_gradient_steps(monkeypatch, tmp_path: Path):
+    """4 steps, and 3 for each rollout."""
+    parts = OnPolicyParts(agent=PQN_, config=replace(CONFIG, total_updates=4), spec=rollout_spec(1))
+    learner = parts.make(jax.random.key(0), NAMES, tmp_path)
+    rollout = Rollout(made_up_windows(1), np.zeros(1, np.int64))
+    monkeypatch.setattr(learner, "can_update", lambda: True)
+    monkeypatch.setattr(learner._rollouts, "take", lambda _: rollout)
+    assert [learner.update() for _ in range(3)] == [3, 1, 0]
+    assert int(learner.arrays()["learner"].num_updates) == 4
 
 
 def test_the_state_is_donated():
