@@ -72,6 +72,34 @@ def test_a_slow_reader_skips_to_the_newest(writer: BroadcastWriter, reader: Broa
     assert read(reader) == (header(10), [10.0] * NUM_PARAMS)
 
 
+def test_a_version_that_comes_during_a_copy_is_read_next(
+    writer: BroadcastWriter, reader: BroadcastReader, monkeypatch: pytest.MonkeyPatch
+):
+    publish(writer, 1)
+    fences = []
+
+    def publish_in_between() -> None:
+        fences.append(1)
+        if len(fences) == 2:
+            publish(writer, 2)
+
+    monkeypatch.setattr(reader, "_fence", publish_in_between)
+    assert [read(reader)[0], read(reader)[0]] == [header(1), header(2)]
+
+
+def test_a_version_counts_when_it_is_whole(writer: BroadcastWriter):
+    """A writer that dies before it counts leaves the version before to the readers."""
+    ticket, found = words_of(writer, 64), []
+
+    class Count(list[int]):
+        def __setitem__(self, index, value):
+            found.append((value, int(ticket[0])))
+
+    writer._count = Count([0])
+    publish(writer, 1)
+    assert found == [(1, 2)], "the slot's ticket is even again"
+
+
 def test_what_was_read_is_the_readers_own(writer: BroadcastWriter, reader: BroadcastReader):
     publish(writer, 1)
     newest = reader.read()

@@ -37,7 +37,7 @@ def wait(actor: RequestWriter, timeout_s: float = 10.0, *, cancelled: bool = Fal
 
 
 def test_what_one_side_writes_the_other_reads(learner: RequestReader):
-    actor = attach(learner)
+    actor, answers = attach(learner), []
     assert learner.pending() is None
     for value in (1, 2, 3):
         for part in actor.observation.values():
@@ -52,8 +52,23 @@ def test_what_one_side_writes_the_other_reads(learner: RequestReader):
         learner.answer(number, answer(value))
         assert learner.pending() is None
         assert wait(actor)
-        action, extras, version = actor.answer()
+        answers.append(actor.answer())
+    for value, (action, extras, version) in zip((1, 2, 3), answers, strict=True):
         assert (action.tolist(), extras.tolist(), version) == ([value] * 2, [[value / 2]] * 2, value * 3)
+
+
+def test_an_answer_is_whole_when_the_actor_sees_it(learner: RequestReader, monkeypatch: pytest.MonkeyPatch):
+    actor, answered = attach(learner), []
+    actor.ask()
+    number = learner.pending()
+    assert number is not None
+
+    def look() -> None:
+        answered.append((wait(actor, cancelled=True), actor.answer().action.tolist()))
+
+    monkeypatch.setattr(learner, "_fence", look)
+    learner.answer(number, answer(7))
+    assert answered == [(False, [7, 7])], "what it says, and then its number"
 
 
 @pytest.mark.parametrize("answered_late", [False, True])
