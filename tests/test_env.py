@@ -113,11 +113,13 @@ def test_kills_beyond_the_upper_bound_do_not_score():
     few = dataclasses.replace(task.scenario, upper_bounds={"thesis": 1, "levdoom": 1})
     env = DoomEnv(dataclasses.replace(task, scenario=few), frame_skip=35)
     env.reset(seed=1)
-    steps = [env.step(2) for _ in range(20)]
+    steps = idle_to_the_end(env, action=2)
     for *_, info in steps:
         assert info["score"] == min(info["kills"], 1)
         assert info["normalized_score"] == 100 * info["score"]
     assert steps[-1][4]["kills"] > 1
+    assert steps[-1][2:4] == (False, True)
+    assert steps[-1][4]["solved_episode"] is False, "to survive is not its objective"
     env.close()
 
 
@@ -174,6 +176,10 @@ def test_death_terminates_with_the_frame_of_its_moment(shared: DoomEnv):
     red, _, blue = (observation.astype(int) - steps[-2][0]).mean((0, 1))
     assert red > blue, "the screen turns red"
     assert 4 * (len(steps) - 1) < info["episode_frames"] <= 4 * len(steps)
+    scenario = dataclasses.replace(shared.task.scenario, timeouts={"thesis": info["episode_frames"]})
+    with closing(DoomEnv(dataclasses.replace(shared.task, scenario=scenario))) as env:
+        env.reset(seed=1)
+        assert idle_to_the_end(env)[-1][2:4] == (True, False), "also in the frame of the time-out"
 
 
 @pytest.mark.parametrize(("frame_skip", "decisions"), [(4, 275), (7, 158)])
