@@ -65,6 +65,14 @@ def test_an_episode_found_twice_is_there_once(tmp_path):
     assert sorted(frame["player"]) == ["r/seed_1@9", "r/seed_1@9", "random"]
 
 
+def test_an_episode_by_other_rules_is_another_one(tmp_path):
+    rules = {"profile": "levdoom", "action_set": "unified_v1", "frame_skip": 7, "observes": "labels", "seed": 8}
+    plain = {"action_set": "buttons", "frame_skip": 4}
+    lines = [line(**plain), *(line(**{**plain, name: value}) for name, value in rules.items())]
+    (tmp_path / "random.jsonl").write_text("".join(lines))
+    assert len(read_evaluations(tmp_path)) == 6
+
+
 def test_episodes_of_a_run_are_there_once_with_those_of_a_file_elsewhere(tmp_path):
     policy = {"player": "r/seed_1@9", "run": "r", "run_seed": 1, "num_updates": 9, "params": "abc"}
     run_dir = tmp_path / "z"

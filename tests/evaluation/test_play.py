@@ -1,5 +1,6 @@
 """Evaluation episodes: their seeds, the same rows however they are shared out, engines that die."""
 
+import contextlib
 import dataclasses
 import multiprocessing
 import os
@@ -12,7 +13,7 @@ from gvz.core.env_config import EnvConfig
 from gvz.core.errors import EngineError, GvzError, WaitTimeoutError
 from gvz.env import DoomEnv
 from gvz.evaluation.episode_log import simple_player
-from gvz.evaluation.play import Episode, PlayerSpec, episode_seed, play, play_episode
+from gvz.evaluation.play import Episode, PlayerSpec, _Worker, episode_seed, play, play_episode
 from gvz.evaluation.players import RandomPlayer
 from gvz.evaluation.simple import player_env
 from gvz.tasks import named_tasks
@@ -58,6 +59,18 @@ def test_rewards_are_counted_by_the_profiles_weights_whatever_the_players_are():
     ]
     (_, default), (_, other) = play([(player_spec, Episode(TASK, 0)) for player_spec in player_specs], num_workers=0)
     assert other == default
+
+
+@pytest.mark.engine
+def test_a_worker_keeps_its_game_only_for_the_same_rules():
+    """A player that sees fuzz may need a fresh engine for each episode."""
+    blind = simple_player("random", SMALL)
+    seeing = dataclasses.replace(blind, recycle_episodes=None)
+    assert blind.recycle_episodes == 0
+    with contextlib.closing(_Worker()) as worker:
+        game = worker._game(blind, "defend_the_center/fuzzy_enemies")
+        assert worker._game(blind, "defend_the_center/fuzzy_enemies") is game
+        assert worker._game(seeing, "defend_the_center/fuzzy_enemies") is not game
 
 
 class Assassin:

@@ -200,3 +200,5 @@ def test_groups_of_the_same_runs_are_redrawn_together():
     assert (wide.value, wide.low, wide.high) == (50.0, 40.0, 60.0)
     with pytest.raises(ValueError, match="want the same runs in each group"):
         bootstrap_runs([runs, runs[:2]], mean_over_scenarios, redraw=["runs"] * 2, together=True)
+    with pytest.raises(ValueError, match="and to redraw runs"):
+        bootstrap_runs([runs, runs], mean_over_scenarios, redraw=["runs", "episodes"], together=True)

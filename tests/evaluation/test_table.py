@@ -21,6 +21,8 @@ def test_rows_of_earlier_versions_have_what_follows_from_their_score_and_count_o
     rows.append({**rows[0], "score": 1100.0})
     (row,) = score_rows(rows, {"player": "p"}, [default], episodes=9)
     assert (row["episodes"], row["score"], row["normalized_score"]) == (2, 110.0, 10.0)
+    (row,) = score_rows([{**rows[0], "profile": "levdoom", "score": 210.0}], {"player": "p"}, [default], episodes=9)
+    assert row["normalized_score"] == 10.0, "of 2100 frames"
     (kills, *_) = named_tasks("seek_and_kill")
     (row,) = score_rows([{**rows[0], "task": kills.id, "score": 15.0}], {"player": "p"}, [kills], episodes=9)
     assert (row["player_kills"], row["score"], row["normalized_score"]) == (None, 15.0, 75.0)

@@ -3,13 +3,16 @@
 import dataclasses
 import json
 
+import numpy as np
 import pytest
 
+from gvz.evaluation.statistics import Estimate
 from gvz.experiments.base import experiment_named
 from gvz.experiments.inventory import run_directory
 from gvz.experiments.plan import Plan
 from gvz.reports.experiment_section import aggregate_table, comparison_table, experiment_section, result_table
 from gvz.reports.results import PlannedExperiment, read_results
+from gvz.reports.scores import Scores, estimate
 from gvz.tasks import parse_task
 from tests.reports.conftest import write_rows
 
@@ -121,6 +124,15 @@ def test_a_level_is_the_mean_of_its_tasks_each_trained_alone(tmp_path, experimen
     assert values == [80.0, round(70 + 4 / 7, 2), round(60 + 8 / 6, 2), round(50 + 8 / 3, 2)]
     assert (ours[6].kind, ours[6].text, ours[6].note) == ("missing", "-", "0 of 1 seeds")
     assert published[2].text == "87.48"
+
+
+@pytest.mark.parametrize(("agents_of_tasks", "ends"), [(False, (5.0, 5.0)), (True, (0.0, 10.0))])
+def test_seeds_of_agents_of_single_tasks_are_redrawn_for_each_task(agents_of_tasks: bool, ends: tuple[float, float]):
+    """Each seed is good on one of two tasks. Of one agent, the mean is always 5. Of two, both drawn may be bad."""
+    zero, ten = np.zeros(1), np.full(1, 10.0)
+    runs = {1: {"one": zero, "other": ten}, 2: {"one": ten, "other": zero}}
+    scores = Scores(runs=runs, wanted_seeds=(1, 2), agents_of_tasks=agents_of_tasks)
+    assert estimate(scores, ("one", "other")).estimate == Estimate(value=5.0, low=ends[0], high=ends[1])
 
 
 def test_an_experiment_without_any_results_is_a_table_of_missing_cells(tmp_path):
