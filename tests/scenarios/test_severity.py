@@ -9,17 +9,18 @@ import gvz
 from gvz.core.errors import TaskError
 from gvz.evaluation.gallery import task_frame
 from gvz.evaluation.play import episode_seed
-from gvz.scenarios.base import Task
+from gvz.scenarios.base import Content, Period, Task, Toward, Uniform
 from gvz.scenarios.compiler import compile_task, map_source, task_content
-from gvz.scenarios.severity import in_force
+from gvz.scenarios.severity import graded, in_force
 from gvz.tasks import all_scenarios, parse_task, scenarios
 from gvz.wad.textures import blended
 from tests.scenarios.conftest import bad_lines
 
-HALF = tuple((f"{name}/complete=0.5", "thesis") for name in ("defend_the_center", "dodge_projectiles"))
-HALF += (("defend_the_center/fast=0.5+fuzzy=0.5+resized=0.5+gore=0.4", "thesis"),)
-HALF += (("defend_the_center/fast=0.5", "levdoom"), ("health_gathering/short_agent=0.5+poison=0.5+slime=0.5", "thesis"))
-HALF += (("health_gathering/supreme+shaded_kits=0.7", "thesis"),)
+GRADED = tuple((f"{name}/complete=0.5", "thesis") for name in ("defend_the_center", "dodge_projectiles"))
+GRADED += (("defend_the_center/fast=0.5+fuzzy=0.5+resized=0.5+gore=0.4", "thesis"),)
+GRADED += (("defend_the_center/fast=0.25", "levdoom"),)
+GRADED += (("health_gathering/short_agent=0.5+poison=0.5+slime=0.5", "thesis"),)
+GRADED += (("health_gathering/supreme+shaded_kits=0.7", "thesis"),)
 SHADED = 66
 """the engine's number of STYLE_Shaded"""
 RESIZED_AT_HALF = (0.65, 2.0)
@@ -127,6 +128,14 @@ def test_things_are_spread_and_numbers_go_part_of_the_way():
     default, whole = content("default").parameters, content("poison").parameters
     half = content("poison=0.5").parameters
     assert (default["num_poisons"], half["num_poisons"], whole["num_poisons"]) == (0, 1, 2)
+    before = Content(parameters={"enemies": 10, "radius": 100.0, "angle": Uniform(0.0, 0.5), "delay": 20})
+    whole = {"enemies": 30, "radius": Uniform(60.0, 140.0), "angle": 1.0, "delay": Period(40)}
+    change = Content(parameters=whole, entity={"Speed": 20.0})
+    quarter = graded(before, change, 0.25)
+    assert quarter.parameters == {
+        "enemies": 15, "radius": Uniform(90.0, 110.0), "angle": Uniform(0.25, 0.625), "delay": 25
+    }  # fmt: skip
+    assert quarter.entity == {"Speed": Toward(20.0, 0.25)}
 
 
 @pytest.mark.parametrize(("profile", "whole", "first"), [("thesis", 30, 1), ("levdoom", 60, 0)])
@@ -156,15 +165,15 @@ def test_a_whole_attribute_is_in_force_in_its_share_of_the_episodes():
 
 
 @pytest.mark.engine
-@pytest.mark.parametrize("job", HALF, ids="-".join)
-def test_games_at_half_severity_are_what_they_say(measured, job):
-    found = measured(HALF, job)
+@pytest.mark.parametrize("job", GRADED, ids="-".join)
+def test_games_at_a_severity_are_what_they_say(measured, job):
+    found = measured(GRADED, job)
     assert found["magic_right"]
     assert bad_lines(found["log"]) == []
     if "fast" in job[0]:  # 8 and 10 of the classes, 20 (levdoom: 15) of the attribute
-        speeds = (11.5, 12.5) if job[1] == "levdoom" else (14.0, 15.0)
+        speeds, damage = ((9.75, 11.25), 0.825) if job[1] == "levdoom" else ((14.0, 15.0), 0.65)
         assert {entity["speed"] for entity in found["entities"]} <= set(speeds)
-        assert found["agent"]["damage_factor"] == pytest.approx(0.65, abs=1e-4)  # halfway from 1 to 0.3
+        assert found["agent"]["damage_factor"] == pytest.approx(damage, abs=1e-4)  # on the way from 1 to 0.3
     if "resized" in job[0]:
         low, high = RESIZED_AT_HALF
         scales = [entity[name] for entity in found["entities"] for name in ("scale_x", "scale_y")]
