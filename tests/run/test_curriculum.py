@@ -95,6 +95,10 @@ def test_progress_draws_where_the_score_moves_most():
     lessons = curriculum(kind="progress", staleness_share=1.0)
     gaps = np.diff(np.flatnonzero(np.array(play(lessons, 30.0, 2_000)) == 3))
     assert gaps.max() < 30, "a stale task comes back"
+    lessons = curriculum(kind="progress", staleness_share=0.0, temperature=0.5)
+    play(lessons, 30.0, 8)
+    squares = np.array([1 / 16, 1 / 9, 1 / 4, 1])  # (1 / rank)^(1 / 0.5)
+    np.testing.assert_allclose(sorted(lessons.probabilities()), squares / squares.sum())
 
 
 @pytest.mark.parametrize("kind", ["uniform", "level", "progress"])
