@@ -1,10 +1,11 @@
 """Configuration of the actor pool."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from actors.placement import PlacementKind
 from gvz.core.errors import ConfigError
+from gvz.core.ranges import Range, check_ranges
 
 MAX_LANES = 2**16
 """games of a run: a step record numbers them with 16 bits"""
@@ -14,10 +15,10 @@ MAX_LANES = 2**16
 class ActorsConfig:
     """How many processes play, and how patiently they are watched. Times in seconds, sizes in step records."""
 
-    num_actors: int | None = None
+    num_actors: Annotated[int | None, Range(1, MAX_LANES)] = None
     """actor processes, of each host if there are some (cluster.hosts); default one per CPU core of this machine, or
     fewer if the replay or the warm-up has no room for their games"""
-    games_per_actor: int | None = None
+    games_per_actor: Annotated[int | None, Range(1, MAX_LANES)] = None
     """games each actor plays and acts on in one batch; default the smallest number >= 4 that gives every actor
     every task, with more than 16 tasks that gives every task a game in the run"""
     placement: PlacementKind = "auto"
@@ -41,14 +42,9 @@ class ActorsConfig:
     where the task needs it, as with fuzzy enemies: a fresh engine for every episode lets each be replayed alone"""
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("num_actors", 1, MAX_LANES),
-            ("games_per_actor", 1, MAX_LANES),
-            ("ring_capacity", 8, 2**20),
-        ):
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise ConfigError(f"actors.{name}: got {value}, want {low}..{high}")
+        check_ranges("actors", self)
+        if not 8 <= self.ring_capacity <= 2**20:
+            raise ConfigError(f"actors.ring_capacity: got {self.ring_capacity}, want 8..{2**20}")
         for name in ("start_timeout_s", "heartbeat_timeout_s", "restart_window_s"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"actors.{name}: got {getattr(self, name)}, want more than 0 seconds")

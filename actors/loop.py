@@ -12,7 +12,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from actors.policy import AskedPolicy, Policy, make_policy
+from actors.policy import AskedPolicy, ExportedPolicy, Policy, RandomPolicy
 from actors.preprocess import ObservationBatch
 from gvz.core.errors import ConfigError, ResumeError
 from gvz.transport.inference import RequestWriter
@@ -138,16 +138,11 @@ class ActorLoop:
             self.games.pop().env.close()
 
     def _local_policy(self) -> Policy:
-        spec = self._spec
-        return make_policy(
-            spec.policy,
-            num_actions=spec.num_actions,
-            num_params=spec.num_params,
-            obs=self._obs.arrays,
-            seed=derive_seed(spec.seed, spec.actor, *spec.first_episodes),
-            fold=spec.fold,
-            fold_period_steps=spec.fold_period_steps,
-        )
+        spec, obs = self._spec, self._obs.arrays
+        seed = derive_seed(spec.seed, spec.actor, *spec.first_episodes)
+        if not spec.policy:
+            return RandomPolicy(spec.num_actions, len(spec.lanes), seed)
+        return ExportedPolicy(spec.policy, spec.num_params, obs, seed, spec.fold, spec.fold_period_steps)
 
     def _make_env(self, task: int) -> gymnasium.Env[np.ndarray, int]:
         module, _, name = self._spec.env_entry_point.partition(":")

@@ -174,19 +174,3 @@ class AskedPolicy:
         self.num_calls += 1
         action, extras, self.params_version = self._requests.answer()
         return action, extras
-
-
-def make_policy(
-    serialized: bytes,
-    *,
-    num_actions: int,
-    num_params: int,
-    obs: Mapping[str, np.ndarray],
-    seed: int,
-    fold: bytes = b"",
-    fold_period_steps: int = 1,
-) -> Policy:
-    """The policy of an actor: an `ExportedPolicy`, whose arguments these are, or chance if `serialized` is empty."""
-    if not serialized:
-        return RandomPolicy(num_actions, len(obs["task"]), seed)
-    return ExportedPolicy(serialized, num_params, obs, seed, fold, fold_period_steps)

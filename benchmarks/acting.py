@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks import workload
 from benchmarks.remote import Remote, count_per_s
-from benchmarks.rounds import Budget, Row, alternate, goal, measured, rates
+from benchmarks.rounds import Budget, Row, alternate, goal, measured, rates, ratios
 
 _POOLS = ((8, 1), (8, 16), (16, 16))
 """games of an actor, and decisions of each for which it keeps a draw of noise"""
@@ -83,11 +83,5 @@ def measure(budget: Budget) -> list[Row]:
         *profile,
         measured("float32 products, all cores", "GFLOP/s", [f / 1e9 for f in values["flops"]]),
         measured("arithmetic of one decision", "MFLOP", [flops / 1e6]),
-        goal(
-            2,
-            "acting pool against the limit",
-            [best / limit for best, limit in zip(bests, limits, strict=True)],
-            at_least=0.6,
-            unit="x",
-        ),
+        goal(2, "acting pool against the limit", ratios(bests, limits), at_least=0.6, unit="x"),
     ]

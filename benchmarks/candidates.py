@@ -9,6 +9,7 @@ from benchmarks import workload
 from benchmarks.remote import Remote, count_per_s, start_peer
 from benchmarks.rounds import Budget, Row, absent, goal, ratios
 from gvz.core.env_config import EnvConfig
+from gvz.engine.tuned import TUNED
 
 
 class Candidates:
@@ -79,4 +80,4 @@ class Candidates:
 
 def engine_is_tuned() -> bool:
     """Whether the installed ViZDoom is our build of it (docs/ENGINE.md)."""
-    return "+gvz" in version("vizdoom")
+    return TUNED in version("vizdoom")

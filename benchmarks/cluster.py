@@ -7,6 +7,7 @@ frames at once give the rate and the processor time of the way to the learner. T
 second goes out. A host has one actor with four games.
 """
 
+import contextlib
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -74,16 +75,13 @@ def _real_frames(directory: Path, count: int) -> Path:
     import gvz
 
     rng, frames = np.random.default_rng(1), list[np.ndarray]()
-    env = gvz.make("defend_the_center/default")
-    try:
+    with contextlib.closing(gvz.make("defend_the_center/default")) as env:
         frame, _ = env.reset(seed=1)
         while len(frames) < count:
             frames.append(np.asarray(frame))
             frame, _, terminated, truncated, _ = env.step(int(rng.integers(3)))
             if terminated or truncated:
                 frame, _ = env.reset()
-    finally:
-        env.close()
     file = directory / "frames.npy"
     np.save(file, np.stack(frames))
     return file

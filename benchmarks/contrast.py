@@ -69,13 +69,12 @@ def measure_contrast(task: Task, num_episodes: int = NUM_EPISODES) -> dict[str, 
         walk = [env.action_meanings.index((button,)) for button in ("MOVE_FORWARD", "TURN_LEFT", "TURN_RIGHT")]
         for episode in range(num_episodes):
             env.reset(options={"episode_seed": episode})
-            ended, action = False, walk[0]
+            action = walk[0]
             for decision in range(DECISIONS):
                 if decision % LOOK_PERIOD == 0:
                     action = rng.choice(walk, p=[0.5, 0.25, 0.25])
                 observation, _, terminated, truncated, _ = env.step(action)
-                ended = terminated or truncated
-                if ended:
+                if terminated or truncated:
                     break
                 if decision % LOOK_PERIOD == LOOK_PERIOD - 1:
                     assert isinstance(observation, dict)

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from benchmarks import workload
-from benchmarks.rounds import Budget, Row, alternate, goal, measured, seconds_per_call
+from benchmarks.rounds import Budget, Row, alternate, goal, measured, ratios, seconds_per_call
 
 _FRAME_SHAPE = (24, 24, 3)
 """frames of the replay curves: a million frames of 84x84x3 would be 21 GB"""
@@ -42,9 +42,7 @@ def _curve(
 def exponent(values: Mapping[float, Sequence[float]]) -> list[float]:
     """b of y ~ x^b between the smallest and the largest x, a value a round: 0 is flat, 1 is linear."""
     low, high = min(values), max(values)
-    return [
-        math.log(above / below) / math.log(high / low) for below, above in zip(values[low], values[high], strict=True)
-    ]
+    return [math.log(grown, high / low) for grown in ratios(values[high], values[low])]
 
 
 def _alternate(budget: Budget, bodies: Mapping[float, Callable[[], float]]) -> dict[float, list[float]]:
@@ -104,7 +102,7 @@ def replay_rows(budget: Budget, capacities: Sequence[int]) -> list[Row]:
     for name, bodies in (("insertion of 64 records", inserts), ("draw of a batch of 32", draws)):
         values = _alternate(budget, bodies)
         low, high = min(values), max(values)
-        grown = [above / below for below, above in zip(values[low], values[high], strict=True)]
+        grown = ratios(values[high], values[low])
         allowed = math.log(high) / math.log(low)
         rows += _curve(name, "ms", "records in the replay", values, 1e3)
         rows.append(goal(7, f"{name}, {high:,} against {low:,} records", grown, at_most=round(allowed, 2), unit="x"))

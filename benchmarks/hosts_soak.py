@@ -11,7 +11,6 @@ run and the cluster have left behind is counted: processes, files in /dev/shm, p
 import json
 import shlex
 import signal
-import statistics
 import sys
 import tempfile
 import time
@@ -25,7 +24,7 @@ import tyro
 from rich.console import Console
 
 from benchmarks import record
-from benchmarks.soak import DIRECTORY, SCHEMA, Watched, ticks, words_of
+from benchmarks.soak import DIRECTORY, SCHEMA, Watched, growth, ticks, words_of
 from gvz.core import janitor, records
 from gvz.run import machine
 
@@ -120,14 +119,7 @@ def table(made: dict[str, Any] | None) -> str:
     if made is None:
         return "There is no record of this soak; `python -m benchmarks.hosts_soak` makes one."
     machine_of, samples = made["machine"], made["samples"]
-    fifth = max(1, len(samples["time_s"]) // 5)
-    growth = {
-        text: statistics.median(samples[name][-fifth:]) / statistics.median(samples[name][:fifth])
-        for name, text in (
-            ("learner_bytes", "resident memory of the learner"),
-            ("learner_descriptors", "its descriptors"),
-        )
-    }
+    grows = {"learner_bytes": "resident memory of the learner", "learner_descriptors": "its descriptors"}
     return "\n".join(
         [
             f"*{made['date']} UTC, commit {made['commit']}, `{made['command']}`; {machine_of['cpu']}, "
@@ -142,7 +134,7 @@ def table(made: dict[str, Any] | None) -> str:
             f"| records that came too late and were dropped | {made['dropped_records']} |",
             f"| gradient steps, decisions | {made['updates']:,}, {made['env_steps']:,} |",
             f"| damaged rows in the records | {made['damaged_rows']} |",
-            *(f"| {text}, last fifth / first fifth | {value:.3f} |" for text, value in growth.items()),
+            *(f"| {text}, last fifth / first fifth | {growth(samples[name]):.3f} |" for name, text in grows.items()),
             f"| exit code after SIGTERM | {made['exit_code']} |",
             f"| left behind | {', '.join(made['left_behind']) or 'nothing'} |",
         ]

@@ -10,6 +10,7 @@ import psutil
 
 from benchmarks.rounds import Row
 from gvz.core.errors import ConfigError
+from gvz.engine.tuned import TUNED
 from gvz.run import machine
 
 SCHEMA = 1
@@ -46,7 +47,7 @@ class Record:
         nothing.
         """
         plays = self.benchmark not in WITHOUT_AN_ENGINE
-        tuned = "tuned" if plays and "+gvz" in self.versions.get("vizdoom", "") else ""
+        tuned = "tuned" if plays and TUNED in self.versions.get("vizdoom", "") else ""
         return "_".join(word for word in (self.device if self.device != "cpu" else "", tuned) if word)
 
 

@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from benchmarks import hosts_soak, record
 from benchmarks.report import between
 from benchmarks.soak import DIRECTORY, SCHEMA, kill_ratios, summary
@@ -93,11 +95,6 @@ def soak_table(made: dict[str, Any]) -> str:
 
 def draw(made: dict[str, Any], out: Path) -> None:
     """One panel for each quantity that must not grow, the kills as ticks, and the rates of the stretches."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     minutes = [s / 60 for s in made["samples"]["time_s"]]
     panels = {
         "memory, GB": {"learner": ("learner_bytes", 1e9), "all processes": ("all_bytes", 1e9)},
@@ -107,7 +104,8 @@ def draw(made: dict[str, Any], out: Path) -> None:
             "files in /dev/shm": ("shared_memory_files", 1),
         },
     }
-    figure, all_axes = plt.subplots(3, 1, figsize=(9.0, 7.0), sharex=True, layout="constrained")
+    figure = Figure(figsize=(9.0, 7.0), layout="constrained")
+    all_axes = figure.subplots(3, 1, sharex=True)
     for axes, (label, curves) in zip(all_axes, panels.items(), strict=False):
         for name, (column, unit) in curves.items():
             axes.plot(minutes, [value / unit for value in made["samples"][column]], label=name, linewidth=1)
@@ -120,7 +118,6 @@ def draw(made: dict[str, Any], out: Path) -> None:
     all_axes[2].vlines([kill / 60 for kill in made["kills"]], 0, 0.05, transform=all_axes[2].get_xaxis_transform())
     all_axes[2].set(xlabel="minutes (ticks: kills)", ylabel="gradient steps/s\ngreen: undisturbed", ylim=(0, None))
     figure.savefig(out, dpi=110, metadata={"Software": None})
-    plt.close(figure)
 
 
 def write_page(page: str, soak: dict[str, Any], fuzz: dict[str, Any]) -> str:

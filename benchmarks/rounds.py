@@ -15,6 +15,8 @@ import numpy as np
 Row = dict[str, Any]
 Spread = dict[str, Any]
 """median, min and max of a quantity over the rounds, and its `values`, one per round"""
+FRAME_SKIP = 4
+"""of everybody who plays"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -73,15 +75,17 @@ def rates(
     *,
     decisions_per_s: Sequence[float] | None = None,
     updates_per_s: Sequence[float] | None = None,
-    frame_skip: int = 4,
     batch_size: int = 32,
 ) -> Row:
     """The four rates of a candidate; None for a rate that it does not have."""
     row: Row = {"kind": "rates", "name": name}
-    for rate, unit in ((decisions_per_s, ("decisions", 1)), (decisions_per_s, ("frames", frame_skip))):
-        row[f"{unit[0]}_per_s"] = None if rate is None else spread([value * unit[1] for value in rate])
-    for rate, unit in ((updates_per_s, ("updates", 1)), (updates_per_s, ("samples", batch_size))):
-        row[f"{unit[0]}_per_s"] = None if rate is None else spread([value * unit[1] for value in rate])
+    for unit, rate, factor in (
+        ("decisions", decisions_per_s, 1),
+        ("frames", decisions_per_s, FRAME_SKIP),
+        ("updates", updates_per_s, 1),
+        ("samples", updates_per_s, batch_size),
+    ):
+        row[f"{unit}_per_s"] = None if rate is None else spread([value * factor for value in rate])
     return row
 
 

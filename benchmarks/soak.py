@@ -197,15 +197,15 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
 
 
 def summary(made: dict[str, Any]) -> dict[str, float]:
-    """The promised quantities: medians of the last fifth over the first, and the median of `kill_ratios`."""
-    samples = made["samples"]
-    fifth = max(1, len(samples["time_s"]) // 5)
-    grown = {
-        name: statistics.median(samples[name][-fifth:]) / statistics.median(samples[name][:fifth])
-        for name in samples
-        if name != "time_s"
-    }
+    """The promised quantities: `growth` of each sample, and the median of `kill_ratios`."""
+    grown = {name: growth(values) for name, values in made["samples"].items() if name != "time_s"}
     return {**grown, "updates_per_s": statistics.median(kill_ratios(made))}
+
+
+def growth(values: Sequence[float]) -> float:
+    """Median of the last fifth over that of the first."""
+    fifth = max(1, len(values) // 5)
+    return statistics.median(values[-fifth:]) / statistics.median(values[:fifth])
 
 
 def kill_ratios(made: dict[str, Any]) -> list[float]:

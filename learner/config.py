@@ -2,10 +2,10 @@
 
 import dataclasses
 from dataclasses import dataclass
-from functools import cache
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from gvz.core.errors import ConfigError
+from gvz.core.ranges import Range, Share, check_ranges
 from gvz.core.registry import find
 
 ConvForm = Literal["auto", "direct", "shifted", "paired"]
@@ -13,38 +13,8 @@ Augmentation = Literal["shift", "vertical_shift", "random_conv", "contrast", "ga
 """a function of learner/augment.py"""
 MOST_UPDATES = 2**31 - 1
 """gradient steps of a run: they are counted with 32 bits"""
-
-
-class Range(NamedTuple):
-    """What a field may be, ends included: `Annotated[float, Range(0.0, 10.0)]`."""
-
-    low: float
-    high: float
-
-
-Share = Annotated[float, Range(0.0, 1.0)]
 _Kept = Annotated[float | None, Range(0.0, 0.99999)]
 """share of itself that a moving average keeps. With 1 it never changes; near 1, float32 rounds its changes to 0."""
-
-
-@cache
-def _ranges(kind: type) -> dict[str, Range]:
-    """The ranges of a class's fields. A field whose default alone is changed in a subclass keeps its range."""
-    return {
-        name: item
-        for owner in reversed(kind.__mro__)
-        for name, hint in get_type_hints(owner, include_extras=True).items()
-        for item in getattr(hint, "__metadata__", ())
-        if isinstance(item, Range)
-    }
-
-
-def check_ranges(prefix: str, config: object) -> None:
-    """Raises ConfigError for the first field outside its range; None passes (a value to be derived)."""
-    for name, (low, high) in _ranges(type(config)).items():
-        value = getattr(config, name)
-        if value is not None and not low <= value <= high:
-            raise ConfigError(f"{prefix}.{name}: got {value}, want {low:g}..{high:g}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -157,7 +157,7 @@ def test_a_ratio_is_made_within_a_round():
 
 
 def test_rates_give_frames_and_samples_with_decisions_and_updates():
-    row = rounds.rates("x", decisions_per_s=[10.0], frame_skip=4)
+    row = rounds.rates("x", decisions_per_s=[10.0])
     assert row["frames_per_s"]["median"] == 40.0
     assert row["updates_per_s"] is None
     row = rounds.rates("x", updates_per_s=[2.0], batch_size=32)

@@ -5,12 +5,11 @@
 The engine has the settings of our own environment: the same map, buttons, variables and screen.
 """
 
+import itertools
 import sys
-import time
-from typing import Any
 
 import numpy as np
-from serve import serve
+from serve import serve_rate
 
 from gvz.engine.engine import Engine
 from gvz.env import DoomEnv
@@ -24,20 +23,18 @@ def main() -> None:
     env = DoomEnv(task, render_width=width, render_height=height)
     engine = Engine(env._engine_config)
     game, rng = engine._game, np.random.default_rng()
-    actions = [env._actions[index] for index in rng.integers(env.action_space.n, size=_NUM_ACTIONS)]
+    choices = rng.integers(env.action_space.n, size=_NUM_ACTIONS)
+    actions = itertools.cycle([env._actions[index] for index in choices])
     engine.new_episode(int(rng.integers(2**31)))
 
-    def play(seconds: float) -> dict[str, Any]:
-        count, start = 0, time.perf_counter()
-        while time.perf_counter() - start < seconds:
-            game.make_action(actions[count % _NUM_ACTIONS], env.config.frame_skip)
-            if game.get_state() is None:
-                engine.new_episode(int(rng.integers(2**31)))
-            count += 1
-        return {"count": count, "seconds": time.perf_counter() - start}
+    def decide() -> int:
+        game.make_action(next(actions), env.config.frame_skip)
+        if game.get_state() is None:
+            engine.new_episode(int(rng.integers(2**31)))
+        return 1
 
     try:
-        serve(play, "vizdoom")
+        serve_rate(decide, "vizdoom")
     finally:
         engine.close()
 

@@ -1,12 +1,10 @@
 """EnvPool's ViZDoom task, asynchronously: `python envpool_doom.py NUM_ENVS NUM_THREADS`."""
 
 import sys
-import time
-from typing import Any
 
 import envpool
 import numpy as np
-from serve import serve
+from serve import serve_rate
 
 
 def main() -> None:
@@ -23,15 +21,12 @@ def main() -> None:
     rng = np.random.default_rng(0)
     pool.async_reset()
 
-    def play(seconds: float) -> dict[str, Any]:
-        count, start = 0, time.perf_counter()
-        while time.perf_counter() - start < seconds:
-            info = pool.recv()[-1]
-            pool.send(rng.integers(pool.action_space.n, size=num_threads, dtype=np.int32), info["env_id"])
-            count += num_threads
-        return {"count": count, "seconds": time.perf_counter() - start}
+    def play() -> int:
+        info = pool.recv()[-1]
+        pool.send(rng.integers(pool.action_space.n, size=num_threads, dtype=np.int32), info["env_id"])
+        return num_threads
 
-    serve(play, "envpool", num_envs=num_envs, frame_skip=4)
+    serve_rate(play, "envpool", num_envs=num_envs, frame_skip=4)
 
 
 if __name__ == "__main__":

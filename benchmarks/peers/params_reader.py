@@ -3,9 +3,8 @@
 
 import sys
 import time
-from typing import Any
 
-from serve import serve
+from serve import serve_rate
 
 from gvz.transport.broadcast import BroadcastReader
 
@@ -17,14 +16,12 @@ def main() -> None:
     """Attaches to the queue and serves."""
     reader = BroadcastReader.attach(int(sys.argv[1]), int(sys.argv[2]), 0)
 
-    def read(seconds: float) -> dict[str, Any]:
-        count, start = 0, time.perf_counter()
-        while time.perf_counter() - start < seconds:
-            count += reader.read() is not None
-            time.sleep(_STEP_S)
-        return {"count": count, "seconds": time.perf_counter() - start}
+    def read() -> int:
+        found = reader.read()
+        time.sleep(_STEP_S)
+        return found is not None
 
-    serve(read)
+    serve_rate(read)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,9 @@
 """Writes blocks into a ring as fast as its reader frees slots: `python ring_writer.py DESCRIPTOR CAPACITY BLOCK`."""
 
 import sys
-import time
-from typing import Any
 
 import numpy as np
-from serve import serve
+from serve import serve_rate
 
 from gvz.transport.ring import RingWriter
 
@@ -19,17 +17,14 @@ def main() -> None:
     ring = RingWriter.attach(descriptor, capacity, _SHAPE)
     frames = np.random.default_rng(0).integers(0, 256, (block, *_SHAPE), np.uint8)
 
-    def write(seconds: float) -> dict[str, Any]:
-        count, start = 0, time.perf_counter()
-        while time.perf_counter() - start < seconds:
-            ring.wait_for_space(block, _TIMEOUT_S)
-            _, slots = ring.reserve(block)
-            slots[...] = frames
-            ring.commit()
-            count += block
-        return {"count": count, "seconds": time.perf_counter() - start}
+    def write() -> int:
+        ring.wait_for_space(block, _TIMEOUT_S)
+        _, slots = ring.reserve(block)
+        slots[...] = frames
+        ring.commit()
+        return block
 
-    serve(write)
+    serve_rate(write)
 
 
 if __name__ == "__main__":

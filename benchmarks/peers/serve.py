@@ -23,18 +23,27 @@ def serve(body: Callable[..., dict[str, Any]], *packages: str, **about: Any) -> 
         print(json.dumps(body(**json.loads(line))), flush=True)
 
 
+def serve_rate(work: Callable[[], int], *packages: str, **about: Any) -> None:
+    """Serves the rate of `work`, which is done again and again and returns how much it was; the rest as of `serve`."""
+
+    def repeat(seconds: float) -> dict[str, Any]:
+        count, start = 0, time.perf_counter()
+        while time.perf_counter() - start < seconds:
+            count += work()
+        return {"count": count, "seconds": time.perf_counter() - start}
+
+    serve(repeat, *packages, **about)
+
+
 def serve_random_play(envs: Any, *packages: str, **about: Any) -> None:
     """Serves random play in a vector environment of Gymnasium, which is closed at the end; arguments as of `serve`."""
     envs.reset(seed=0)
 
-    def play(seconds: float) -> dict[str, Any]:
-        count, start = 0, time.perf_counter()
-        while time.perf_counter() - start < seconds:
-            envs.step(envs.action_space.sample())
-            count += envs.num_envs
-        return {"count": count, "seconds": time.perf_counter() - start}
+    def play() -> int:
+        envs.step(envs.action_space.sample())
+        return envs.num_envs
 
     try:
-        serve(play, *packages, **about)
+        serve_rate(play, *packages, **about)
     finally:
         envs.close()

@@ -1,8 +1,10 @@
 """Configuration of actor hosts."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from gvz.core.errors import ConfigError
+from gvz.core.ranges import Range, check_ranges
 
 MAX_HOSTS = 64
 """of one learner; beyond some sixteen, several learners are faster (docs/CLUSTER.md)"""
@@ -16,16 +18,16 @@ class ClusterConfig:
     """HOST:PORT of the cluster's head; default: this machine plays, without a cluster"""
     public: bool = False
     """its nodes may have public addresses, because a firewall stands before them (docs/CLUSTER.md, Safety)"""
-    hosts: int = 0
+    hosts: Annotated[int, Range(0, MAX_HOSTS)] = 0
     """machines that play, each with actors.num_actors actors of actors.games_per_actor games; 0: this one alone"""
     min_hosts: int = 1
     """with fewer hosts that play, for patience_s, the run writes a checkpoint and ends with exit code 1"""
-    cpus_per_host: int | None = None
+    cpus_per_host: Annotated[int | None, Range(0, 2**16)] = None
     """cores that Ray reserves for a host; default one an actor"""
-    credits: int = 2
+    credits: Annotated[int, Range(1, 64)] = 2
     """batches of a host that may be under way or wait for the learner; more hide a slow network, and make records
     older"""
-    batch_records: int = 512
+    batch_records: Annotated[int, Range(1, 2**16)] = 512
     """step records of a batch; a host that plays slowly sends fewer. With an on-policy agent at most a rollout of the
     host's games"""
     compress: bool = True
@@ -39,16 +41,9 @@ class ClusterConfig:
     """time that a run goes on with fewer than min_hosts hosts"""
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("hosts", 0, MAX_HOSTS),
-            ("min_hosts", 1, max(1, self.hosts)),
-            ("cpus_per_host", 0, 2**16),
-            ("credits", 1, 64),
-            ("batch_records", 1, 2**16),
-        ):
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise ConfigError(f"cluster.{name}: got {value}, want {low}..{high}")
+        check_ranges("cluster", self)
+        if not 1 <= self.min_hosts <= max(1, self.hosts):
+            raise ConfigError(f"cluster.min_hosts: got {self.min_hosts}, want 1..{max(1, self.hosts)}")
         for name, low in (("publish_period_s", 0.0), ("silence_timeout_s", 3.0), ("patience_s", 0.0)):
             if not getattr(self, name) >= low:
                 raise ConfigError(f"cluster.{name}: got {getattr(self, name)}, want at least {low:g} seconds")

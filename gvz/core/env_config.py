@@ -6,9 +6,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from gvz.core.errors import ConfigError
+from gvz.core.ranges import Range, check_ranges
 
 ActionSet = Literal["buttons", "combinations", "unified_v1", "multi_discrete_v1"]
 Profile = Literal["thesis", "levdoom"]
@@ -39,9 +40,9 @@ class EnvConfig:
     the same 16:9 field of view of 108 degrees at a fifth of the cost.
     """
 
-    frame_height: int = 84
+    frame_height: Annotated[int, Range(8, 1080)] = 84
     """height of an observation frame, pixels"""
-    frame_width: int = 84
+    frame_width: Annotated[int, Range(8, 1920)] = 84
     """width of an observation frame, pixels"""
     grayscale: bool = False
     """one luminance channel instead of RGB"""
@@ -52,17 +53,17 @@ class EnvConfig:
     """the network of segmented frames: one that comes with GViZDoom, by its name (train4: one for each scenario, which
     has seen four training tasks), or the path of an ONNX file (gvz segmenter trains one), or of a directory with a file
     for each scenario; default: that of the scenario's name"""
-    segmenter_temperature: float = 1.0
+    segmenter_temperature: Annotated[float, Range(0.1, 10)] = 1.0
     """the network's probabilities are raised to the power of 1 / this before they become colours: above 1, unlikely
     classes are seen better (temperature scaling, Guo et al. 2017)"""
-    frame_skip: int = 4
+    frame_skip: Annotated[int, Range(1, 35)] = 4
     """game tics an action is held; one decision = frame_skip frames"""
     repeat_action_probability: float = 0.0
     """sticky actions, for training: with this probability a decision's buttons stay those of the decision before.
     Evaluations have none (Machado et al. 2018)"""
-    render_width: int = 256
+    render_width: Annotated[int, Range(160, 1920)] = 256
     """width the engine renders, pixels (must be a ViZDoom screen resolution with render_height)"""
-    render_height: int = 144
+    render_height: Annotated[int, Range(120, 1200)] = 144
     """height the engine renders, pixels"""
     action_set: ActionSet = "buttons"
     """buttons: one button held an action; combinations: all non-contradictory sets; unified_v1: one list of actions for
@@ -99,18 +100,7 @@ class EnvConfig:
             raise ConfigError("env.grayscale: got True with env.frames segmented, whose three channels are classes")
         if self.interpolation != "linear" and self.frames == "segmented":
             raise ConfigError(f"env.interpolation: got {self.interpolation} with env.frames segmented, want linear")
-        for name, low, high in (
-            ("frame_height", 8, 1080),
-            ("frame_width", 8, 1920),
-            ("frame_skip", 1, 35),
-            ("render_width", 160, 1920),
-            ("render_height", 120, 1200),
-            ("segmenter_temperature", 0.1, 10),
-        ):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ConfigError(f"env.{name}: got {value}, want {low}..{high}")
-
+        check_ranges("env", self)
         if not 0.0 <= self.repeat_action_probability < 1.0:
             raise ConfigError(
                 f"env.repeat_action_probability: got {self.repeat_action_probability}, want at least 0 and less than 1"

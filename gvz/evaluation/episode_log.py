@@ -1,5 +1,6 @@
 """Evaluations on disk: episodes are played and appended to a record file. Those already there are not played again."""
 
+import contextlib
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -178,16 +179,12 @@ def evaluate_player(
     player_spec = PlayerSpec(make_player=make_player, env=env, identity=identity)
     parsed = [parse_task(id_for_processes(task)) for task in tasks]
     wanted = wanted_episodes(parsed, episodes, [base_seed])
-    file = RecordFile(Path(out))
-    try:
-        player_specs = {player_spec: file}
-        jobs, num_wanted = missing_jobs(player_specs, wanted), len(set(wanted))
+    with contextlib.closing(RecordFile(Path(out))) as file:
+        jobs, num_wanted = missing_jobs({player_spec: file}, wanted), len(set(wanted))
         if held := num_wanted - len(jobs):
             note = f"{out}: holds {held} of these {num_wanted} episodes of {name!r}, which are not played again"
             print(f"{note}; another player needs another name", file=sys.stderr)
-        for _ in play_and_record(player_specs, jobs, num_workers=num_workers):
+        for _ in play_and_record({player_spec: file}, jobs, num_workers=num_workers):
             pass
-    finally:
-        file.close()
     found = rows_of(player_spec, file.rows)
     return [found[episode] for episode in wanted]

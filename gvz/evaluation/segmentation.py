@@ -4,6 +4,7 @@ import itertools
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
+from contextlib import closing
 from functools import cache, partial
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -105,8 +106,7 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
     height, width = EnvConfig().render_height, EnvConfig().render_width
     config = EnvConfig(frame_height=height, frame_width=width, buffers=("depth", "labels"))
     frames_per_episode = _FRAMES_PER_EPISODE if task.maps is None else _FRAMES_PER_MAP
-    env = DoomEnv(task, config)
-    try:
+    with closing(DoomEnv(task, config)) as env:
         while len(frames) < num_frames:
             seed = episode_seed(task.id, episode, _BASE_SEED)
             observation, info = env.reset(options={"episode_seed": seed})
@@ -123,8 +123,6 @@ def labelled_frames(task: Task, num_frames: int) -> Labelled:
                 if terminated or truncated or len(frames) == num_frames:
                     break
             episode += 1
-    finally:
-        env.close()
     return Labelled(np.stack(frames), np.stack(labels), np.stack(depths), *_looks(task))
 
 

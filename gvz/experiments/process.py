@@ -55,37 +55,11 @@ class LocalProcess:
     where = ""
     problem = ""  # where it cannot begin, `start` raises
 
-    def __init__(
-        self,
-        log: IO[bytes],
-        arguments: Sequence[str],
-        cores: Sequence[int],
-        environment: Mapping[str, str],
-        kept: Sequence[int] = (),
-        guard: Sequence[str] = (),
-    ):
-        self._log = log
+    def __init__(self, log: IO[bytes], process: "subprocess.Popen[bytes]"):
+        """`start` calls this."""
+        self._log, self._process = log, process
         self._started_s = time.monotonic()
         self._code: int | None = None
-        self._note(f"# {time.strftime('%Y-%m-%d %H:%M:%S')} python {shlex.join(arguments)}")
-        self._process = subprocess.Popen(
-            [
-                sys.executable,
-                "-P",
-                "-m",
-                "gvz.experiments.child",
-                str(os.getpid()),
-                ",".join(map(str, cores)),
-                *guard,
-                *arguments,
-            ],
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            env={**environment, "PYTHONUNBUFFERED": "1", "PYTHONPATH": import_path()},
-            pass_fds=kept,
-            start_new_session=True,  # the terminal's Ctrl-C is for us, who then stop it in order
-        )
 
     @classmethod
     def start(
@@ -114,14 +88,25 @@ class LocalProcess:
         if not records.lock(log):
             log.close()
             return None
-        return cls(log, arguments, cores, environment, kept, guard)
+        _note(log, f"# {time.strftime('%Y-%m-%d %H:%M:%S')} python {shlex.join(arguments)}")
+        child = ("-m", "gvz.experiments.child", str(os.getpid()), ",".join(map(str, cores)))
+        process = subprocess.Popen(
+            [sys.executable, "-P", *child, *guard, *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            env={**environment, "PYTHONUNBUFFERED": "1", "PYTHONPATH": import_path()},
+            pass_fds=kept,
+            start_new_session=True,  # the terminal's Ctrl-C is for us, who then stop it in order
+        )
+        return cls(log, process)
 
     def poll(self) -> int | None:
         """Exit code of the command, as a shell says it; None while it runs."""
         code = self._process.poll()
         if code is not None and self._code is None:
             self._code = 128 - code if code < 0 else code
-            self._note(f"{inventory.END_MARK}{self._code} after {time.monotonic() - self._started_s:.0f} s")
+            _note(self._log, f"{inventory.END_MARK}{self._code} after {time.monotonic() - self._started_s:.0f} s")
             self._log.close()
         return self._code
 
@@ -137,6 +122,7 @@ class LocalProcess:
             janitor.reap_killed(self._process, self._log.name)
             self.poll()
 
-    def _note(self, line: str) -> None:
-        with contextlib.suppress(OSError):  # a full disk: the command is worth more than this line
-            self._log.write(f"{line}\n".encode())
+
+def _note(log: IO[bytes], line: str) -> None:
+    with contextlib.suppress(OSError):  # a full disk: the command is worth more than this line
+        log.write(f"{line}\n".encode())

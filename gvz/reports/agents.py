@@ -4,12 +4,12 @@ import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 
 from gvz.reports.runs import Run
 from gvz.run.resume import may_change
+from gvz.tasks import all_scenarios
 
 EACH = "each task alone"
 """training of agents each of which was trained on one task"""
@@ -82,7 +82,7 @@ def _telling_settings(runs: Sequence[Run]) -> dict[Path, list[str]]:
         alike.setdefault((run.name, run.tasks), []).append(run)
     found: dict[Path, list[str]] = {}
     for group in alike.values():
-        values = [dict(_settings(run.config, run.scenarios)) for run in group]
+        values = [dict(_settings(run)) for run in group]
         for name in dict.fromkeys(name for of_run in values for name in of_run):
             own = {run.path: of_run[name] for run, of_run in zip(group, values, strict=True) if name in of_run}
             if len(set(own.values())) > 1:
@@ -91,18 +91,14 @@ def _telling_settings(runs: Sequence[Run]) -> dict[Path, list[str]]:
     return found
 
 
-def _settings(config: Mapping[str, Any], scenarios: Sequence[str], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Dotted names and values, in JSON, of what may tell agents of these scenarios apart."""
-    for name, value in config.items():
-        if isinstance(value, dict):
-            yield from _settings(value, scenarios, f"{prefix}{name}.")
-        elif name == "reward_weights" and isinstance(value, list):
-            yield (
-                prefix + name,
-                json.dumps([pair for pair in value if any(f"{scenario}." in str(pair) for scenario in scenarios)]),
-            )
-        elif not (may_change(prefix + name) or prefix + name in _TELL_NOTHING):
-            yield prefix + name, json.dumps(value)
+def _settings(run: Run) -> Iterator[tuple[str, str]]:
+    """Dotted names and values, in JSON, of what may tell agents of the run's scenarios apart."""
+    others = all_scenarios().keys() - set(run.scenarios)
+    for name, value in run.settings.items():
+        if name == "env.reward_weights" and isinstance(value, list):
+            yield name, json.dumps([pair for pair in value if not any(f"{one}." in str(pair) for one in others)])
+        elif not (may_change(name) or name in _TELL_NOTHING):
+            yield name, json.dumps(value)
 
 
 def pooled_runs(runs: Sequence[Run], agents: Mapping[str, str], evaluated: Mapping[object, set[str]]) -> list[str]:

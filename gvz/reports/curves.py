@@ -42,10 +42,7 @@ class Curve:
 
 def running_mean(values: np.ndarray, window: int) -> np.ndarray:
     """Mean of each value and up to `window - 1` before it, float64[N]."""
-    sums = np.cumsum(np.concatenate([[0.0], values]))
-    ends = np.arange(1, len(values) + 1)
-    starts = np.maximum(0, ends - window)
-    return (sums[ends] - sums[starts]) / (ends - starts)
+    return pl.Series(values).rolling_mean(window, min_samples=1).to_numpy()
 
 
 def learning_curve(label: str, runs: Sequence[Run], tasks: Sequence[str]) -> Curve | None:

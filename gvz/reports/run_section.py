@@ -21,6 +21,7 @@ _SEVERAL_VALUES = (
     "Where runs of one agent differ, the value of the most runs is the first. Scenarios stand beside another value if "
     "none of their runs has the first."
 )
+_NOT_SHOWN = ("seed", "run_dir", "tasks", "scenario", "training_set", "name")
 _VIDEOS = (".mp4", ".gif", ".webp", ".webm")
 
 
@@ -125,9 +126,7 @@ def _configurations(results: Results) -> Table:
     """Every field as a row, every agent as a column; without seeds and directories; rows that differ come first."""
     agents: dict[str, list[tuple[Run, dict[str, Any]]]] = {}
     for run in results.runs:
-        flat = _flat(run.config)
-        for name in ("seed", "run_dir", "tasks", "scenario", "training_set", "name"):
-            flat.pop(name, None)
+        flat = {name: value for name, value in run.settings.items() if name not in _NOT_SHOWN}
         agents.setdefault(results.agents[str(run.path)], []).append((run, flat))
     fields = list(dict.fromkeys(field for of_agent in agents.values() for _, flat in of_agent for field in flat))
     rows = [(words(field), *(words(_values(field, of_agent)) for of_agent in agents.values())) for field in fields]
@@ -153,16 +152,6 @@ def _values(field: str, runs: Sequence[tuple[Run, dict[str, Any]]]) -> str:
         usual = usual or set(scenarios)
         texts.append(value if usual & scenarios.keys() else f"{value} ({', '.join(scenarios)})")
     return "; ".join(texts) if texts else "-"
-
-
-def _flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in config.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{name}.")
-        else:
-            flat[prefix + name] = value
-    return flat
 
 
 def _links(results: Results, out: Path) -> Block:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -52,6 +52,11 @@ class Run:
         return int(self.config["seed"])
 
     @property
+    def settings(self) -> dict[str, Any]:
+        """Dotted name of each field of the configuration -> its value."""
+        return dict(_leaves(self.config))
+
+    @property
     def curriculum(self) -> str:
         """How tasks were given to games; older runs had no choice."""
         lessons = self.config.get("curriculum")
@@ -95,6 +100,14 @@ class Run:
                 return words if len(self.scenarios) == 1 else f"{words} of each scenario"
         names = [task.partition("/")[2] for task in self.tasks]
         return f"{names[0]} alone" if len(names) == 1 else f"{len(names)} chosen tasks: {', '.join(names)}"
+
+
+def _leaves(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in config.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
 
 
 def read_run(file: Path, results: Path) -> tuple[Run | None, list[str]]:

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from gvz.core.errors import ConfigError
+from gvz.core.ranges import Range, Share, check_ranges
 from gvz.scenarios.map_set import PARTS
 from gvz.task_table import TaskTable
-from learner.config import Range, Share, check_ranges
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from gvz.core.errors import ConfigError
-from learner.config import Range, check_ranges
+from gvz.core.ranges import Range, check_ranges
 
 _PROCESS_ID_VARIABLE = "SLURM_PROCID"
 

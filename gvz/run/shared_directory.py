@@ -11,6 +11,7 @@ import secrets
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Generator
 from pathlib import Path
@@ -117,32 +118,28 @@ def check_locks(directory: Path) -> Finding:
 
 def check_renames(directory: Path) -> Finding:
     """Whoever reads a file while it is replaced gets the old one or the new one."""
-    inside = directory / f".gvz-rename-{secrets.token_hex(8)}"
-    inside.mkdir()
-    file = inside / "file"
-    file.write_bytes(bytes(8192))
-    command = [sys.executable, "-c", _RENAMER, str(inside), str(NUM_RENAMES)]
-    renamer = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     num_reads, bad = 0, ""
-    try:
-        while not bad and renamer.poll() is None:
-            try:
-                seen = file.read_bytes()
-            except FileNotFoundError:
-                bad = "a file was missing while it was replaced"
-                break
-            num_reads += 1
-            if len(seen) != 8192 or len(set(seen)) != 1:
-                bad = "a file was half old and half new while it was replaced"
-        _, error = renamer.communicate(timeout=_TIMEOUT_S)
-        if not bad and renamer.returncode:
-            bad = f"a file could not be replaced: {(error.splitlines() or [f'exit code {renamer.returncode}'])[-1]}"
-    finally:
-        renamer.kill()
-        renamer.communicate()
-        for left in inside.iterdir():
-            left.unlink()
-        inside.rmdir()
+    with tempfile.TemporaryDirectory(prefix=".gvz-rename-", dir=directory) as inside:
+        file = Path(inside) / "file"
+        file.write_bytes(bytes(8192))
+        command = [sys.executable, "-c", _RENAMER, inside, str(NUM_RENAMES)]
+        renamer = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        try:
+            while not bad and renamer.poll() is None:
+                try:
+                    seen = file.read_bytes()
+                except FileNotFoundError:
+                    bad = "a file was missing while it was replaced"
+                    break
+                num_reads += 1
+                if len(seen) != 8192 or len(set(seen)) != 1:
+                    bad = "a file was half old and half new while it was replaced"
+            _, error = renamer.communicate(timeout=_TIMEOUT_S)
+            if not bad and renamer.returncode:
+                bad = f"a file could not be replaced: {(error.splitlines() or [f'exit code {renamer.returncode}'])[-1]}"
+        finally:
+            renamer.kill()
+            renamer.communicate()
     if bad:
         return Finding(
             "renames", "bad", f"{directory}: {bad}", "use another file system: a checkpoint appears by a rename"

@@ -84,7 +84,7 @@ class Telemetry:
                 "episode": stats.episode,
                 "seed": stats.seed,
                 "score": stats.score,
-                "normalized_score": 100 * stats.score / self._table.rows[stats.task].upper_bound,
+                "normalized_score": self._table.percent(stats.task, stats.score),
                 "reward": stats.reward,
                 "reward_components": stats.reward_components,
                 "length_frames": stats.length_frames,

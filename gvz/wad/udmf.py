@@ -167,7 +167,7 @@ class _Parser:
         blocks = result.blocks()
         lines: dict[str, list[int]] = {kind: [] for kind in blocks}
         while self._token.kind != "end":
-            name = self._expect("name", "a block or 'namespace'")
+            name = self._expect_name("a block or 'namespace'")
             kind = name.text.lower()
             if self._token.text == "=":
                 value = self._value_of_field()
@@ -188,7 +188,7 @@ class _Parser:
         fields: Block = {}
         self._expect_symbol("{")
         while self._token.text != "}" or self._token.kind != "symbol":
-            name = self._expect("name", "a field or '}'")
+            name = self._expect_name("a field or '}'")
             if name.text.lower() in fields:
                 _fail(name.line, f"got the field {name.text!r} again", "it once in a block")
             fields[name.text.lower()] = self._value_of_field()
@@ -228,8 +228,8 @@ class _Parser:
             self._token = next(self._tokens)
         return token
 
-    def _expect(self, kind: str, wanted: str) -> _Token:
-        if self._token.kind != kind:
+    def _expect_name(self, wanted: str) -> _Token:
+        if self._token.kind != "name":
             _fail(self._token.line, f"got {self._token}", wanted)
         return self._advance()
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from fake_env import export_act
 
-from actors.policy import ExportedPolicy, RandomPolicy, make_policy
+from actors.policy import ExportedPolicy, RandomPolicy
 from actors.preprocess import ObservationBatch
 from gvz.transport.messages import ParamsHeader
 
@@ -56,8 +56,9 @@ def draws(policy: ExportedPolicy | RandomPolicy, count: int) -> list[list[int]]:
 @pytest.mark.parametrize("kind", ["exported", "random"])
 def test_choices_follow_from_seed_and_call_number_alone(serialized: bytes, kind: str):
     def make(seed: int):
-        data = serialized if kind == "exported" else b""
-        policy = make_policy(data, num_actions=NUM_ACTIONS, num_params=2, obs=OBS, seed=seed)
+        games = len(OBS["task"])
+        exported = kind == "exported"
+        policy = ExportedPolicy(serialized, 2, OBS, seed) if exported else RandomPolicy(NUM_ACTIONS, games, seed)
         policy.set_params(np.zeros(2, np.float32), header(1.0))
         return policy
 

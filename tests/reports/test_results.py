@@ -181,11 +181,16 @@ def test_a_run_that_lacks_a_setting_hides_no_difference_between_others(copied, t
     file = tmp_path / "r" / "2" / "config.json"
     file.write_text(file.read_text().replace('"discount": null, ', ""))
     agents = read_results([tmp_path / "r"]).agents
-    assert [agents[str(tmp_path / "r" / str(seed))] for seed in range(3)] == [
-        "rainbow_4task (agent.discount 0.5)",
-        "rainbow_4task (agent.discount 0.9)",
-        "rainbow_4task",
-    ]
+    for seed, word in enumerate((" (agent.discount 0.5)", " (agent.discount 0.9)", "")):
+        assert agents[str(tmp_path / "r" / str(seed))] == f"rainbow_4task{word}"
+
+
+def test_reward_weights_tell_agents_apart_unless_they_are_of_other_scenarios(copied, tmp_path):
+    for number, weights in enumerate(([], [["seek_and_kill.kill", 2.0]], [["kill", 2.0]])):
+        copied(f"r/{number}", seed=number, env={"reward_weights": weights})
+    agents = read_results([tmp_path / "r"]).agents
+    for number, weights in enumerate(("[]", "[]", '[["kill", 2.0]]')):
+        assert agents[str(tmp_path / "r" / str(number))] == f"rainbow_4task (env.reward_weights {weights})"
 
 
 def test_runs_of_an_experiment_with_other_settings_are_put_together_and_named(small, tmp_path):
@@ -197,8 +202,7 @@ def test_runs_of_an_experiment_with_other_settings_are_put_together_and_named(sm
     saved["config"]["agent"]["discount"], saved["config"]["seed"] = 0.5, 2222
     (other / "config.json").write_text(json.dumps(saved))
     (problem, _) = read_results([tmp_path / "r"]).problems
-    assert problem.endswith(": put together with other runs of rainbow_4task (4 tasks), which have another agent."
-                            "discount 0.99")  # fmt: skip
+    assert problem.endswith(" with other runs of rainbow_4task (4 tasks), which have another agent.discount 0.99")
 
 
 def test_seeds_that_learned_with_other_networks_are_named(small, tmp_path):
@@ -219,9 +223,8 @@ def test_seeds_that_learned_with_other_networks_are_named(small, tmp_path):
 
 
 def test_seeds_of_other_budgets_are_named(copied, tmp_path):
-    copied("r/1", seed=1, max_processor_s=900.0)
-    copied("r/2", seed=2, max_processor_s=5400.0)
-    copied("r/3", seed=3, max_processor_s=900.0)
+    for seed, limit_s in enumerate((900.0, 5400.0, 900.0), 1):
+        copied(f"r/{seed}", seed=seed, max_processor_s=limit_s)
     results = read_results([tmp_path / "r"])
     assert set(results.agents.values()) == {"rainbow_4task"}
     (problem,) = results.problems

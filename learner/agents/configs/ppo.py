@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from learner.config import AgentConfig, Range, Share
+from gvz.core.ranges import Range, Share
+from learner.config import AgentConfig
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from learner.config import EpsilonConfig, Share
+from gvz.core.ranges import Share
+from learner.config import EpsilonConfig
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
 from gvz.core.errors import ConfigError
-from learner.config import Augmentation, Range, Share, ValueConfig
+from gvz.core.ranges import Range, Share
+from learner.config import Augmentation, ValueConfig
 
 Noisy = Literal["off", "factorized", "independent"]
 
