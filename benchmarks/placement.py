@@ -53,7 +53,7 @@ def measure(budget: Budget) -> list[Row]:
             with workload.playing(pool(kind, num_actors), learner.acting_params()) as players:
                 workload.decisions_per_s(players, 0.0)
                 num_updates, start, before = 0, time.perf_counter(), players.statistics().env_steps
-                while time.perf_counter() - start < budget.body_s:
+                while time.perf_counter() - start < budget.body_s or players.statistics().env_steps == before:
                     learner.updates_per_s(per_call, 0.0)  # two calls: one before the clock of its own
                     num_updates += 2 * per_call
                     players.drain(256)
