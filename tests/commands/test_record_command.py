@@ -23,6 +23,12 @@ from tests.waiting import wait_until
         ("--player idle --out v.webp", "--task: want a task id, for example defend_the_center/gore"),
         ("--player idle --task defend_the_center/gor --out v.webp", "unknown attribute 'gor' (did you mean 'gore'?)"),
         ("{run} --out v.avi", "--out: got v.avi, want a name that ends with .mp4, .gif, .webp"),
+        ("--player idle --checkpoint 10 --out v.webp", "--checkpoint: got it beside --player idle, want it with a run"),
+        (
+            "{run} --profile levdoom --out v.webp",
+            "--profile: got levdoom, but small keeps the rules that it was trained by, ",
+        ),
+        ("{run} --encoder none.py --out v.webp", "--encoder: no file none.py here ("),
         ("{run} --out {file}/v.webp", "cannot be made: File exists"),
         ("{run} --out v.webp --seconds 0", "--seconds: got 0, want more than 0"),
         ("{run} --out v.webp --seconds nan", "--seconds: got nan, want more than 0"),
