@@ -2,6 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
+
+import tyro
 
 from gvz.core.errors import ConfigError
 from gvz.scenarios.base import Suite, Task
@@ -12,7 +15,7 @@ from gvz.tasks import TaskSet, named_tasks, parse_task, scenario_named
 class TaskSelection:
     """Which tasks: all named ones of the core suite, or these."""
 
-    tasks: tuple[str, ...] | None = None
+    tasks: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="ID [ID ...]")] = None
     """ids, for example defend_the_center/gore+mossy_bricks; not only named tasks"""
     scenario: str | None = None
     """the named tasks of this scenario"""
