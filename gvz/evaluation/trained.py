@@ -154,12 +154,14 @@ def find_checkpoint(run_dir: Path, wanted: str) -> int:
     """One policy of a run, as gradient steps.
 
     Raises:
-        ConfigError: as `find_checkpoints`, or `wanted` means several.
+        ConfigError: there is no such policy, or `wanted` is neither "newest" nor one; lists those there are.
     """
-    found = find_checkpoints(run_dir, [wanted])
-    if len(found) > 1:
-        raise ConfigError(f"--checkpoint: got {wanted}, want one of {', '.join(map(str, found))}")
-    return found[0]
+    known = {str(steps): steps for steps in find_checkpoints(run_dir, ["all"])}
+    if wanted not in ("newest", *known):
+        raise ConfigError(
+            f"--checkpoint: got {wanted!r}, want newest, or one of those in {run_dir / 'policies'}: {', '.join(known)}"
+        )
+    return known[wanted] if wanted in known else max(known.values())
 
 
 def trained_player(run_dir: Path, config: RunConfig, num_updates: int) -> PlayerSpec:

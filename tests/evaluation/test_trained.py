@@ -150,7 +150,7 @@ def test_a_loaded_player_is_of_one_policy(run):
     for checkpoint in ("20", 20):
         assert load_player(run, checkpoint).identity == wanted.identity
     assert load_player(str(run)).identity["num_updates"] == 100
-    with pytest.raises(ConfigError, match=r"--checkpoint: got all, want one of .*20, 100"):
+    with pytest.raises(ConfigError, match=r"--checkpoint: got 'all', want newest, or one of .*20, 100"):
         load_player(run, "all")
 
 
