@@ -28,19 +28,24 @@ def test_help_loads_neither_jax_nor_vizdoom_nor_anything_heavy():
         assert f"• {command} " in done.stdout
 
 
-def test_a_reader_that_has_enough_is_no_error():
+@pytest.mark.parametrize("arguments", ["cli tasks", "launch --help"])
+def test_a_reader_that_has_enough_is_no_error(arguments):
     read, write = os.pipe()
     os.close(read)
-    command = [sys.executable, "-m", "gvz.cli", "tasks"]
+    module, *flags = arguments.split()
+    command = [sys.executable, "-m", f"gvz.{module}", *flags]
     done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, timeout=120, check=False)
     os.close(write)
     assert (done.returncode, done.stderr) == (141, b"")
 
 
-@pytest.mark.parametrize("arguments", ["tasks", "tasks --help", "tasks --scenario rockets"])
+@pytest.mark.parametrize(
+    "arguments", ["cli tasks", "cli tasks --help", "cli tasks --scenario rockets", "launch --help"]
+)
 def test_output_that_has_no_room_is_one_line(arguments):
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
-    command = ["bash", "-c", 'exec "$@" > /dev/full', "bash", sys.executable, "-m", "gvz.cli", *arguments.split()]
+    module, *flags = arguments.split()
+    command = ["bash", "-c", 'exec "$@" > /dev/full', "bash", sys.executable, "-m", f"gvz.{module}", *flags]
     done = subprocess.run(command, stderr=subprocess.PIPE, env=environment, timeout=120, check=False, text=True)
     assert done.returncode == 1
     assert done.stderr == "error: No space left on device; make room or give a place that you can write to\n"
