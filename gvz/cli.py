@@ -29,9 +29,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if sys.stdout is None:  # closed by who started us
         sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115
     try:
-        code = run(list(sys.argv[1:] if arguments is None else arguments))
-        sys.stdout.flush()
-        return code
+        try:
+            return run(list(sys.argv[1:] if arguments is None else arguments))
+        finally:  # a help text ends by SystemExit
+            sys.stdout.flush()
     except GvzError as error:
         say(f"error: {error}")
         return error.exit_code
@@ -39,14 +40,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         say("interrupted")
         return EXIT_INTERRUPTED
     except BrokenPipeError:  # the reader of our output has closed it: gvz tasks | head
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python flushes once more at the end
+        _drop_unwritten()
         return EXIT_BROKEN_PIPE
     except OSError as error:
+        if error.errno == errno.ENOENT and error.filename is None:  # os.getcwd
+            say("error: the current directory is not there any more; change to another")
+            return 2
         if error.errno not in _OF_THE_DISK:
             raise
+        _drop_unwritten()
         where = f"{error.filename}: " if error.filename else ""
         say(f"error: {where}{error.strerror}; make room or give a place that you can write to")
         return 1
+
+
+def _drop_unwritten() -> None:
+    """Drops output that cannot be written: Python flushes once more when it ends, and its exit code would be 120."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -117,4 +117,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from gvz import cli  # a full disk or a closed pipe is one line there
+
+    sys.exit(cli.main(["train", *sys.argv[1:]]))

@@ -28,13 +28,34 @@ def test_help_loads_neither_jax_nor_vizdoom_nor_anything_heavy():
         assert f"• {command} " in done.stdout
 
 
-def test_a_reader_that_has_enough_is_no_error():
+@pytest.mark.parametrize("arguments", ["cli tasks", "launch --help"])
+def test_a_reader_that_has_enough_is_no_error(arguments):
     read, write = os.pipe()
     os.close(read)
-    command = [sys.executable, "-m", "gvz.cli", "tasks"]
+    module, *flags = arguments.split()
+    command = [sys.executable, "-m", f"gvz.{module}", *flags]
     done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, timeout=120, check=False)
     os.close(write)
     assert (done.returncode, done.stderr) == (141, b"")
+
+
+@pytest.mark.parametrize(
+    "arguments", ["cli tasks", "cli tasks --help", "cli tasks --scenario rockets", "launch --help"]
+)
+def test_output_that_has_no_room_is_one_line(arguments):
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    module, *flags = arguments.split()
+    command = ["bash", "-c", 'exec "$@" > /dev/full', "bash", sys.executable, "-m", f"gvz.{module}", *flags]
+    done = subprocess.run(command, stderr=subprocess.PIPE, env=environment, timeout=120, check=False, text=True)
+    assert done.returncode == 1
+    assert done.stderr == "error: No space left on device; make room or give a place that you can write to\n"
+
+
+def test_a_current_directory_that_is_gone_is_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    tmp_path.rmdir()
+    assert cli.main(["train", "--config", "./mine.py"]) == 2
+    assert capsys.readouterr().err == "error: the current directory is not there any more; change to another\n"
 
 
 def test_closed_output_is_no_error():
@@ -93,6 +114,8 @@ def test_tasks_prints_a_table(capsys):
         ("tasks --scenario seek_and_kil", "unknown scenario 'seek_and_kil' (did you mean 'seek_and_kill'?)"),
         ("tasks --tasks seek_and_kill/blu", "unknown attribute 'blu' (did you mean 'blue'?)"),
         ("tasks --tasks seek_and_kill/blue --split test", "got ids and also --scenario, --split, --suite or --level"),
+        ("tasks --tasks", "--tasks: got none, want at least one id"),
+        ("zoo --checkpoint 10", "got --replace or --checkpoint, want them with --add alone"),
         ("gallery --scenario nowhere", "unknown scenario 'nowhere'"),
         ("gallery --out {file}/below", "cannot be made: Not a directory"),
         ("train --config no_such", "no config 'no_such'"),

@@ -56,8 +56,8 @@ class Evaluate:
     """base seeds: each draws episodes of its own. 0 is the set that all published scores are of"""
     out: Path | None = None
     """record file, JSON lines; default evaluation.jsonl, in the run directory if there is one"""
-    profile: Profile = "thesis"
-    """rules of the tasks (a run keeps the rules it was trained by)"""
+    profile: Profile | None = None
+    """rules of the tasks, for --player: thesis by default; a run keeps the rules it was trained by"""
     workers: int | None = None
     """processes; default one per CPU core"""
     json: bool = False
@@ -111,17 +111,25 @@ class Evaluate:
     def _player_specs(self) -> "dict[PlayerSpec, tuple[tuple[Task, ...], Path]]":
         """Who plays -> what, and the record file."""
         from gvz.evaluation.episode_log import simple_player
-        from gvz.evaluation.trained import check_tasks, find_checkpoints, read_run_config, trained_player
+        from gvz.evaluation.trained import (
+            check_profile,
+            check_tasks,
+            find_checkpoints,
+            read_run_config,
+            trained_player,
+        )
         from gvz.evaluation.zoo import run_directory
 
         if self.player is not None:
             out = Path("evaluation.jsonl") if self.out is None else self.out
-            return {simple_player(self.player, EnvConfig(profile=self.profile)): (self.select.resolve(), out)}
+            env = EnvConfig(profile=self.profile or "thesis")
+            return {simple_player(self.player, env): (self.select.resolve(), out)}
         found = {}
         for run_dir in dict.fromkeys(map(run_directory, self.run_dirs)):
             config = read_run_config(run_dir, OwnFiles(self.agent, self.encoder))
             tasks = self.select.of_run([scenario.id for scenario in config.table.scenarios])
             check_tasks(config, tasks)
+            check_profile(config, self.profile)
             out = run_dir / "evaluation.jsonl" if self.out is None else self.out
             for num_updates in find_checkpoints(run_dir, self.checkpoints):
                 found[trained_player(run_dir, config, num_updates)] = (tasks, out)

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
+
+import tyro
 
 from gvz.core.errors import ConfigError
 
@@ -51,8 +53,8 @@ class TrainSegmenter:
     workers: int = 0
     """processes that play and change frames while this one learns, to keep a GPU busy; with 0 this one does it all.
     They share the frames in files of the temporary directory (TMPDIR), 185 KB each"""
-    tints_and_patches: bool = True
-    """walls and floors of some frames get tints and patches; --no-tints-and-patches: of none. With them, the network is
+    tints_and_patches: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = True
+    """leave walls and floors as they are. By default, those of some frames get tints and patches: the network is then
     better in Health Gathering, worse in Seek and Kill (docs/FINDINGS.md)"""
     seed: int = 1111
     """of the first parameters and of the changes of frames"""

@@ -50,6 +50,8 @@ class Zoo:
         own_files = OwnFiles(self.agent, self.encoder)
         if (self.add is None) != (self.name is None):
             raise ConfigError("zoo: want --add and --name together")
+        if self.add is None and (self.replace or self.checkpoint != "newest"):
+            raise ConfigError("zoo: got --replace or --checkpoint, want them with --add alone")
         if self.add is not None and self.name is not None:
             if self.names:
                 raise ConfigError(f"zoo: got {' '.join(self.names)} beside --add; the policy's name is that of --name")

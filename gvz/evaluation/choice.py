@@ -41,8 +41,8 @@ class EpisodeChoice:
     """number of the evaluation episode, as `gvz evaluate` counts them"""
     seed: int = 0
     """base seed of the episode"""
-    profile: Profile = "thesis"
-    """rules of the task (a run keeps the rules it was trained by)"""
+    profile: Profile | None = None
+    """rules of the task, for --player: thesis by default; a run keeps the rules it was trained by"""
 
     def resolve(self) -> "tuple[PlayerSpec, Task]":
         """Who plays what.
@@ -51,13 +51,22 @@ class EpisodeChoice:
             ConfigError, TaskError, CheckpointError: there is no such player, task or checkpoint.
         """
         from gvz.evaluation.episode_log import simple_player
-        from gvz.evaluation.trained import check_tasks, find_checkpoint, read_run_config, trained_player
+        from gvz.evaluation.trained import (
+            check_profile,
+            check_tasks,
+            find_checkpoint,
+            read_run_config,
+            trained_player,
+        )
         from gvz.evaluation.zoo import run_directory
 
         if self.player is not None and self.run_dir is not None:
             raise ConfigError(f"got --player {self.player} and also {self.run_dir}, want one of them")
         if self.player is None and self.run_dir is None:
             raise ConfigError("want a run directory or --player")
+        of_runs = {"--agent": self.agent, "--encoder": self.encoder, "--checkpoint": self.checkpoint != "newest"}
+        if self.player is not None and (given := [flag for flag, value in of_runs.items() if value]):
+            raise ConfigError(f"{given[0]}: got it beside --player {self.player}, want it with a run directory alone")
         for name, value in (("episode", self.episode), ("seed", self.seed)):
             if not 0 <= value < 2**63:
                 raise ConfigError(f"--{name}: got {value}, want a number from 0 to 2^63 - 1")
@@ -65,11 +74,12 @@ class EpisodeChoice:
             assert self.player is not None
             if self.task is None:
                 raise ConfigError("--task: want a task id, for example defend_the_center/gore (gvz tasks lists them)")
-            return simple_player(self.player, EnvConfig(profile=self.profile)), parse_task(self.task)
+            return simple_player(self.player, EnvConfig(profile=self.profile or "thesis")), parse_task(self.task)
         run_dir = run_directory(self.run_dir)
         config = read_run_config(run_dir, OwnFiles(self.agent, self.encoder))
         task = config.table.tasks[0] if self.task is None else parse_task(self.task)
         check_tasks(config, [task])
+        check_profile(config, self.profile)
         num_updates = find_checkpoint(run_dir, self.checkpoint)
         if task.scenario not in config.table.scenarios:  # a run's weights are of its own scenario's components
             config = dataclasses.replace(config, env=dataclasses.replace(config.env, reward_weights=()))

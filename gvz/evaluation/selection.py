@@ -2,6 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
+
+import tyro
 
 from gvz.core.errors import ConfigError
 from gvz.scenarios.base import Suite, Task
@@ -12,7 +15,7 @@ from gvz.tasks import TaskSet, named_tasks, parse_task, scenario_named
 class TaskSelection:
     """Which tasks: all named ones of the core suite, or these."""
 
-    tasks: tuple[str, ...] = ()
+    tasks: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="ID [ID ...]")] = None
     """ids, for example defend_the_center/gore+mossy_bricks; not only named tasks"""
     scenario: str | None = None
     """the named tasks of this scenario"""
@@ -28,15 +31,17 @@ class TaskSelection:
         """The tasks.
 
         Raises:
-            TaskError: an unknown name. ConfigError: ids together with another choice, or no task fits the choice.
+            TaskError: an unknown name. ConfigError: no ids, or ids together with another choice, or no task fits it.
         """
         if self.scenario is not None and self.suite != "core" and scenario_named(self.scenario).suite != self.suite:
             raise ConfigError(
                 f"--suite: got {self.suite} and also --scenario {self.scenario}, which is of another suite"
             )
-        if not self.tasks:
+        if self.tasks is None:
             return self._named((self.scenario,))
-        if replace(self, tasks=()) != ALL_TASKS:
+        if not self.tasks:  # such as those of a shell's variable that is not set
+            raise ConfigError("--tasks: got none, want at least one id")
+        if replace(self, tasks=None) != ALL_TASKS:
             raise ConfigError(
                 "--tasks: got ids and also --scenario, --split, --suite or --level, want one or the other"
             )
@@ -48,7 +53,7 @@ class TaskSelection:
         Raises:
             TaskError, ConfigError: as `resolve`.
         """
-        if self.tasks or self.scenario:
+        if self.tasks is not None or self.scenario:
             return self.resolve()
         for scenario in map(scenario_named, scenarios):
             if self.suite not in ("core", scenario.suite):  # core: nothing was chosen

@@ -19,6 +19,7 @@ import numpy as np
 
 from actors.preprocess import ObservationBatch
 from gvz.core.durable import saved_steps
+from gvz.core.env_config import Profile
 from gvz.core.errors import CheckpointError, ConfigError
 from gvz.core.libraries import require_learner
 from gvz.core.registry import NO_OWN_FILES, OwnFiles
@@ -91,6 +92,14 @@ def check_tasks(config: RunConfig, tasks: Sequence[Task]) -> None:
             )
 
 
+def check_profile(config: RunConfig, profile: Profile | None) -> None:
+    """Raises ConfigError for other rules than those that the run was trained by; None passes."""
+    if profile not in (None, config.env.profile):
+        raise ConfigError(
+            f"--profile: got {profile}, but {config.name} keeps the rules that it was trained by, {config.env.profile}"
+        )
+
+
 def _check_game(config: RunConfig, env: "DoomEnv") -> None:
     """Raises ConfigError for a game that the run's policy cannot play: of such a task, or with other actions or frames
     than those it has learned with.
@@ -125,7 +134,9 @@ def find_checkpoints(run_dir: Path, wanted: Sequence[str]) -> list[int]:
         if last := re.fullmatch(r"last(\d{1,9})", text):
             count = int(last[1])
             if not 1 <= count <= len(known):
-                raise ConfigError(f"--checkpoints: got {text}, but {directory} holds {len(known)} policies")
+                raise ConfigError(
+                    f"--checkpoints: got {text}, want last1 to last{len(known)}: so many are in {directory}"
+                )
             chosen.update(known[-count:])
         elif text in ("newest", "all"):
             chosen.update(known if text == "all" else known[-1:])
@@ -143,12 +154,14 @@ def find_checkpoint(run_dir: Path, wanted: str) -> int:
     """One policy of a run, as gradient steps.
 
     Raises:
-        ConfigError: as `find_checkpoints`, or `wanted` means several.
+        ConfigError: there is no such policy, or `wanted` is neither "newest" nor one; lists those there are.
     """
-    found = find_checkpoints(run_dir, [wanted])
-    if len(found) > 1:
-        raise ConfigError(f"--checkpoint: got {wanted}, want one of {', '.join(map(str, found))}")
-    return found[0]
+    known = {str(steps): steps for steps in find_checkpoints(run_dir, ["all"])}
+    if wanted not in ("newest", *known):
+        raise ConfigError(
+            f"--checkpoint: got {wanted!r}, want newest, or one of those in {run_dir / 'policies'}: {', '.join(known)}"
+        )
+    return known[wanted] if wanted in known else max(known.values())
 
 
 def trained_player(run_dir: Path, config: RunConfig, num_updates: int) -> PlayerSpec:

@@ -1,4 +1,4 @@
-"""How far commands are: bars on a terminal, a line now and then elsewhere. On stderr."""
+"""How far commands are: bars on a terminal, a line now and then elsewhere and on a narrow one. On stderr."""
 
 import time
 from collections.abc import Sequence
@@ -11,6 +11,8 @@ from rich.table import Column
 from gvz.run.progress import format_duration, stderr_console
 
 DRAW_PERIOD_S = 0.1
+LEAST_WIDTH = 60
+"""columns of a terminal with room for bars and their names"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -33,23 +35,24 @@ class Bars:
     """
 
     def __init__(self, line_period_s: float, console: Console | None = None):
-        """`line_period_s`: seconds between lines where the output is not a terminal; inf: none."""
+        """`line_period_s`: seconds between lines where no bars are drawn; inf: none."""
         self._console = stderr_console() if console is None else console
         name = TextColumn("{task.description}", table_column=Column(overflow="fold"))  # long: it may take two lines
         columns = (BarColumn(20), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"), name)
         self._progress = Progress(*columns, console=self._console, auto_refresh=False)
         self._tasks: dict[str, TaskID] = {}
         self._begun: dict[str, tuple[float, int]] = {}
-        self._period_s = DRAW_PERIOD_S if self._console.is_terminal else line_period_s
+        self._drawn = self._console.is_terminal and self._console.width >= LEAST_WIDTH
+        self._period_s = DRAW_PERIOD_S if self._drawn else line_period_s
         self._next_s = 0.0
 
     def __enter__(self) -> "Bars":
-        if self._console.is_terminal:
+        if self._drawn:
             self._progress.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._console.is_terminal:
+        if self._drawn:
             self._progress.stop()
 
     def say(self, line: str) -> None:
@@ -69,7 +72,7 @@ class Bars:
         if not self.due and any(bar.done < bar.total for bar in bars):
             return
         self._next_s = now_s + self._period_s
-        if not self._console.is_terminal:
+        if not self._drawn:
             for bar in bars if self._period_s < float("inf") else ():
                 self.say(f"{bar.done:,}/{bar.total:,}  {self._rate(bar, now_s)}  {bar.text or bar.name}")
             return
@@ -85,6 +88,7 @@ class Bars:
     def _rate(self, bar: Bar, now_s: float) -> str:
         """Since the bar was first shown: what came before, as the start of workers, is left out."""
         begun_s, begun = self._begun[bar.name]
-        per_s = (bar.done - begun) / (now_s - begun_s) if bar.done > begun else 0.0
-        left = format_duration((bar.total - bar.done) / per_s if per_s else None)
-        return f"{per_s:.2f} {bar.unit}/s  eta {left}"
+        if bar.done <= begun:
+            return f"- {bar.unit}/s  eta {format_duration(None)}"
+        per_s = (bar.done - begun) / (now_s - begun_s)
+        return f"{per_s:.2f} {bar.unit}/s  eta {format_duration((bar.total - bar.done) / per_s)}"

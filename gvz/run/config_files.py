@@ -172,6 +172,8 @@ def config_from_dict(saved: Any, own_files: OwnFiles = NO_OWN_FILES) -> RunConfi
 def _with_own_files(agent: dict[str, Any], own_files: OwnFiles) -> dict[str, Any]:
     named = dict(agent)
     for what, field, file in (("agent", "name", own_files.agent), ("encoder", "encoder", own_files.encoder)):
+        if file is not None and not file.is_file():
+            raise ConfigError(f"--{what}: no file {file} here ({Path.cwd()})")
         if str(agent.get(field)).endswith(".py"):
             if file is None:
                 raise ConfigError(

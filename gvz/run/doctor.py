@@ -122,8 +122,9 @@ def check_shared_memory() -> Finding:
     """Free space in /dev/shm, against four games a core."""
     free = shutil.disk_usage(janitor.SHM_DIR).free
     games = 4 * len(os.sched_getaffinity(0))
-    need = games * ENGINE_SHM_BYTES + 64 * 2**20
-    found = f"{format_bytes(free)} free; {games} games take {format_bytes(need)}"
+    taken = games * ENGINE_SHM_BYTES
+    need = taken + 64 * 2**20
+    found = f"{format_bytes(free)} free, want {format_bytes(need)}: {games} games take {format_bytes(taken)}"
     if free < need:
         size = -(-need // 2**20)
         remedy = f"docker run --shm-size={size}m ..., or as root: mount -o remount,size={size}m /dev/shm"

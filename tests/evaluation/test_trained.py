@@ -53,7 +53,7 @@ def test_a_checkpoint_that_is_not_there_is_an_error(tmp_path, run):
         find_checkpoints(run, ["15"])
     with pytest.raises(ConfigError, match="--checkpoints: got 'latest', want newest"):
         find_checkpoints(run, ["latest"])
-    with pytest.raises(ConfigError, match=r"--checkpoints: got last4, but .*policies holds 3 policies"):
+    with pytest.raises(ConfigError, match=r"--checkpoints: got last4, want last1 to last3: so many are in .*policies"):
         find_checkpoints(run, ["last4"])
     with pytest.raises(ConfigError, match="holds no policy: "):
         find_checkpoints(tmp_path, ["newest"])
@@ -150,7 +150,7 @@ def test_a_loaded_player_is_of_one_policy(run):
     for checkpoint in ("20", 20):
         assert load_player(run, checkpoint).identity == wanted.identity
     assert load_player(str(run)).identity["num_updates"] == 100
-    with pytest.raises(ConfigError, match=r"--checkpoint: got all, want one of .*20, 100"):
+    with pytest.raises(ConfigError, match=r"--checkpoint: got 'all', want newest, or one of .*20, 100"):
         load_player(run, "all")
 
 

@@ -141,7 +141,7 @@ def test_a_policy_takes_the_place_of_another_only_if_that_is_wanted(run, capsys)
     add = ["zoo", "--add", str(run), "--name", "one"]
     assert cli.main(add) == 0
     assert cli.main([*add, "--replace", "--checkpoint", "all"]) == 2
-    assert "--checkpoint: got all, want one of " in capsys.readouterr().err
+    assert "--checkpoint: got 'all', want newest, or one of " in capsys.readouterr().err
     assert cli.main([*add, "--checkpoint", "20"]) == 2
     assert "--name: the zoo has a policy one already; give another name, or --replace" in capsys.readouterr().err
     assert find_checkpoints(run_directory("zoo:one"), ["newest"]) == [100]

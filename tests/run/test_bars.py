@@ -28,13 +28,20 @@ def test_off_a_terminal_there_is_a_line_now_and_then_and_at_the_end(clock):
             clock[0] = 100.0 + 30 * second
             shown.show([bar(done), bar(30, name="other", text="another")])
     assert out.getvalue().splitlines() == [
-        "0/30  0.00 episodes/s  eta --:--  evaluate",
-        "30/30  0.00 episodes/s  eta --:--  another",
+        "0/30  - episodes/s  eta --:--  evaluate",
+        "30/30  - episodes/s  eta --:--  another",
         "10/30  0.17 episodes/s  eta 02:00  evaluate",
-        "30/30  0.00 episodes/s  eta --:--  another",
+        "30/30  - episodes/s  eta --:--  another",
         "30/30  0.33 episodes/s  eta 00:00  evaluate",
-        "30/30  0.00 episodes/s  eta --:--  another",
+        "30/30  - episodes/s  eta --:--  another",
     ]
+
+
+def test_on_a_narrow_terminal_there_are_lines():
+    out = io.StringIO()
+    with Bars(60, Console(file=out, width=bars.LEAST_WIDTH - 1, force_terminal=True, color_system=None)) as shown:
+        shown.show([bar(30)])
+    assert out.getvalue() == "30/30  - episodes/s  eta --:--  evaluate\n"
 
 
 def test_no_lines_are_no_lines():

@@ -28,7 +28,7 @@ def test_little_shared_memory_is_bad_and_the_remedy_is_large_enough(monkeypatch:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(2**26, 0, 2**26))
     finding = doctor.check_shared_memory()
     assert finding.state == "bad"
-    assert finding.found.startswith("67 MB free")
+    assert finding.found.startswith("67 MB free, want ")
     size = int(finding.remedy.partition("--shm-size=")[2].partition("m")[0])
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, size * 2**20))
     assert doctor.check_shared_memory().state == "ok"
