@@ -180,7 +180,7 @@ class SupervisedActor:
                 f"and actors.max_restarts allows {limits.max_restarts} restarts."
             )
             self.failure = WorkerError(f"{message} The end of {log_path(self._spec)}:\n{log_tail}")
-            return Fault(actor=actor, lane=None, kind="gave_up", message=message, traceback=log_tail, fatal=True)
+            return Fault(actor=actor, lane=None, kind="gave_up", message=message, traceback=log_tail)
         self._failed_starts = 0 if stable else self._failed_starts + 1
         backoff_s = min(_FIRST_BACKOFF_S * 2**self._failed_starts, _LONGEST_BACKOFF_S)
         self._start_at = now + backoff_s

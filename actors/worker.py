@@ -137,7 +137,6 @@ def main() -> int:
                 kind=kind,
                 message=message,
                 traceback=traceback.format_exc(),
-                fatal=True,
             )
         )
         with contextlib.suppress(OSError):  # the disk with the log is full

@@ -17,6 +17,20 @@ _Kept = Annotated[float | None, Range(0.0, 0.99999)]
 """share of itself that a moving average keeps. With 1 it never changes; near 1, float32 rounds its changes to 0."""
 
 
+def refuse_unused(prefix: str, config: Any, other: str, *names: str) -> None:
+    """Raises ConfigError for the first of these fields that is not at its default: `other` leaves it without effect.
+
+    Not for what a configuration has at hand for a part that another one, made of it by one field, switches on or off,
+    such as `noisy_sigma`.
+    """
+    for field in dataclasses.fields(config):
+        if field.name in names and (got := getattr(config, field.name)) != field.default:
+            because = f"which has no effect with {prefix}.{other} {getattr(config, other)}"
+            raise ConfigError(
+                f"{prefix}.{field.name}: got {got}, {because}; want {field.default}, or another {prefix}.{other}"
+            )
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class AgentConfig:
     """What every agent has: what it observes, and its network. Each agent adds its own, in learner/agents/configs."""
@@ -186,6 +200,8 @@ class ReplayConfig:
 
     def __post_init__(self) -> None:
         check_ranges("replay", self)
+        if not self.prioritized:
+            refuse_unused("replay", self, "prioritized", "priority_exponent", "min_priority")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -234,6 +250,8 @@ class LearnerConfig:
 
     def __post_init__(self) -> None:
         check_ranges("learner", self)
+        if not self.kpi_weighting:
+            refuse_unused("learner", self, "kpi_weighting", "kpi_window_episodes", "kpi_max_weight")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -22,7 +22,8 @@ class Export:
     """Write the records of runs as CSV or Parquet: a table each of metrics, episodes, faults, starts and evaluations.
 
     The rows of all runs go into one table, with the columns `run_dir`, `run` and `run_seed`. A table without rows is
-    not written, and one of that name and format from an earlier export is removed.
+    not written, and one of that name and format from an earlier export is removed. It writes no policies;
+    `gvz zoo --add` makes a file of one.
 
     Example: gvz export runs/rainbow_4task/seed_* --format parquet --out tables
     """

@@ -59,9 +59,15 @@ def runtime_dir() -> Path:
     containers and batch jobs lack.
 
     Raises:
-        ResourceError: the directory exists but is not ours alone, or cannot be made.
+        ResourceError: the directory exists but is not ours alone, or cannot be made; or $GVZ_RUNTIME_DIR is relative.
     """
-    path = Path(os.environ.get("GVZ_RUNTIME_DIR") or tempfile.gettempdir()) / f"gvizdoom-{os.getuid()}"
+    given = Path(os.environ.get("GVZ_RUNTIME_DIR") or tempfile.gettempdir())
+    if not given.is_absolute():
+        raise ResourceError(
+            f"GVZ_RUNTIME_DIR: got {given}, want an absolute path: all processes of a user have to find it, whatever "
+            "directory they are in"
+        )
+    path = given / f"gvizdoom-{os.getuid()}"
     try:
         path.mkdir(mode=0o700, exist_ok=True)
         found = path.lstat()

@@ -50,6 +50,7 @@ OPTIONAL: dict[str, pl.DataType] = {
     "length_steps": pl.Int64(),
     "terminated": pl.Boolean(),
     "truncated": pl.Boolean(),
+    "vizdoom": pl.String(),
 }
 """fields that are null where a row lacks them. `run`, `run_seed`, `num_updates` and `params` are a trained player's.
 `observes` is that of a player of your own which has more or other than the screen"""
@@ -141,6 +142,14 @@ def collect_evaluations(paths: Iterable[Path | str]) -> tuple[pl.DataFrame, list
                 f"{run_dir}: {player} has episodes of {num_policies} policies (`params`), which are put together as if "
                 "they were of one; leave out the records of the others"
             )
+    released = (
+        together["vizdoom"].str.split("+").list.first()
+    )  # a tuned engine plays the games of the one it is made of
+    if len(versions := released.drop_nulls().unique().sort()) > 1:
+        problems.append(
+            f"episodes were played with several versions of ViZDoom ({', '.join(versions)}), whose games may differ; "
+            "play them again with one of these"
+        )
     return together, problems
 
 

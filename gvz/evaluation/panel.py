@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from gvz.actions import action_buttons
+from gvz.actions import action_buttons, action_mask
 from gvz.core.env_config import EnvConfig
 from gvz.evaluation.playback import SCREEN_HEIGHT, SCREEN_WIDTH, Moment
 from gvz.evaluation.trained import Values
@@ -39,8 +39,8 @@ class Panel:
     def __init__(self, player: str, task: Task, env: EnvConfig, notes: Sequence[str] = ()):
         """`player` is a name; `env` is what it plays in; `notes` are lines for the lower right corner."""
         self._task = task
-        held = action_buttons(task.scenario, env.action_set)
-        self._actions = ["+".join(buttons).replace("_", " ").lower() or "nothing" for buttons in held]
+        held, mask = action_buttons(task.scenario, env.action_set), action_mask(task.scenario, env.action_set)
+        self._actions = {a: _action_name(held[a]) for a, allowed in enumerate(mask) if allowed}
         self._bound = task.scenario.upper_bound(env.profile)
         self._timeout = task.scenario.timeout_frames(env.profile)
         self._notes = notes
@@ -95,16 +95,19 @@ class Panel:
             self._text((left, HEIGHT - 8 - NOTE_HEIGHT * n), note, 13, FAINT, "ld")
 
     def _draw_actions(self, moment: Moment, box: Box) -> float:
-        """A line an action, the held one marked, with its value or probability if it has one. Returns where it ends."""
+        """A line an action that the scenario allows, the held one marked, with its value or probability if it has one.
+
+        Returns where it ends.
+        """
         left, y, right, _ = box
         caption, values, (low, high) = self._estimates(moment.values)
         self._caption((left, y), caption)
         y += 22
         row = min(24, 200 // len(self._actions))
         size = min(15, row - 3)
-        name_width = min(220, max(_font(size).getlength(name) for name in self._actions))
+        name_width = min(220, max(_font(size).getlength(name) for name in self._actions.values()))
         bar_left, bar_right = left + 14 + name_width + 10, right - 62
-        for action, name in enumerate(self._actions):
+        for action, name in self._actions.items():
             middle = y + row / 2
             held = action == moment.action
             colour = ACCENT if held else FAINT
@@ -130,7 +133,8 @@ class Panel:
             return "action, probability", values.policy, (0.0, 1.0)
         assert values.q_values is not None
         low, high = self._value_range
-        self._value_range = low, high = min(low, float(values.q_values.min())), max(high, float(values.q_values.max()))
+        shown = values.q_values[list(self._actions)]
+        self._value_range = low, high = min(low, float(shown.min())), max(high, float(shown.max()))
         room = max(0.1 * (high - low), 1e-3)
         return "action, value (discounted reward to come)", values.q_values, (low - room, high + room)
 
@@ -140,7 +144,8 @@ class Panel:
         assert values.probabilities is not None
         assert values.atoms is not None
         left, y, right, _ = box
-        self._caption((left, y), f"return of {self._actions[action]}, probability")
+        name = self._actions.get(action, _action_name(()))  # one that is forbidden holds nothing
+        self._caption((left, y), f"return of {name}, probability")
         masses, atoms = values.probabilities[action], values.atoms
         top, bottom = y + 24, y + 24 + (110 if len(self._actions) <= 6 else 70)
         width = (right - left) / len(atoms)
@@ -219,6 +224,10 @@ class Panel:
 
     def _text(self, at: tuple[float, float], text: str, size: float, colour: Colour, anchor: str) -> None:
         self._draw.text(at, text, colour, _font(size), anchor)
+
+
+def _action_name(buttons: Sequence[str]) -> str:
+    return "+".join(buttons).replace("_", " ").lower() or "nothing"
 
 
 @cache

@@ -14,6 +14,8 @@ import queue
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gvz.core.env_config import EnvConfig
@@ -101,7 +103,13 @@ class Tally:
             "length_steps": self._steps,
             "terminated": bool(terminated),
             "truncated": bool(truncated),
+            "vizdoom": _vizdoom_version(),
         }
+
+
+@cache
+def _vizdoom_version() -> str:
+    return version("vizdoom")
 
 
 def play_episode(env: "DoomEnv", player: Player, episode: int, base_seed: int = 0) -> Row:
@@ -109,7 +117,7 @@ def play_episode(env: "DoomEnv", player: Player, episode: int, base_seed: int = 
 
     Returns:
         task, episode, base_seed, seed, score, normalized_score (percent), kills, player_kills, reward,
-        reward_components, length_frames, length_steps, terminated, truncated.
+        reward_components, length_frames, length_steps, terminated, truncated, vizdoom (its version).
 
     Raises:
         EngineError: the engine died in each of MAX_ATTEMPTS attempts.

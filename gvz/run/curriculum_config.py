@@ -7,6 +7,7 @@ from gvz.core.errors import ConfigError
 from gvz.core.ranges import Range, Share, check_ranges
 from gvz.scenarios.map_set import PARTS
 from gvz.task_table import TaskTable
+from learner.config import refuse_unused
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -28,6 +29,11 @@ class CurriculumConfig:
 
     def __post_init__(self) -> None:
         check_ranges("curriculum", self)
+        of_level, of_progress = ("learned_percent",), ("temperature", "staleness_share")
+        unused = {"level": of_progress, "progress": of_level}.get(
+            self.kind, ("window_episodes", *of_level, *of_progress)
+        )
+        refuse_unused("curriculum", self, "kind", *unused)
 
 
 def steps_of(table: TaskTable) -> list[int]:

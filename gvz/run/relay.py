@@ -9,11 +9,14 @@ import json
 import socket
 import threading
 import time
+from collections.abc import Iterator
 from typing import Any
 
 MAX_LINE_BYTES = 2**20
 HELLO_TIMEOUT_S = 20.0
 """for a connection's first line; who sends none is no process of the group"""
+_ACCEPT_RETRY_S = 0.1
+"""after a connection that could not be taken"""
 
 
 class Relay:
@@ -33,15 +36,13 @@ class Relay:
         _start(self._accept, "group relay")
 
     def close(self) -> None:
-        self._server.close()
+        close(self._server)
         for connection in self._connections.values():
             close(connection)
 
     def _accept(self) -> None:
-        with contextlib.suppress(OSError):  # closed
-            while True:
-                connection, _ = self._server.accept()
-                _start(lambda c=connection: self._serve(c), "group relay, a process")
+        for connection in _accepted(self._server):
+            _start(lambda c=connection: self._serve(c), "group relay, a process")
 
     def _serve(self, connection: socket.socket) -> None:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -92,8 +93,7 @@ class Forward:
         _start(self._accept, "group forward")
 
     def _accept(self) -> None:
-        while True:
-            near, _ = self._server.accept()
+        for near in _accepted(self._server):
             try:
                 far = socket.create_connection(self._target, timeout=HELLO_TIMEOUT_S)
             except OSError:  # not there yet: JAX tries again
@@ -146,6 +146,17 @@ def close(connection: socket.socket) -> None:
     with contextlib.suppress(OSError):
         connection.shutdown(socket.SHUT_RDWR)
     connection.close()
+
+
+def _accepted(server: socket.socket) -> Iterator[socket.socket]:
+    """Its connections until it is closed; those after one that failed, or after a lack of open files, too."""
+    while server.fileno() >= 0:
+        try:
+            connection, _ = server.accept()
+        except OSError:
+            time.sleep(_ACCEPT_RETRY_S)
+            continue
+        yield connection
 
 
 def _pump(source: socket.socket, sink: socket.socket, *, closes: bool) -> None:

@@ -99,7 +99,6 @@ class Telemetry:
     def fault(self, fault: Fault, *, num_updates: int) -> None:
         """Records something that failed and was handled."""
         row = {"num_updates": num_updates, "time_s": time.time(), **msgspec.structs.asdict(fault)}
-        del row["fatal"]
         self._run.append("faults.jsonl", row)
 
     def scalars(self, num_updates: int, values: Mapping[str, float]) -> None:

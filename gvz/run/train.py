@@ -92,7 +92,7 @@ class Trainer:
         self._monitor.look(self._pool.statistics(), self._learner.take_staleness)  # rates count from here
         try:
             with Watchdog("the learner", LONGEST_ROUND_S) as watchdog:
-                while not self._is_done() and not self._group.stops(stop):
+                while not self.is_done() and not self._group.stops(stop):
                     watchdog.beat()
                     self._collect()
                     self._supervise()
@@ -106,7 +106,7 @@ class Trainer:
                 self._saver.save_last(self._group, self._record_row)
             raise
         last = "writing the last checkpoint" if self._saver.behind else "no new gradient steps to save"
-        self._progress.say(f"{'stopping' if stop.requested else 'done'}: {last}")
+        self._progress.say(f"{'done' if self.is_done() else 'stopping'}: {last}")
         self._saver.save_last(self._group, self._record_row)
         self._record_used_up_time()
 
@@ -122,8 +122,10 @@ class Trainer:
             finally:
                 self._telemetry.close()
 
-    def _is_done(self) -> bool:
-        """Processor time is looked at with every row of metrics: a row more or less is how exact its limit is."""
+    def is_done(self) -> bool:
+        """The run is complete. Processor time is looked at with every row of metrics: a row more or less is how exact
+        its limit is.
+        """
         config, counts = self._config, self._counts
         used_up = config.max_processor_s is not None and counts.processor_s >= config.max_processor_s
         return used_up or counts.updates >= config.learner.total_updates
@@ -262,8 +264,8 @@ def train(config: RunConfig, run: RunDir, stop: StopRequest) -> int:
 
     `stop` is entered; from when there is a trainer on, the first signal no longer ends things at once.
 
-    Returns: 0 when all updates are done, or the processor time is used up; 130 or 143 when a signal stopped the run,
-    which is then saved.
+    Returns: 0 when all updates are done, or the processor time is used up, whatever signal came then; 130 or 143 when a
+    signal stopped the run before, which is then saved.
 
     Raises:
         ResourceError: the machine is too small. GvzError: what a user can do something about.
@@ -293,4 +295,4 @@ def train(config: RunConfig, run: RunDir, stop: StopRequest) -> int:
             except KeyboardInterrupt:
                 trainer.close(abandon_save=True)
                 raise
-        return stop.exit_code if stop.requested else 0
+        return 0 if trainer.is_done() else stop.exit_code

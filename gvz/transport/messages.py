@@ -19,7 +19,7 @@ import numpy as np
 
 from gvz.core.errors import TransportError
 
-SCHEMA_VERSION = 7
+SCHEMA_VERSION = 8
 """Increased by one when the meaning or layout of anything in this file changes."""
 
 
@@ -118,7 +118,7 @@ class Ready(_Message, frozen=True, tag="ready"):
 
 
 class Fault(_Message, frozen=True, tag="fault"):
-    """Something failed at a process boundary, actor -> learner. `fatal` means the sender is about to exit."""
+    """Something failed at a process boundary, actor -> learner."""
 
     actor: int
     lane: Count | None
@@ -126,7 +126,6 @@ class Fault(_Message, frozen=True, tag="fault"):
     """short name: engine_start, engine_crash, exception, ..."""
     message: str
     traceback: str = ""
-    fatal: bool = False
 
 
 class Stop(_Message, frozen=True, tag="stop"):

@@ -113,7 +113,6 @@ def main() -> int:
                 kind=type(error).__name__,
                 message=str(error),
                 traceback=traceback.format_exc(),
-                fatal=True,
             )
         )
         return 1

@@ -289,7 +289,7 @@ def test_a_crashed_engine_cuts_its_episode_and_the_lane_goes_on(tmp_path: Path):
     cut = steps[steps["truncated"] == 1]
     assert [(int(s["lane"]), int(s["episode"]), s["reward"]) for s in cut] == [(1, 1, 3.0)]
     faults = [m for m in messages if isinstance(m, Fault)]
-    assert [(f.lane, f.kind, f.fatal) for f in faults] == [(1, "engine_crash", False)]
+    assert [(f.lane, f.kind) for f in faults] == [(1, "engine_crash")]
     assert "lane 1, task b, episode 1, seed" in faults[0].message
     assert "the engine died at decision 3" in faults[0].message
     stats = defaultdict(list)

@@ -110,7 +110,7 @@ def test_what_it_fails_of_is_said_also_where_the_disk_with_its_log_is_full(tmp_p
         assert process.wait(60)
         (fault,) = process.channel.receive()
         assert isinstance(fault, Fault)
-        assert (fault.kind, fault.message, fault.fatal) == ("exception", "RuntimeError: no engine today", True)
+        assert (fault.kind, fault.message) == ("exception", "RuntimeError: no engine today")
     finally:
         process.end(grace_s=0.0)
 

@@ -353,6 +353,13 @@ def test_a_runtime_directory_that_cannot_be_made_is_refused(tmp_path: Path, monk
         janitor.runtime_dir()
 
 
+def test_a_relative_runtime_directory_is_refused(monkeypatch: pytest.MonkeyPatch):
+    """Processes in other directories would not find its records, nor this one after a change of directory."""
+    monkeypatch.setenv("GVZ_RUNTIME_DIR", "here")
+    with pytest.raises(ResourceError, match="GVZ_RUNTIME_DIR: got here, want an absolute path"):
+        janitor.runtime_dir()
+
+
 def test_records_are_in_the_temporary_directory_also_where_a_login_has_one_of_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -28,6 +28,20 @@ def test_files_and_directories_compressed_or_not(tmp_path):
     assert set(one.columns) == {*REQUIRED, *OPTIONAL, *DERIVED}
 
 
+def test_episodes_of_several_versions_of_the_engine_are_told_of(tmp_path):
+    file = tmp_path / "random.jsonl"
+    played = [line(episode=n, vizdoom=version) for n, version in enumerate(("1.3.2", "1.3.2+gvz.1"))]
+    file.write_text("".join([*played, line(episode=2)]))
+    frame, problems = collect_evaluations([file])
+    assert frame["vizdoom"].to_list() == ["1.3.2", "1.3.2+gvz.1", None]
+    assert problems == [], "a tuned engine plays the same games, and older rows do not say"
+    file.write_text("".join([*played, line(episode=2, vizdoom="1.4.0")]))
+    assert collect_evaluations([file])[1] == [
+        "episodes were played with several versions of ViZDoom (1.3.2, 1.4.0), whose games may differ; play them again "
+        "with one of these"
+    ]
+
+
 def test_what_follows_from_the_task_is_in_the_row(tmp_path):
     file = tmp_path / "random.jsonl"
     file.write_text(line(task="defend_the_center/gore+mossy_bricks", terminated=True, reward_components={"kill": 2}))

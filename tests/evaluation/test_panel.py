@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gvz.actions import action_buttons
+from gvz.actions import action_buttons, action_mask
 from gvz.core.env_config import EnvConfig
 from gvz.evaluation.panel import ACCENT, BAR, GOOD, HEAD_HEIGHT, HEIGHT, WIDTH, Panel
 from gvz.evaluation.playback import SCREEN_HEIGHT, SCREEN_WIDTH, Moment
@@ -94,6 +94,21 @@ def test_the_bar_of_an_action_is_as_long_as_it_is_likely():
     whole, halves = bars(1.0, 0.0, 0.0, 0.0, 0.0) - none, bars(0.5, 0.5, 0.0, 0.0, 0.0) - none
     assert whole == pytest.approx(halves, rel=0.05)
     assert whole > 2000
+
+
+def test_what_the_scenario_forbids_is_no_choice():
+    """Health Gathering does not shoot, for one."""
+    task = parse_task("health_gathering/lava")
+    allowed = np.array(action_mask(task.scenario, "unified_v1"))
+
+    def picture(forbidden: float) -> np.ndarray:
+        estimates = dataclasses.replace(values(np.where(allowed, 1.0, forbidden)), value=1.0)
+        panel = Panel("somebody", task, EnvConfig(action_set="unified_v1"))
+        moment = dataclasses.replace(START, action=int(allowed.argmax()), values=estimates)
+        return np.array(panel.draw(moment))
+
+    assert 1 < allowed.sum() < len(allowed)
+    np.testing.assert_array_equal(picture(-5.0), picture(9.0))
 
 
 def test_the_timeline_has_the_value_of_a_policy_and_not_its_probabilities():

@@ -5,6 +5,7 @@ import dataclasses
 import multiprocessing
 import os
 import time
+from importlib.metadata import version
 
 import pytest
 
@@ -47,6 +48,7 @@ def test_rows_do_not_depend_on_how_episodes_are_shared_out():
     for _, row in here:
         assert row["seed"] == episode_seed(row["task"], row["episode"], row["base_seed"])
         assert row["terminated"] != row["truncated"]
+        assert row["vizdoom"] == version("vizdoom")
         assert row["reward"] == pytest.approx(sum(row["reward_components"].values()))
         assert 4 * row["length_steps"] >= row["length_frames"] > 4 * (row["length_steps"] - 1)
 

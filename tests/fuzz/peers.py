@@ -61,7 +61,7 @@ MESSAGES = [
         truncated=False,
     ),
     Ready(actor=1, pid=2),
-    Fault(actor=1, lane=None, kind="exception", message="m", traceback="t", fatal=True),
+    Fault(actor=1, lane=None, kind="exception", message="m", traceback="t"),
     Stop(),
     Assign(lane=1, task=2),
     ActorSpec(

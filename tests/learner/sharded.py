@@ -233,7 +233,6 @@ AGENTS = {
         **{name: getattr(RAINBOW, name) for name in ("conv_channels", "conv_kernels", "conv_strides", "hidden_units")},
         num_quantiles=4,
         munchausen=True,
-        double=False,
     ),
     "dqn": change_agent(RAINBOW, "dqn"),
 }

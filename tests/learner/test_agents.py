@@ -134,8 +134,8 @@ def test_only_the_online_network_sees_augmented_frames_and_hidden_inputs(agent_n
         {"double": True},
         {"distributional": True},
         {"distributional": True, "num_quantiles": 5},
-        {"munchausen": True},
-        {"distributional": True, "num_quantiles": 5, "munchausen": True},
+        {"double": True, "munchausen": True},
+        {"double": True, "distributional": True, "num_quantiles": 5, "munchausen": True},
         {"name": "in a file"},
     ],
     ids=str,
@@ -246,7 +246,7 @@ def test_epsilon_is_the_share_of_uniformly_random_actions():
 def test_noise_can_have_random_actions_beside_it():
     config = replace(RAINBOW, noisy="factorized", noisy_epsilon=0.3)
     assert [config.epsilon(steps) for steps in (0, 10**7)] == [0.3, 0.3]
-    assert replace(config, noisy="off").epsilon(10**7) == pytest.approx(config.epsilon_end)
+    assert replace(config, noisy="off", noisy_epsilon=0.0).epsilon(10**7) == pytest.approx(config.epsilon_end)
     agent, act, _, _ = jitted(config)
     obs = jax.tree.map(lambda x: jnp.repeat(x[:1], 3000, axis=0), batch().obs_t)
     params = made_up_params(agent, 0, sigma=0.0)  # so that the noise alone would choose one action

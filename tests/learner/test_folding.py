@@ -194,7 +194,9 @@ def test_a_policy_that_goes_on_within_a_stretch_or_after_one_has_the_same_noise(
 
 
 @pytest.mark.parametrize(
-    "change", [{"noisy_period_steps": 1}, {"noisy": "off"}], ids=["a draw for each decision", "no noise"]
+    "change",
+    [{"noisy_period_steps": 1}, {"noisy_period_steps": 1, "noisy": "off"}],
+    ids=["a draw for each decision", "no noise"],
 )
 def test_nothing_is_folded_without_a_stretch_or_noise(change: dict[str, object]):
     agent = make_agent(replace(CONFIG, **change), SPEC)  # pyright: ignore[reportArgumentType]

@@ -9,6 +9,7 @@ import pytest
 from gvz.core.errors import ConfigError
 from gvz.run.config import RunConfig
 from gvz.run.config_files import configs_directory, load_config
+from gvz.run.curriculum_config import CurriculumConfig
 from learner.agents.configs.rainbow import RainbowConfig
 from learner.config import LearnerConfig, OnPolicyConfig, ReplayConfig
 
@@ -115,3 +116,39 @@ def test_the_page_says_what_each_configuration_has_of_the_recipe():
 def test_values_out_of_range_are_refused_by_name(make, message: str):
     with pytest.raises(ConfigError, match=message):
         make()
+
+
+@pytest.mark.parametrize(
+    ("make", "got", "other", "default"),
+    [
+        (
+            lambda: RainbowConfig(munchausen=True, num_quantiles=5, double=False),
+            "double: got False",
+            "munchausen True",
+            True,
+        ),
+        (lambda: RainbowConfig(munchausen_alpha=0.5), "munchausen_alpha: got 0.5", "munchausen False", 0.9),
+        (lambda: RainbowConfig(num_quantiles=5, v_max=1.0), "v_max: got 1.0", "num_quantiles 5", None),
+        (lambda: RainbowConfig(distributional=False, v_min=1.0), "v_min: got 1.0", "distributional False", None),
+        (lambda: RainbowConfig(noisy="off", noisy_period_steps=9), "noisy_period_steps: got 9", "noisy off", 1),
+        (lambda: RainbowConfig(noisy="off", noisy_epsilon=0.1), "noisy_epsilon: got 0.1", "noisy off", 0.0),
+        (lambda: ReplayConfig(prioritized=False, min_priority=0.5), "min_priority: got 0.5", "prioritized False", 0.01),
+        (lambda: LearnerConfig(kpi_max_weight=2.0), "kpi_max_weight: got 2.0", "kpi_weighting False", 10.0),
+        (lambda: CurriculumConfig(window_episodes=5), "window_episodes: got 5", "kind fixed", 20),
+        (lambda: CurriculumConfig(kind="uniform", window_episodes=5), "window_episodes: got 5", "kind uniform", 20),
+        (lambda: CurriculumConfig(kind="level", temperature=2.0), "temperature: got 2.0", "kind level", 1.0),
+        (
+            lambda: CurriculumConfig(kind="progress", learned_percent=9.0),
+            "learned_percent: got 9.0",
+            "kind progress",
+            50.0,
+        ),
+    ],
+)
+def test_a_setting_that_another_leaves_without_effect_is_refused(make, got: str, other: str, default: object):
+    with pytest.raises(ConfigError) as raised:
+        make()
+    part, _, message = str(raised.value).partition(".")
+    assert message == (
+        f"{got}, which has no effect with {part}.{other}; want {default}, or another {part}.{other.split()[0]}"
+    )

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 from typing import get_args
 
 import pytest
@@ -16,16 +17,17 @@ from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError, TaskError
 from gvz.launch import main, parse, resumed_config
 from gvz.run.config import RunConfig, with_agent
-from gvz.run.config_files import config_from_dict, config_to_dict, configs_directory, load_config
+from gvz.run.config_files import CONFIG_SCHEMA, config_from_dict, config_to_dict, configs_directory, load_config
 from gvz.run.resume import differences
 from gvz.run.rundir import RunDir
-from gvz.tasks import scenario_named
+from gvz.tasks import all_scenarios, scenario_named
 from learner.agents.configs.dqn import DQNConfig
 from learner.agents.configs.ppo import PPOConfig
 from learner.agents.configs.pqn import PQNConfig
 from learner.augment import AUGMENTATIONS
 from learner.config import Augmentation, LearnerConfig, OnPolicyConfig, ReplayConfig
 
+RESULTS = Path(__file__).parents[2] / "results"
 ALL_CONFIGS = sorted(p.stem for p in configs_directory().glob("*.py") if p.stem != "__init__")
 
 
@@ -35,6 +37,16 @@ def test_every_config_loads_and_survives_json(name):
     assert config.name == name
     saved = json.loads(json.dumps(config_to_dict(config)))
     assert differences(config_from_dict(saved), config) == []
+
+
+def test_every_config_loads_in_every_scenario_and_every_committed_run_can_still_be_read():
+    for name in ALL_CONFIGS:
+        for scenario in all_scenarios():
+            assert load_config(name, scenario).name == name
+    for file in RESULTS.rglob("config.json"):
+        saved = json.loads(file.read_text())
+        if saved["schema"] == CONFIG_SCHEMA:
+            config_from_dict(saved)
 
 
 @pytest.mark.parametrize("name", ALL_CONFIGS)

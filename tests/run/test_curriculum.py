@@ -101,15 +101,23 @@ def test_progress_draws_where_the_score_moves_most():
     np.testing.assert_allclose(sorted(lessons.probabilities()), squares / squares.sum())
 
 
-@pytest.mark.parametrize("kind", ["uniform", "level", "progress"])
-def test_a_run_that_goes_on_draws_the_same(kind):
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"kind": "uniform"},
+        {"kind": "level", "window_episodes": 4, "learned_percent": 0.0},
+        {"kind": "progress", "window_episodes": 4},
+    ],
+    ids=["uniform", "level", "progress"],
+)
+def test_a_run_that_goes_on_draws_the_same(settings):
     def score(task, number):
         return 10.0 * task + number % 7
 
-    whole = curriculum(kind=kind, window_episodes=4, learned_percent=0.0)
+    whole = curriculum(**settings)
     play(whole, score, 40)
     state = msgspec.msgpack.decode(msgspec.msgpack.encode(whole.state()))
-    resumed = curriculum(state, kind=kind, window_episodes=4, learned_percent=0.0)
+    resumed = curriculum(state, **settings)
     assert play(whole, score, 40) == play(resumed, score, 40)
 
 

@@ -1,6 +1,8 @@
 """Processes that act as one, here as threads without devices: what is agreed, refused, and noticed."""
 
 import contextlib
+import errno
+import os
 import socket
 import threading
 import time
@@ -230,6 +232,23 @@ def test_jax_in_process_0_may_come_late():
     with socket.create_server(address):
         waiting.join(30)
     assert not waiting.is_alive()
+
+
+@pytest.mark.parametrize("number", [errno.ECONNABORTED, errno.EMFILE])
+def test_a_connection_that_cannot_be_taken_does_not_keep_later_ones_out(number, monkeypatch):
+    accept, failures = socket.socket.accept, iter([OSError(number, os.strerror(number))])
+
+    def first_fails(server: socket.socket) -> tuple[socket.socket, Any]:
+        for failure in failures:
+            raise failure
+        return accept(server)
+
+    monkeypatch.setattr(socket.socket, "accept", first_fails)
+    address = "127.0.0.1", free_port("127.0.0.1")
+    the_relay = Relay(address, 1)
+    link.Link(address, 0, 1, {}).close()
+    assert next(failures, None) is None
+    the_relay.close()
 
 
 def test_a_forwarded_connection_outlives_the_other_end():

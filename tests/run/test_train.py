@@ -7,6 +7,7 @@ import re
 import signal
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import msgpack
 import numpy as np
@@ -25,6 +26,7 @@ from gvz.run import machine
 from gvz.run.config import CheckpointConfig, LogConfig, RunConfig
 from gvz.run.curriculum_config import CurriculumConfig
 from gvz.run.rundir import RunDir
+from gvz.run.saver import Saver
 from gvz.run.train import train, with_own_segmenters
 from gvz.segmentation import segmenter_file
 from learner.agents.configs.dqn import DQNConfig
@@ -297,6 +299,21 @@ def test_a_run_says_whether_its_end_has_anything_to_save(tmp_path, capsys):
     assert "done: writing the last checkpoint" in capsys.readouterr().err
     go_on(tmp_path, DQN, 20)
     assert "done: no new gradient steps to save" in capsys.readouterr().err
+
+
+def test_a_signal_in_the_last_save_of_a_complete_run_leaves_it_complete(tmp_path, monkeypatch):
+    save_last = Saver.save_last
+
+    def interrupted(self: Saver, *arguments: Any) -> None:
+        signal.raise_signal(signal.SIGTERM)
+        save_last(self, *arguments)
+
+    monkeypatch.setattr(Saver, "save_last", interrupted)
+    config = replace(DQN, learner=replace(DQN.learner, total_updates=20))
+    with RunDir(tmp_path) as run, StopRequest() as stop:
+        assert train(config, run, stop) == 0
+        assert stop.requested
+    assert saved_steps(tmp_path / "checkpoints") == [20]
 
 
 def test_an_on_policy_run_learns_from_what_was_chosen_on_the_learners_device(tmp_path):

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from gvz.core.errors import ConfigError
 from gvz.core.ranges import Range, Share
-from learner.config import Augmentation, ValueConfig
+from learner.config import Augmentation, ValueConfig, refuse_unused
 
 Noisy = Literal["off", "factorized", "independent"]
 
@@ -21,7 +21,7 @@ class RainbowConfig(ValueConfig):
     name: str = "rainbow"
     """module in learner/agents, or the path of a Python file (docs/AGENTS.md)"""
     double: bool = True
-    """double Q-learning (thesis eq. 4.9); without effect on Munchausen's target, which takes no maximum"""
+    """double Q-learning (thesis eq. 4.9). Munchausen's target takes no maximum, so it cannot be off there"""
     dueling: bool = True
     """dueling streams (eq. 4.10)"""
     noisy: Noisy = "factorized"
@@ -41,9 +41,9 @@ class RainbowConfig(ValueConfig):
     munchausen_temperature: Annotated[float, Range(1e-6, 100.0)] = 0.03
     """temperature of the softmax policy, in units of the return"""
     v_min: float | None = None
-    """smallest atom; default from the scenario's reward range"""
+    """smallest atom, if there are atoms; default from the scenario's reward range"""
     v_max: float | None = None
-    """largest atom; default from the scenario's reward range"""
+    """largest atom, if there are atoms; default from the scenario's reward range"""
     noisy_sigma: Annotated[float, Range(0.0, 10.0)] = 0.017
     """initial sigma of the noisy layers"""
     noisy_period_steps: Annotated[int, Range(1, 10**6)] = 1
@@ -69,6 +69,15 @@ class RainbowConfig(ValueConfig):
                 "agent.munchausen: got True with atoms, for which no form is published; set agent.num_quantiles, or "
                 "agent.distributional False"
             )
+        if self.munchausen:
+            refuse_unused("agent", self, "munchausen", "double")
+        else:
+            refuse_unused("agent", self, "munchausen", "munchausen_alpha", "munchausen_temperature")
+        if not self.has_atoms:
+            without = "num_quantiles" if self.distributional else "distributional"
+            refuse_unused("agent", self, without, "v_min", "v_max")
+        if self.noisy == "off":
+            refuse_unused("agent", self, "noisy", "noisy_period_steps", "noisy_epsilon")
         if self.sight_augmentations and not self.learns_sight:
             raise ConfigError(
                 f"agent.sight_augmentations: got {' '.join(self.sight_augmentations)} without a loss that reads them; "
