@@ -24,6 +24,7 @@ from gvz.observation import (
     observe_screen,
     observe_sight,
 )
+from gvz.one_thread import one_thread
 from gvz.scenarios.base import BOOKKEEPING, Task
 from gvz.scenarios.compiler import compile_task, task_content
 from gvz.segmentation import segmented_frame, segmenter_of
@@ -63,6 +64,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
       in each column of the frame, from left to right.
     - Seeds: `reset(seed=n)` seeds the sequence of episodes. Each episode has its own seed, `info["episode_seed"]`, and
       `reset(options={"episode_seed": m})` replays that episode alone. It also chooses the map, where maps are drawn.
+    - Threads: `reset`, `step` and `close` raise AlreadyPendingCallError while another thread is in one of them.
     """
 
     metadata = {  # noqa: RUF012  Gymnasium's; an instance's has the pictures per second of its own frame skip
@@ -155,6 +157,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         self._held: list[bool] | None = None
         """the buttons of the last decision"""
 
+    @one_thread
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
@@ -191,6 +194,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         self._playing = True
         return observation, info
 
+    @one_thread
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Holds the action's buttons for `frame_skip` tics, or for the rest until the time-out.
 
@@ -253,6 +257,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             raise ValueError("DoomEnv.labels: want 'labels' among the buffers of the EnvConfig")
         return () if self._state is None or self._state.labels is None else self._state.labels
 
+    @one_thread
     def close(self) -> None:
         """Ends the engine and its window, and frees the engine's memory. Can be repeated.
 

@@ -5,10 +5,13 @@ Calls that are interrupted.
 import shutil
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium.error import ResetNeeded
+from gymnasium.error import AlreadyPendingCallError, ResetNeeded
 
 from gvz.core.errors import EngineError
 from gvz.engine.engine import Engine
@@ -137,6 +140,29 @@ def test_a_working_directory_that_was_removed_is_an_error():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert done.stdout.startswith("the working directory was removed; change to another"), done.stderr
+
+
+def test_a_call_beside_that_of_another_thread_is_refused_and_breaks_nothing(monkeypatch):
+    env = DoomEnv("defend_the_center/default")
+    env.reset(seed=1)
+    advance, entered, go_on = Engine.advance, threading.Event(), threading.Event()
+
+    def waiting(engine: Engine, *arguments: Any) -> bool:
+        entered.set()
+        go_on.wait(30)
+        return advance(engine, *arguments)
+
+    monkeypatch.setattr(Engine, "advance", waiting)
+    with ThreadPoolExecutor(1) as player:
+        step = player.submit(env.step, TURN)
+        assert entered.wait(30)
+        for call in (env.close, env.reset, lambda: env.step(TURN)):
+            with pytest.raises(AlreadyPendingCallError, match="another thread is in a call of this environment"):
+                call()
+        go_on.set()
+        assert not step.result()[4]["engine_crash"]
+    env.step(TURN)
+    env.close()
 
 
 def test_close_may_be_repeated_and_reset_starts_anew():
