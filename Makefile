@@ -49,10 +49,10 @@ test-isa: install ## tests of learning and of the learner's numbers, as older pr
 	  XLA_FLAGS=--xla_cpu_max_isa=$$isa $(BIN)/python -m pytest -m "isa and not slow" -n 2 --dist loadfile $(ARGS) || exit 1; \
 	done
 
-learning-seeds: install ## ten seeds of each test of learning of agents with a replay, under three instruction sets
+learning-seeds: install ## ten seeds of each test of learning, under three instruction sets
 	for isa in AMX_FP16 AVX2 SSE4_2; do \
-	  XLA_FLAGS=--xla_cpu_max_isa=$$isa $(BIN)/python -m pytest tests/learner/test_learning.py --learning-seeds 10 \
-	    --timeout 1800 -q $(ARGS) || exit 1; \
+	  XLA_FLAGS=--xla_cpu_max_isa=$$isa $(BIN)/python -m pytest tests/learner/test_learning.py \
+	    tests/learner/test_on_policy_learning.py --learning-seeds 10 --timeout 1800 -q $(ARGS) || exit 1; \
 	done
 
 pipeline: install ## the thesis's experiments at a two-thousandth of their size, and their report, in runs/pipeline
