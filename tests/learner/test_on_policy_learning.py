@@ -1,8 +1,8 @@
 """PQN and PPO reach the optimum of small pixel games (games.py), as one compiled loop around the real update.
 
 Every claim was measured with ten seeds under each of three instruction sets, AVX512, AVX2 and SSE4_2, once more without
-XLA's optimization, and held in all 40 runs (`make learning-seeds`; 2026-11-29, 2-core AMD EPYC). With 100 rollouts 10 of
-10 reach the optimum, too, but for PQN in Catch: 8 of 10.
+XLA's optimization, and held in all 40 runs (`make learning-seeds`; 2026-11-29, 2-core AMD EPYC). With 100 rollouts 10
+of 10 reach the optimum, too, but for PQN in Catch: 8 of 10.
 """
 
 from collections.abc import Callable
