@@ -8,7 +8,9 @@ from typing import Concatenate, ParamSpec, TypeVar
 
 from gymnasium.error import AlreadyPendingCallError
 
-S, P, R = TypeVar("S"), ParamSpec("P"), TypeVar("R")
+S = TypeVar("S")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 def one_thread(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[S, P], R]:
