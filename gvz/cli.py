@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _drop_unwritten()
         return EXIT_BROKEN_PIPE
     except OSError as error:
-        if error.errno == errno.ENOENT and error.filename is None:  # os.getcwd
+        if error.errno == errno.ENOENT and _directory_is_gone():
             say("error: the current directory is not there any more; change to another")
             return 2
         if error.errno not in _OF_THE_DISK:
@@ -52,6 +52,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         where = f"{error.filename}: " if error.filename else ""
         say(f"error: {where}{error.strerror}; make room or give a place that you can write to")
         return 1
+
+
+def _directory_is_gone() -> bool:
+    try:
+        os.getcwd()  # noqa: PTH109
+    except FileNotFoundError:
+        return True
+    return False
 
 
 def _drop_unwritten() -> None:

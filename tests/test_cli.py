@@ -69,9 +69,9 @@ def test_help_of_a_command_says_all_that_the_overview_leaves_out(capsys):
     for arguments in (["--help"], ["evaluate", "--help"]):
         with pytest.raises(SystemExit, match=r"^(0|None)$"):
             cli.main(arguments)
-        told.append(capsys.readouterr().out)
+        told.append(" ".join(capsys.readouterr().out.split()))
     overview, evaluate = told
-    assert "Play evaluation episodes and append a row" in " ".join(overview.split())
+    assert "Play evaluation episodes and append a row" in overview
     assert "Episode n of a task has the same seed" not in overview
     assert "Episode n of a task has the same seed" in evaluate
     assert "RUN_DIR" in evaluate
