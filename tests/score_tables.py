@@ -47,9 +47,9 @@ def score_cells(scores: Scores, scenario: str, training: TaskSet = "train8") -> 
     return " | ".join(estimate(scores, tasks).text for tasks in task_sets(scenario, training))
 
 
-def means(of_agents: Mapping[str, Scores]) -> list[str]:
+def means(of_agents: Mapping[str, Scores], training: TaskSet = "train8") -> list[str]:
     """Means over scenarios on each of `task_sets`."""
-    groups = [[(scores, task_sets(name)[column]) for name, scores in of_agents.items()] for column in range(4)]
+    groups = [[(scores, task_sets(name, training)[column]) for name, scores in of_agents.items()] for column in range(4)]
     return [estimate_groups(group, mean_over_scenarios).text for group in groups]
 
 
