@@ -49,7 +49,7 @@ def score_cells(scores: Scores, scenario: str, training: TaskSet = "train8") -> 
 
 def means(of_agents: Mapping[str, Scores], training: TaskSet = "train8") -> list[str]:
     """Means over scenarios on each of `task_sets`."""
-    groups = [[(scores, task_sets(name, training)[column]) for name, scores in of_agents.items()] for column in range(4)]
+    groups = [[(of, task_sets(name, training)[column]) for name, of in of_agents.items()] for column in range(4)]
     return [estimate_groups(group, mean_over_scenarios).text for group in groups]
 
 
