@@ -33,4 +33,4 @@ def check_ranges(prefix: str, config: object) -> None:
     for name, (low, high) in _ranges(type(config)).items():
         value = getattr(config, name)
         if value is not None and not low <= value <= high:
-            raise ConfigError(f"{prefix}.{name}: got {value}, want {low}..{high}")
+            raise ConfigError(f"{prefix}.{name}: got {value}, want {low:.10g}..{high:.10g}")

@@ -114,15 +114,9 @@ def test_online_target_and_choice_of_the_next_action_have_independent_noise():
 @pytest.mark.parametrize(("num_quantiles", "munchausen"), [(7, False), (7, True), (0, True)])
 def test_quantiles_and_munchausen_are_their_equations_in_float64(num_quantiles: int, munchausen: bool):
     """Rainbow without noise. Dabney et al. 2018 (QR-DQN), eq. 10; Vieillard et al. 2020, eq. 2."""
-    config = replace(
-        RAINBOW,
-        noisy="off",
-        distributional=num_quantiles > 0,
-        num_quantiles=num_quantiles,
-        munchausen=munchausen,
-        munchausen_alpha=0.7,
-        munchausen_temperature=0.5,
-    )
+    config = replace(RAINBOW, noisy="off", distributional=num_quantiles > 0, num_quantiles=num_quantiles)
+    if munchausen:
+        config = replace(config, munchausen=True, munchausen_alpha=0.7, munchausen_temperature=0.5)
     agent, _, evaluate, loss = jitted(config)
     params, target, b = made_up_params(agent, 0), made_up_params(agent, 1), batch()
     result, N = loss(params, target, jax.random.key(7), b), max(1, num_quantiles)
