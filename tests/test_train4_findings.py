@@ -94,7 +94,7 @@ def test_the_findings_say_what_six_times_the_time_gave_on_four_training_tasks(sc
             assert f"| mean | {called} | {seconds} | {cells} |" in WORDS
     for (name, called), of_agent in longer.items():
         title, short = scenario_named(name).title, scores[name, called]
-        assert len(of_agent.runs) == {"4 tasks": 1, "8 tasks": 3}[called]
+        assert len(of_agent.runs) == (3 if called == "8 tasks" else 2 if name == "health_gathering" else 1)
         assert f"| {title} | {called} | 900 s | {score_cells(short, name, 'train4')} |" in WORDS
         assert f"| {title} | {called} | 5,400 s | {score_cells(of_agent, name, 'train4')} |" in WORDS
 
@@ -129,8 +129,7 @@ def test_the_findings_say_what_six_times_the_time_gave_on_four_training_tasks(sc
         said = f"`{task}` has {four:.0f} (after 900 seconds {four_short:.0f}, with eight tasks {eight:.0f})"
         assert said in WORDS
     steps = sorted(rows_of(file)[-1]["num_updates"] for file in (ROOT / "results").glob(STEPS.format("_long")))
-    assert f"training seed 1111; {steps[0]:,} to {steps[-1]:,} gradient steps, 50 episodes" in WORDS
-    assert len(steps) == len(scenarios())
+    assert f"in Health Gathering also 2222; {steps[0]:,} to {steps[-1]:,} gradient steps, 50 episodes" in WORDS
 
 
 def test_the_findings_say_how_long_agents_of_four_training_tasks_learned():

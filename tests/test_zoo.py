@@ -96,6 +96,7 @@ def test_the_findings_say_what_the_agent_with_shifted_frames_has(tmp_path, monke
         ("", "have {}% of the bound on the 28 test tasks"),
         ("_compositions", "for 45 minutes of one core each, and have {}%"),
         ("_screen", "the screen alone and have {}%"),
+        ("_train4", "for 90 minutes of one core each, and have {}%"),
     ],
 )
 def test_the_mean_over_scenarios_is_that_of_the_score_cards(suffix, said, tmp_path, monkeypatch):
