@@ -27,7 +27,7 @@ class ActorsConfig:
     inference: Literal["actors", "device"] = "actors"
     """who chooses actions: actors, each for its own games on its core; device, the learner's device (a GPU) for the
     games of all actors in one batch. An actor waits for its actions then: more actors than cores may be faster"""
-    ring_capacity: int = 64
+    ring_capacity: Annotated[int, Range(8, 2**20)] = 64
     """step records a ring holds; a full ring makes its actor wait"""
     start_timeout_s: float = 120.0
     """an actor that has not started all its games by then is restarted"""
@@ -43,8 +43,6 @@ class ActorsConfig:
 
     def __post_init__(self) -> None:
         check_ranges("actors", self)
-        if not 8 <= self.ring_capacity <= 2**20:
-            raise ConfigError(f"actors.ring_capacity: got {self.ring_capacity}, want 8..{2**20}")
         for name in ("start_timeout_s", "heartbeat_timeout_s", "restart_window_s"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"actors.{name}: got {getattr(self, name)}, want more than 0 seconds")

@@ -142,9 +142,8 @@ def collect_evaluations(paths: Iterable[Path | str]) -> tuple[pl.DataFrame, list
                 f"{run_dir}: {player} has episodes of {num_policies} policies (`params`), which are put together as if "
                 "they were of one; leave out the records of the others"
             )
-    released = (
-        together["vizdoom"].str.split("+").list.first()
-    )  # a tuned engine plays the games of the one it is made of
+    # a tuned engine plays the games of the one it is made of
+    released = together["vizdoom"].str.split("+").list.first()
     if len(versions := released.drop_nulls().unique().sort()) > 1:
         problems.append(
             f"episodes were played with several versions of ViZDoom ({', '.join(versions)}), whose games may differ; "

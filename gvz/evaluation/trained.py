@@ -135,7 +135,7 @@ def find_checkpoints(run_dir: Path, wanted: Sequence[str]) -> list[int]:
             count = int(last[1])
             if not 1 <= count <= len(known):
                 raise ConfigError(
-                    f"--checkpoints: got {text}, want last1 to last{len(known)}: so many are in {directory}"
+                    f"--checkpoints: got {text}, want last1 to last{len(known)}: {directory} holds {len(known)}"
                 )
             chosen.update(known[-count:])
         elif text in ("newest", "all"):

@@ -35,7 +35,7 @@ from tests.waiting import wait_until
         ("--player idle --level 5", "level: got 5, want 0..4"),
         ("--player idle --level 0 --split test", "--level, --split: no task of test has level 0"),
         ("{file}", "is not a run directory"),
-        ("{run} --checkpoints last3", "--checkpoints: got last3, want last1 to last2: so many are in "),
+        ("{run} --checkpoints last3", "--checkpoints: got last3, want last1 to last2: "),
         ("{run} --tasks", "--tasks: got none, want at least one id"),
         ("{run} --profile levdoom", "--profile: got levdoom, but small keeps the rules that it was trained by, "),
         ("{run} --agent none.py", "--agent: no file none.py here ("),
