@@ -38,7 +38,10 @@ def check_agent(agent: Any, *, on_policy: bool) -> None:
     try:
         hash(agent)
     except TypeError as error:
-        raise ConfigError(f"agent.name: {error}; make {_name(agent)} a frozen dataclass") from error
+        raise ConfigError(
+            f"agent.name: {_name(agent)} cannot be hashed ({error}); want a frozen dataclass, without lists in "
+            "it or in its configuration"
+        ) from error
 
     key, obs = jax.random.key(0), agent.spec.zeros(_B)
     params = jax.eval_shape(agent.init, key)

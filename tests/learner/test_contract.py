@@ -100,7 +100,7 @@ def test_an_agent_that_cannot_be_hashed_is_refused():
     class Mine(DQN):
         __hash__ = None  # pyright: ignore
 
-    with pytest.raises(ConfigError, match=r"agent\.name: unhashable type: 'Mine'; make Mine a frozen dataclass"):
+    with pytest.raises(ConfigError, match=r"agent\.name: Mine cannot be hashed \(unhashable type: 'Mine'\); want a f"):
         check_agent(Mine(DQNConfig(**SIZES), SPEC), on_policy=False)
 
 
