@@ -5,6 +5,7 @@ never be an error: JAX would broadcast a priority without axes over the batch, a
 axes exchanged would go to other steps.
 """
 
+from dataclasses import fields
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 from gvz.core.errors import ConfigError
 from learner.agents.base import AgentLoss, Evaluation, RolloutSteps, SampleLosses, Samples, Targets
 from learner.replay import Transitions
+from learner.rollout_step import MetricSums
 
 _B, _T = 3, 2
 """samples of a batch, or games of a rollout, and its steps: two numbers, so that exchanged axes are seen"""
@@ -89,6 +91,11 @@ def _check_rollouts(agent: Any, params: Any, obs: Any, num_extras: int) -> None:
     _check(agent.losses, "loss", found["loss"], (_B,))
     if not isinstance(found["metrics"], dict):
         raise ConfigError(f"agent.name: {_name(agent.losses)} gives metrics {_text(found['metrics'])}, want dict")
+    if taken := {field.name for field in fields(MetricSums)} & found["metrics"].keys():
+        raise ConfigError(
+            f"agent.name: {_name(agent.losses)} gives metrics named {', '.join(sorted(taken))}, want other names: "
+            "these are the learner's own"
+        )
     for name, values in found["metrics"].items():
         _check(agent.losses, f"metrics[{name!r}]", values, (_B,))
 

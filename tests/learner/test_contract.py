@@ -73,6 +73,7 @@ def test_every_agent_of_the_package_passes(name: str):
         (PPO, "targets", of("advantages", jnp.ravel), "gives advantages float32[6], want float32[2, 3]"),
         (PPO, "losses", of("loss", without_axes), "gives loss float32[], want float32[3]"),
         (PPO, "losses", of("metrics", lambda _: {"x": jnp.zeros(())}), "gives metrics['x'] float32[], want float32[3]"),
+        (PPO, "losses", lambda x: x._replace(metrics={"loss": x.loss}), "gives metrics named loss, want other names"),
         (PPO, "losses", of("metrics", lambda _: None), "gives metrics NoneType, want dict"),
     ],
 )
