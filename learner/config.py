@@ -152,9 +152,18 @@ def agent_config_class(name: str) -> type[AgentConfig]:
         name: a module's name, or the path of a Python file, which is executed.
 
     Raises:
-        ConfigError: no such agent.
+        ConfigError: no such agent, or what its file sets is no such class.
     """
-    return find("learner.agents.configs", "CONFIG", name, "agent.name")
+    kind = find("learner.agents.configs", "CONFIG", name, "agent.name")
+    if not (isinstance(kind, type) and issubclass(kind, AgentConfig)):
+        raise ConfigError(
+            f"agent.name: {name} sets CONFIG to {kind!r}, want a class made from one of learner/config.py, such as "
+            "ValueConfig"
+        )
+    for field in dataclasses.fields(kind):
+        if field.name != "name" and dataclasses.MISSING is field.default is field.default_factory:
+            raise ConfigError(f"agent.name: {field.name} of {kind.__name__} in {name} has no default, want one")
+    return kind
 
 
 def change_agent(config: AgentConfig, name: str) -> AgentConfig:

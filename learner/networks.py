@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from gvz.core.errors import ConfigError
 from learner.agents.configs.rainbow import Noisy
 from learner.config import AgentConfig
 from learner.encoders.base import make_encoder
@@ -182,6 +183,11 @@ class QNetwork(nn.Module):
         """Applies the network: by its means, or by each row's own noise, see `draw_noise`."""
         config, dtype = self.config, jnp.dtype(self.config.activation_dtype)
         x = make_encoder(config.encoder)(obs.frames.astype(dtype) / 255, config)
+        B, shape = len(obs.frames), getattr(x, "shape", ())
+        if len(shape) != 2 or shape[0] != B:
+            raise ConfigError(
+                f"agent.encoder: {config.encoder!r} gives features {list(shape)}, want [B, F] with B = {B}"
+            )
         if self.num_sights:
             normalized = nn.LayerNorm(use_scale=False, use_bias=False, dtype=dtype)(x)
             logits = nn.Dense(self.num_sights, dtype=dtype, name="sight")(normalized)

@@ -16,7 +16,6 @@ from actors.pool import Pool, PoolConfig
 from actors.process_pool import ProcessPool
 from gvz.cluster.config import ClusterConfig
 from gvz.core.env_config import SIGHT_CLASSES, SIGHT_COLUMNS
-from gvz.core.errors import ConfigError
 from gvz.run.config import RunConfig, off_policy
 from gvz.run.curriculum_config import first_tasks
 from gvz.run.footprint import Footprint
@@ -26,6 +25,7 @@ from gvz.task_table import TaskTable
 from learner.acting import DevicePolicy
 from learner.agents.base import Agent, AgentSpec, OffPolicyAgent, OnPolicyAgent, folding, make_agent
 from learner.config import OnPolicyConfig, ValueConfig
+from learner.contract import check_agent
 from learner.export import export_fold, export_policy, layout_hash
 from learner.learner import LearnerParts
 from learner.off_policy import OffPolicyParts
@@ -104,6 +104,7 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
         for scenario in table.scenarios:
             segmenter_of(scenario.id, config.env)  # its errors are the run's, not an actor's
     agent = run_agent(config)
+    check_agent(agent, on_policy=config.agent.on_policy)
     spec, params = agent.spec, jax.eval_shape(agent.init, jax.random.key(0))
     num_params = sum(leaf.size for leaf in jax.tree.leaves(params))
     _, extras = jax.eval_shape(agent.act, params, jax.random.key(0), spec.zeros(), jnp.float32(0))
@@ -197,8 +198,7 @@ def _acting(config: RunConfig, agent: Agent) -> dict[str, Any]:
 
 def _off_policy(config: RunConfig, agent: Agent, pool: PoolConfig) -> OffPolicyParts:
     """A learner of n-step transitions from a replay."""
-    if not isinstance(agent, OffPolicyAgent):
-        raise ConfigError(f"agent.name: {config.agent.name!r} has no `loss` of transitions; want on_policy = True")
+    assert isinstance(agent, OffPolicyAgent)
     learner, replay = off_policy(config)
     spec = ReplaySpec(
         **_store_sizes(config, pool),
@@ -222,8 +222,7 @@ def _off_policy(config: RunConfig, agent: Agent, pool: PoolConfig) -> OffPolicyP
 
 def _on_policy(config: RunConfig, agent: Agent, pool: PoolConfig) -> OnPolicyParts:
     """A learner of rollouts."""
-    if not isinstance(agent, OnPolicyAgent):
-        raise ConfigError(f"agent.name: {config.agent.name!r} has no `targets` and `losses`; want on_policy = False")
+    assert isinstance(agent, OnPolicyAgent)
     assert isinstance(config.learner, OnPolicyConfig)
     sizes = _store_sizes(config, pool)
     window = StoreSpec(**sizes, capacity=0).history + config.learner.rollout_steps

@@ -177,7 +177,7 @@ class Trainer:
         Raises:
             ConfigError: it is no probability.
         """
-        epsilon = self._learner.epsilon(self._counts.published_env_steps)
+        epsilon = float(self._learner.epsilon(self._counts.published_env_steps))  # of a schedule of optax, an array
         if not 0 <= epsilon <= 1:
             raise ConfigError(
                 f"agent.name: the `epsilon` of {self._config.agent.name!r} gives {epsilon} after "

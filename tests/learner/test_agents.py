@@ -286,6 +286,30 @@ def test_a_file_that_is_no_agent_is_refused(tmp_path: Path):
         make_agent(replace(RAINBOW, name=str(tmp_path / "mine.py")), SPEC)
 
 
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (
+            "DQNConfig()",
+            r"own\.py sets CONFIG to DQNConfig\(name='dqn', .*, want a class made from one of learner/config",
+        ),
+        ("int", r"own\.py sets CONFIG to <class 'int'>, want a class made from"),
+        ("Lacking", r"agent\.name: alpha of Lacking in .*own\.py has no default, want one"),
+    ],
+)
+def test_a_configuration_that_is_no_class_with_defaults_is_refused(tmp_path: Path, config: str, message: str):
+    (tmp_path / "own.py").write_text(
+        "from dataclasses import dataclass\n"
+        "from learner.agents.configs.dqn import DQNConfig\n"
+        "@dataclass(frozen=True, kw_only=True)\n"
+        "class Lacking(DQNConfig):\n"
+        "    alpha: float\n"
+        f"CONFIG = {config}\n"
+    )
+    with pytest.raises(ConfigError, match=message):
+        agent_config_class(str(tmp_path / "own.py"))
+
+
 def test_a_path_from_here_names_the_same_agent(agent_file: Path, monkeypatch):
     from_anywhere = make_agent(plain_config(str(agent_file)), SPEC)
     monkeypatch.chdir(agent_file.parent)

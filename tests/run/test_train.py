@@ -11,6 +11,7 @@ from typing import Any
 
 import msgpack
 import numpy as np
+import optax
 import psutil
 import pytest
 
@@ -178,6 +179,17 @@ def test_a_run_that_explores_by_epsilon_goes_on_bit_for_bit_between_two_publicat
     assert (len(tasks_of_lanes) > games) == (curriculum == "uniform")
     assert logged_updates(tmp_path / "whole") == [20, 40, 60, 80]
     assert logged_updates(tmp_path / "cut") == [50, 60, 80]
+
+
+def test_an_epsilon_may_be_a_number_of_jax_or_numpy(tmp_path):
+    @dataclass(frozen=True, kw_only=True)
+    class Scheduled(DQNConfig):
+        def epsilon(self, env_steps: int) -> float:
+            return optax.linear_schedule(1.0, 0.0, 100)(env_steps)  # pyright: ignore
+
+    agent = Scheduled(conv_channels=(4,), conv_kernels=(8,), conv_strides=(4,), hidden_units=16)
+    go_on(tmp_path, replace(DQN, agent=agent), 4)
+    assert saved_steps(tmp_path / "checkpoints") == [4]
 
 
 def test_an_epsilon_that_is_no_probability_ends_a_run_which_is_saved_first(tmp_path):
