@@ -110,7 +110,7 @@ def test_the_findings_say_what_further_seeds_of_compositions_gave_with_more_time
     assert f"and {on_level_4} after three times the time, with three seeds." in WORDS
     percent, interval = on_test.split(" ", 1)
     readme = " ".join((ROOT / "README.md").read_text().split())
-    assert f"for 45 minutes, they have {percent}% {interval} (three seeds). " in readme
+    assert f"for 45 minutes, such agents have {percent}% {interval} (three seeds). " in readme
     guide = " ".join((ROOT / "docs" / "how-to" / "train.md").read_text().split())
     assert f"Such agents have {percent}% of the bound on the 28 test tasks." in guide
     for folder, words in (("general_short", "after 15 minutes"), ("general", "after 90.")):

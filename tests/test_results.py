@@ -62,12 +62,12 @@ def test_the_quick_comparison_says_what_its_records_give():
         assert said[-1] == round(np.mean([row["normalized_score"] for row in final if row["task"] in test_tasks]), 1)
 
 
-def test_the_quick_comparison_says_what_a_player_that_looks_at_nothing_has_on_the_same_episodes():
+def test_the_quick_comparison_says_what_players_that_do_not_learn_have_on_the_same_episodes():
     folder, scenario = ROOT / "results" / "quick_comparison", "defend_the_center"
-    first = read_results([ROOT / "results" / "reference" / "sweep.jsonl.gz"]).episodes.filter(
-        polars.col("episode") < 25
-    )
-    sweep = first.filter(scenario=scenario).to_dicts()
+
+    def first_episodes(player: str) -> list[dict[str, Any]]:
+        played = read_results([ROOT / "results" / "reference" / f"{player}.jsonl.gz"]).episodes
+        return played.filter(polars.col("episode") < 25, scenario=scenario).to_dicts()
 
     def mean(rows: list[dict[str, Any]], tasks: list[Task]) -> float:
         ids = {task.id for task in tasks}
@@ -76,7 +76,10 @@ def test_the_quick_comparison_says_what_a_player_that_looks_at_nothing_has_on_th
     levels = [named_tasks(scenario, level=level) for level in LEVELS]
     train, test = (named_tasks(scenario, split=split) for split in ("train4", "test"))
     readme, words = (folder / "README.md").read_text(), " ".join((folder / "README.md").read_text().split())
-    assert f"| sweep | {' | '.join(f'{mean(sweep, tasks):.1f}' for tasks in (*levels, test))} |" in readme
+    for player in ("random", "sweep", "scripted"):
+        rows = first_episodes(player)
+        assert f"| {player} | {' | '.join(f'{mean(rows, tasks):.1f}' for tasks in (*levels, test))} |" in readme
+    sweep = first_episodes("sweep")
     assert f"On the four training tasks the sweep has {mean(sweep, train):.1f}." in words
     better = {}
     for config, said in (
@@ -114,6 +117,10 @@ def test_the_gap_of_procedural_maps_is_what_its_records_give():
 def test_the_joint_run_says_what_its_records_give():
     folder = ROOT / "results" / "rainbow_all"
     rows, readme = rows_of(folder / "evaluation.jsonl.gz"), (folder / "README.md").read_text()
+    last = metrics_of(folder)[-1]
+    updates, decisions = f"{last['num_updates']:,} gradient steps", f"{round(last['actors/env_steps'], -3):,} decisions"
+    assert f"{updates}, {decisions}, 48 minutes" in readme
+    assert f"{last['run/processor_s']:,.0f} seconds of processor time" in readme
     for split, episodes, title in (("train4", 20, "4 training tasks"), ("test", 50, "7 test tasks")):
         means = []
         for scenario in scenarios():
