@@ -271,6 +271,26 @@ def test_the_readme_says_how_fast_the_records_are():
     assert row("actors_tuned", "; here with the tuned engine, others with their own") in readme
 
 
+def test_the_page_of_the_tuned_engine_says_what_its_records_give():
+    page = " ".join((ROOT / "docs" / "ENGINE.md").read_text().split())
+    equal, speed = (
+        json.loads((ROOT / "results" / "engine" / f"{name}.json").read_text()) for name in ("equality", "speed")
+    )
+    assert not equal["differing"]
+    assert f"**{equal['decisions']:,} decisions, and none differs**" in page
+    ends = equal["episode_ends"]
+    all_ends = f"{ends['inside']:,} of these {ends['deaths'] + ends['timeouts']:,} ends came within a decision."
+    assert f"{ends['deaths']} episodes ended with the player's death and {ends['timeouts']:,} with a time-out" in page
+    assert all_ends in page
+    for part, title in (("bare", "`make_action` and `get_state`"), ("environment", "`gvz.make`, all of it")):
+        for engine, called in (("stock", "released"), ("tuned", "tuned")):
+            rate, *us = (speed[part][engine][key] for key in ("decisions_per_core_s", "engine_us", "python_us"))
+            cells = " | ".join(f"{found['median']:g}" for found in us)
+            assert f"| {title} | {called} | {rate['median']:,.0f} | {cells} |" in page
+        gain = speed[part]["gain_decisions_per_core_s"]
+        assert f"**{gain['median']:.2f}** [{gain['min']:.2f}, {gain['max']:.2f}] times" in page
+
+
 def test_pages_say_what_a_gpu_gave():
     record = json.loads((ROOT / "results" / "performance" / "gpu_gpu.json").read_text())
     rows = {row["name"]: row for row in record["rows"]}
