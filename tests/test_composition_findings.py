@@ -88,7 +88,9 @@ def test_the_findings_say_what_three_seeds_of_compositions_have_beside_eight_tas
         return found
 
     trained, gate, test, hardest = map(gains, range(4))
-    assert f"with half the time**: by {in_words(test)} points. On level 4 by {in_words(hardest)}." in WORDS
+    assert (
+        f"with half the time**: by {in_words(test)} points. On level 4 they are better by {in_words(hardest)}." in WORDS
+    )
     assert f"no difference is shown**: {in_words(trained)} points. On the gate tasks the" in WORDS
     assert f"the differences are {in_words(gate)}." in WORDS
     assert f"not eight tasks for 5,400 s | {' | '.join(gate)} |" in WORDS
