@@ -218,6 +218,19 @@ def test_every_run_has_all_episodes_of_its_evaluation(folder: str, split: TaskSe
         assert Counter(row["task"] for row in rows) == dict.fromkeys(wanted, num_episodes), file
 
 
+def test_the_page_of_the_gates_says_how_many_runs_are_missing():
+    folder = ROOT / "results" / "gates"
+    page = " ".join((folder / "README.md").read_text().split())
+    (command,) = re.findall("gvz experiment run (.*?) --results", page)
+    missing = {}
+    for gate in re.findall(r"gate_\w+", command):
+        there = [(folder / "runs" / run.id).exists() for run in experiments()[gate].runs()]
+        if not all(there):
+            missing[gate] = (f"{there.count(False)}", f"{len(there)}")
+    said = re.findall(r"(\d+) of the (\d+) (?:runs )?of `(gate_\w+)`", page)
+    assert {gate: (absent, runs) for absent, runs, gate in said} == missing
+
+
 def test_the_page_of_the_general_agents_says_what_their_records_give(tmp_path):
     folder = ROOT / "results" / "general_short"
     page, results = (folder / "README.md").read_text(), results_of("general_short")
