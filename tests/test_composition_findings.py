@@ -88,7 +88,9 @@ def test_the_findings_say_what_three_seeds_of_compositions_have_beside_eight_tas
         return found
 
     trained, gate, test, hardest = map(gains, range(4))
-    assert f"with half the time**: by {in_words(test)} points. On level 4 by {in_words(hardest)}." in WORDS
+    assert (
+        f"with half the time**: by {in_words(test)} points. On level 4 they are better by {in_words(hardest)}." in WORDS
+    )
     assert f"no difference is shown**: {in_words(trained)} points. On the gate tasks the" in WORDS
     assert f"the differences are {in_words(gate)}." in WORDS
     assert f"not eight tasks for 5,400 s | {' | '.join(gate)} |" in WORDS
@@ -110,7 +112,7 @@ def test_the_findings_say_what_further_seeds_of_compositions_gave_with_more_time
     assert f"and {on_level_4} after three times the time, with three seeds." in WORDS
     percent, interval = on_test.split(" ", 1)
     readme = " ".join((ROOT / "README.md").read_text().split())
-    assert f"for 45 minutes, they have {percent}% {interval} (three seeds); " in readme
+    assert f"for 45 minutes, such agents have {percent}% {interval} (three seeds). " in readme
     guide = " ".join((ROOT / "docs" / "how-to" / "train.md").read_text().split())
     assert f"Such agents have {percent}% of the bound on the 28 test tasks." in guide
     for folder, words in (("general_short", "after 15 minutes"), ("general", "after 90.")):
@@ -132,8 +134,11 @@ def test_the_pages_say_how_near_the_test_tasks_are_to_compositions():
     assert f"attributes of {len(parts)} of the {len(test)} test tasks stand together in one of them" in WORDS
     assert f"and {sum(map(near, test))} of the {len(test)} become one if one" in WORDS
     benchmark, readme = (" ".join((ROOT / page).read_text().split()) for page in ("docs/BENCHMARK.md", "README.md"))
-    assert f"but {len(parts)} of the {len(test)} are a part of one, and {sum(map(near, test))} become one" in benchmark
-    assert f"{len(parts)} of the {len(test)} test tasks are a part of such a combination." in readme
+    assert (
+        f"attributes of {len(parts)} of the {len(test)} test tasks stand together in one of them, and "
+        f"{sum(map(near, test))} become one"
+    ) in benchmark
+    assert f"attributes of {len(parts)} of the {len(test)} test tasks stand together in one of these" in readme
 
     def scores(folder: str) -> list[str]:
         """On these tasks, and on the others."""

@@ -12,7 +12,7 @@ from gvz import cli, launch
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("**/*.md"))]
-RECORDS = sorted((ROOT / "results").glob("*/README.md"))
+RECORDS = sorted((ROOT / "results").glob("**/README.md"))
 REPORTS = sorted((ROOT / "results").glob("*/report/report.md"))
 EXAMPLES = [
     pytest.param(block, id=f"{page.name}-{number}")
@@ -64,6 +64,11 @@ def test_commands_have_the_flags_they_are_given(page, tmp_path, monkeypatch):
             command = cli.parse(words[1:])
             if words[1:3] in (["experiment", "plan"], ["experiment", "run"]):
                 assert command.action.ask.plan().runs()
+
+
+def test_the_index_of_records_has_every_folder():
+    folders = {path.name for path in (ROOT / "results").iterdir() if path.is_dir()}
+    assert set(re.findall(r"\[(\w+)\]\(", (ROOT / "results" / "README.md").read_text())) == folders
 
 
 @pytest.mark.parametrize("page", [*PAGES, *RECORDS, *REPORTS], ids=lambda page: str(page.relative_to(ROOT)))

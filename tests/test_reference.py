@@ -117,6 +117,36 @@ def test_the_page_says_how_many_sergeants_died_by_other_hands():
     ) in page
 
 
+def test_the_page_of_later_scenarios_says_what_players_reach():
+    page = " ".join((PAGE.parent / "EXTENDED.md").read_text().split())
+
+    def found(player: str, task: str, column: str = "score") -> float:
+        rows = read_reference(RECORDS / task.partition("/")[0])[player, task]
+        return float(np.mean([row[column] for row in rows]))
+
+    def of_sweep(scenario: str) -> tuple[float, str]:
+        """Its score in `default`, and that in percent of the bound."""
+        score = found("sweep", f"{scenario}/default")
+        return score, f"{100 * score / all_scenarios()[scenario].upper_bound('thesis'):.0f} %"
+
+    key, goal, rockets, ammunition = map(of_sweep, ("find_the_key", "guarded_goal", "rockets", "find_ammunition"))
+    fast = ("fast_enemies", "fast_enemies+resized_enemies+wrong_ammunition")
+    deaths = [f"{100 * found('scripted', f'find_ammunition/{name}', 'terminated'):.0f}" for name in fast]
+    assert round(1 / goal[0]) == 11
+    for told in (
+        f"a blind walk in circles leaves {key[0]:.1f} times in `default`, {key[1]} of the bound",
+        f"where it sees nothing and leaves {found('scripted', 'find_the_key/maze'):.1f} times",
+        f"reaches a goal in one episode of eleven, {goal[1]} of the bound",
+        f"until its rockets are spent kills {rockets[0]:.1f} of 45 in `default`, {rockets[1]} of the bound",
+        f"Random play kills {found('random', 'rockets/default'):.0f}, some of them together with itself",
+        f"burst barrels and kill {found('idle', 'rockets/complete'):.0f} enemy even if the agent does nothing",
+        f"the best blind sweep kills {ammunition[0]:.1f} enemies in `default`, {ammunition[1]} of the bound",
+        f"in the maze it kills {found('sweep', 'find_ammunition/maze'):.1f}.",
+        f"kill it in {deaths[0]} of 100 episodes, and in {deaths[1]} if they also have other sizes",
+    ):
+        assert told in page, told
+
+
 def test_the_page_says_where_the_thesis_is_beside_the_sweep():
     published = experiment_named("training_set_size").published["thesis"]
     above = [

@@ -62,12 +62,12 @@ def test_the_quick_comparison_says_what_its_records_give():
         assert said[-1] == round(np.mean([row["normalized_score"] for row in final if row["task"] in test_tasks]), 1)
 
 
-def test_the_quick_comparison_says_what_a_player_that_looks_at_nothing_has_on_the_same_episodes():
+def test_the_quick_comparison_says_what_players_that_do_not_learn_have_on_the_same_episodes():
     folder, scenario = ROOT / "results" / "quick_comparison", "defend_the_center"
-    first = read_results([ROOT / "results" / "reference" / "sweep.jsonl.gz"]).episodes.filter(
-        polars.col("episode") < 25
-    )
-    sweep = first.filter(scenario=scenario).to_dicts()
+
+    def first_episodes(player: str) -> list[dict[str, Any]]:
+        played = read_results([ROOT / "results" / "reference" / f"{player}.jsonl.gz"]).episodes
+        return played.filter(polars.col("episode") < 25, scenario=scenario).to_dicts()
 
     def mean(rows: list[dict[str, Any]], tasks: list[Task]) -> float:
         ids = {task.id for task in tasks}
@@ -76,7 +76,10 @@ def test_the_quick_comparison_says_what_a_player_that_looks_at_nothing_has_on_th
     levels = [named_tasks(scenario, level=level) for level in LEVELS]
     train, test = (named_tasks(scenario, split=split) for split in ("train4", "test"))
     readme, words = (folder / "README.md").read_text(), " ".join((folder / "README.md").read_text().split())
-    assert f"| sweep | {' | '.join(f'{mean(sweep, tasks):.1f}' for tasks in (*levels, test))} |" in readme
+    for player in ("random", "sweep", "scripted"):
+        rows = first_episodes(player)
+        assert f"| {player} | {' | '.join(f'{mean(rows, tasks):.1f}' for tasks in (*levels, test))} |" in readme
+    sweep = first_episodes("sweep")
     assert f"On the four training tasks the sweep has {mean(sweep, train):.1f}." in words
     better = {}
     for config, said in (
@@ -114,6 +117,10 @@ def test_the_gap_of_procedural_maps_is_what_its_records_give():
 def test_the_joint_run_says_what_its_records_give():
     folder = ROOT / "results" / "rainbow_all"
     rows, readme = rows_of(folder / "evaluation.jsonl.gz"), (folder / "README.md").read_text()
+    last = metrics_of(folder)[-1]
+    updates, decisions = f"{last['num_updates']:,} gradient steps", f"{round(last['actors/env_steps'], -3):,} decisions"
+    assert f"{updates}, {decisions}, 48 minutes" in readme
+    assert f"{last['run/processor_s']:,.0f} seconds of processor time" in readme
     for split, episodes, title in (("train4", 20, "4 training tasks"), ("test", 50, "7 test tasks")):
         means = []
         for scenario in scenarios():
@@ -211,6 +218,19 @@ def test_every_run_has_all_episodes_of_its_evaluation(folder: str, split: TaskSe
         assert Counter(row["task"] for row in rows) == dict.fromkeys(wanted, num_episodes), file
 
 
+def test_the_page_of_the_gates_says_how_many_runs_are_missing():
+    folder = ROOT / "results" / "gates"
+    page = " ".join((folder / "README.md").read_text().split())
+    (command,) = re.findall("gvz experiment run (.*?) --results", page)
+    missing = {}
+    for gate in re.findall(r"gate_\w+", command):
+        there = [(folder / "runs" / run.id).exists() for run in experiments()[gate].runs()]
+        if not all(there):
+            missing[gate] = (f"{there.count(False)}", f"{len(there)}")
+    said = re.findall(r"(\d+) of the (\d+) (?:runs )?of `(gate_\w+)`", page)
+    assert {gate: (absent, runs) for absent, runs, gate in said} == missing
+
+
 def test_the_page_of_the_general_agents_says_what_their_records_give(tmp_path):
     folder = ROOT / "results" / "general_short"
     page, results = (folder / "README.md").read_text(), results_of("general_short")
@@ -262,6 +282,26 @@ def test_the_readme_says_how_fast_the_records_are():
     ) in readme
     assert row("actors", "") in readme
     assert row("actors_tuned", "; here with the tuned engine, others with their own") in readme
+
+
+def test_the_page_of_the_tuned_engine_says_what_its_records_give():
+    page = " ".join((ROOT / "docs" / "ENGINE.md").read_text().split())
+    equal, speed = (
+        json.loads((ROOT / "results" / "engine" / f"{name}.json").read_text()) for name in ("equality", "speed")
+    )
+    assert not equal["differing"]
+    assert f"**{equal['decisions']:,} decisions, and none differs**" in page
+    ends = equal["episode_ends"]
+    all_ends = f"{ends['inside']:,} of these {ends['deaths'] + ends['timeouts']:,} ends came within a decision."
+    assert f"{ends['deaths']} episodes ended with the player's death and {ends['timeouts']:,} with a time-out" in page
+    assert all_ends in page
+    for part, title in (("bare", "`make_action` and `get_state`"), ("environment", "`gvz.make`, all of it")):
+        for engine, called in (("stock", "released"), ("tuned", "tuned")):
+            rate, *us = (speed[part][engine][key] for key in ("decisions_per_core_s", "engine_us", "python_us"))
+            cells = " | ".join(f"{found['median']:g}" for found in us)
+            assert f"| {title} | {called} | {rate['median']:,.0f} | {cells} |" in page
+        gain = speed[part]["gain_decisions_per_core_s"]
+        assert f"**{gain['median']:.2f}** [{gain['min']:.2f}, {gain['max']:.2f}] times" in page
 
 
 def test_pages_say_what_a_gpu_gave():

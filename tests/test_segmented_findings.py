@@ -121,7 +121,7 @@ def test_the_findings_say_what_shifted_frames_gave():
         of_tasks.filter(agent=f"rainbow_segmented+{name}")["normalized_score"].mean()
         for name in ("moved_most", "shift", "vertical")
     )
-    assert f"[-3.9, -0.4] on the gate tasks and {plain - everywhere:.0f} on the training tasks. The thought" in WORDS
+    assert f"[-3.9, -0.4] on the gate tasks and {plain - everywhere:.0f} on the training tasks. The hypothesis" in WORDS
     assert f"the training tasks lose {plain - vertical:.0f} point, but the gate tasks lose no less" in WORDS
     (gate,) = [asked for asked in results_of("gates").asked if asked.experiment.name == "gate_shift"]
     gains = [row[2].text for row in comparison_table(results_of("gates"), gate).rows]

@@ -1,5 +1,6 @@
 """The policies that come with GViZDoom: small, playable, and their scores are those that the findings say."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -90,23 +91,16 @@ def test_the_findings_say_what_the_agent_with_shifted_frames_has(tmp_path, monke
     assert said in WORDS
 
 
-@pytest.mark.parametrize(
-    ("suffix", "said"),
-    [
-        ("", "have {}% of the bound on the 28 test tasks"),
-        ("_compositions", "for 45 minutes of one core each, and have {}%"),
-        ("_screen", "the screen alone and have {}%"),
-        ("_train4", "for 90 minutes of one core each, and have {}%"),
-    ],
-)
-def test_the_mean_over_scenarios_is_that_of_the_score_cards(suffix, said, tmp_path, monkeypatch):
+@pytest.mark.parametrize("suffix", ["", "_compositions", "_screen", "_train4"])
+def test_the_mean_over_scenarios_is_that_of_the_score_cards(suffix, tmp_path, monkeypatch):
     monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path))
     means = [
         np.mean(scores_of(read_rows(run_directory(Path(f"zoo:{name}{suffix}")) / "evaluation.jsonl"), name))
         for name in scenarios()
     ]
-    assert f"| P_norm: mean over scenarios | | {np.mean(means):.1f} [" in PAGE
-    assert said.format(f"{np.mean(means):.1f}") in " ".join((ROOT / "README.md").read_text().split())
+    (score,) = set(re.findall(rf"mean over scenarios \| \| ({np.mean(means):.1f} \[.*?\]) ", PAGE))
+    (row,) = re.findall(rf"^\| `zoo:SCENARIO{suffix}` .*", (ROOT / "README.md").read_text(), flags=re.MULTILINE)
+    assert row.endswith(f"| {score} |")
 
 
 @pytest.mark.parametrize(
