@@ -17,7 +17,7 @@ from gvz.reports.joint_section import joint_sections
 from gvz.reports.results import read_results
 from gvz.reports.scores import agent_scores, estimate
 from gvz.tasks import LEVELS, Task, TaskSet, named_tasks, scenarios
-from tests.score_tables import PAGE, ROOT, WORDS, metrics_of, results_of, rows_of
+from tests.score_tables import PAGE, ROOT, WORDS, metrics_of, results_of, rows_of, words_of
 
 
 def test_the_quick_runs_are_better_than_chance_on_the_same_episodes():
@@ -75,7 +75,7 @@ def test_the_quick_comparison_says_what_a_player_that_looks_at_nothing_has_on_th
 
     levels = [named_tasks(scenario, level=level) for level in LEVELS]
     train, test = (named_tasks(scenario, split=split) for split in ("train4", "test"))
-    readme, words = (folder / "README.md").read_text(), " ".join((folder / "README.md").read_text().split())
+    readme, words = (folder / "README.md").read_text(), words_of("results/quick_comparison/README.md")
     assert f"| sweep | {' | '.join(f'{mean(sweep, tasks):.1f}' for tasks in (*levels, test))} |" in readme
     assert f"On the four training tasks the sweep has {mean(sweep, train):.1f}." in words
     better = {}
@@ -144,7 +144,7 @@ def test_the_joint_run_says_what_its_records_give():
 
 def test_the_hour_of_the_main_job_says_what_its_records_give():
     folder = ROOT / "results" / "rainbow_4task"
-    page, guide = (" ".join(file.read_text().split()) for file in (folder / "README.md", ROOT / "docs/how-to/train.md"))
+    page, guide = words_of("results/rainbow_4task/README.md"), words_of("docs/how-to/train.md")
     last = metrics_of(folder / "seed_1111")[-1]
     updates, decisions = f"{last['num_updates']:,} gradient steps", f"{round(last['actors/env_steps'], -3):,} decisions"
     assert f"{updates}, {decisions} and {last['run/processor_s']:,.0f} seconds of processor time" in page
@@ -270,7 +270,7 @@ def test_pages_say_what_a_gpu_gave():
     cores, device = (rows[f"the run, actors.inference {where}"] for where in ("actors", "device"))
     alone = [row["updates_per_s"]["median"] for name, row in rows.items() if name.startswith("learner, ")]
     updates = [run["updates_per_s"]["median"] for run in (cores, device)]
-    guide = " ".join((ROOT / "docs" / "how-to" / "train.md").read_text().split())
+    guide = words_of("docs/how-to/train.md")
     assert f"`rainbow_4task` makes {updates[0]:.0f} gradient steps a second" in guide
     assert f"chooses the actions, too, and it makes {updates[1]:.0f} ([measured]" in guide
     assert f"The learner alone makes up to {float(f'{max(alone):.3g}'):,.0f}." in guide
@@ -283,7 +283,7 @@ def test_pages_say_what_a_gpu_gave():
         )
         in guide
     )
-    readme = " ".join((ROOT / "README.md").read_text().split())
+    readme = words_of("README.md")
     decisions = [round(run["decisions_per_s"]["median"], -1) for run in (cores, device)]
     assert (
         f"makes {updates[0]:.0f} gradient steps and plays {decisions[0]:,.0f} decisions a second, with "
@@ -295,7 +295,7 @@ def test_pages_say_what_a_gpu_gave():
     )
     acting, learning = sum(act), sum(train_step)
     assert f"it was {acting + learning:.0f} of 180 seconds" in guide
-    page = " ".join((ROOT / "results" / "general_gpu" / "README.md").read_text().split())
+    page = words_of("results/general_gpu/README.md")
     assert f"for five batch sizes ({acting:.0f} s), then the gradient step ({learning:.0f} s)" in page
     assert (len(act), len(train_step)) == (5, 1)
 
