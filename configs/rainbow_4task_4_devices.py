@@ -1,7 +1,7 @@
 """`rainbow_4task` on four devices: the batch, and the decisions for a gradient step, are four times as large.
 
 So a decision is learnt from as often as with one device, and every number of gradient steps is a quarter. The learning
-rate grows with the square root of the batch, as is usual with Adam. Not measured: none of us has four devices.
+rate grows with the square root of the batch, as is usual with Adam. Not measured.
 """
 
 from gvz.run.config import CheckpointConfig, LogConfig, RunConfig

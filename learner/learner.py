@@ -1,7 +1,7 @@
 """What a learner is to the training loop: step records in, gradient steps, parameters out.
 
 The loop in gvz/run/train.py knows these protocols alone. How records are kept and drawn (a replay, rollouts), and on
-which device, is the learner's own matter. `learner.off_policy` learns from a replay.
+which device, is the learner's own matter. `learner.off_policy` learns from a replay, `learner.on_policy` from rollouts.
 """
 
 from collections.abc import Sequence

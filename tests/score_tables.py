@@ -1,8 +1,8 @@
-"""The text of the findings, the records that it is of, and the columns that its tables have for an agent."""
+"""The text of the findings, the records that it is of, and how it states scores, gains and numbers of steps."""
 
 import gzip
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -10,15 +10,22 @@ from typing import Any
 import numpy as np
 import polars
 
-from gvz.evaluation.statistics import mean_over_scenarios
+from gvz.evaluation.statistics import difference, mean_over_scenarios
 from gvz.reports.results import Results, read_results
-from gvz.reports.scores import Scores, estimate, estimate_groups
-from gvz.tasks import TaskSet, named_tasks
+from gvz.reports.scores import Scores, agent_scores, estimate, estimate_groups
+from gvz.tasks import TaskSet, named_tasks, scenario_named
 
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "FINDINGS.md").read_text()
-WORDS = " ".join(PAGE.split())
-"""the page with one space between words"""
+SUMMARY = PAGE.partition("## In short")[2].partition("\n## ")[0]
+
+
+def words_of(page: str) -> str:
+    """A page of the repository with one space between words."""
+    return " ".join((ROOT / page).read_text().split())
+
+
+WORDS = words_of("docs/FINDINGS.md")
 
 
 @cache
@@ -29,6 +36,27 @@ def results_of(folder: str) -> Results:
 def rows_of(file: Path) -> list[dict[str, Any]]:
     """The rows of a compressed record file."""
     return [json.loads(line) for line in gzip.decompress(file.read_bytes()).splitlines()]
+
+
+def scores_of(folder: str, agent: str, scenario: str) -> Scores:
+    """What the records in a folder of results/ give an agent in a scenario."""
+    return agent_scores(results_of(folder).episodes.filter(scenario=scenario), agent)
+
+
+def mean_score(episodes: polars.DataFrame, **chosen: Any) -> str:
+    """The mean percentage of these episodes, rounded."""
+    return f"{episodes.filter(**chosen)['normalized_score'].mean():.0f}"
+
+
+def gain(ours: Scores, theirs: Scores, tasks: Collection[str]) -> str:
+    """The difference of the means on these tasks, with its interval."""
+    return estimate_groups([(ours, tasks), (theirs, tasks)], difference).text
+
+
+def last_updates(runs: str) -> list[int]:
+    """Gradient steps of all runs whose directories under results/ fit the pattern, the fewest first."""
+    files = (ROOT / "results").glob(f"{runs}/metrics.jsonl.gz")
+    return sorted(rows_of(file)[-1]["num_updates"] for file in files)
 
 
 def task_sets(scenario: str, training: TaskSet = "train8") -> list[list[str]]:
@@ -45,6 +73,11 @@ def task_sets(scenario: str, training: TaskSet = "train8") -> list[list[str]]:
 def score_cells(scores: Scores, scenario: str, training: TaskSet = "train8") -> str:
     """Mean score and interval on each of `task_sets`, as cells of a Markdown table."""
     return " | ".join(estimate(scores, tasks).text for tasks in task_sets(scenario, training))
+
+
+def score_row(scenario: str, called: str, scores: Scores, training: TaskSet = "train8") -> str:
+    """The row of a Markdown table that begins with the scenario's title and what the agent is called there."""
+    return f"| {scenario_named(scenario).title} | {called} | {score_cells(scores, scenario, training)} |"
 
 
 def means(of_agents: Mapping[str, Scores], training: TaskSet = "train8") -> list[str]:

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gvz.reports.scores import Scores, agent_scores, estimate
+from gvz.reports.scores import Scores, estimate
 from gvz.tasks import TaskSet, scenario_named
-from tests.score_tables import PAGE, ROOT, WORDS, in_words, metrics_of, results_of, task_sets
+from tests.score_tables import PAGE, SUMMARY, WORDS, in_words, last_updates, scores_of, task_sets
 
 RUNS: dict[str, tuple[str, str, TaskSet]] = {
     "Rainbow": ("general_train4", "rainbow_segmented+train4_network", "train4"),
@@ -21,8 +21,7 @@ LAST = "+last_parameters"
 def pair(agent: str, scenario: str) -> tuple[Scores, Scores]:
     """Scores of the same runs with averaged parameters and with the last ones, on the same episodes."""
     folder, name, training = RUNS[agent]
-    averaged = agent_scores(results_of(folder).episodes.filter(scenario=scenario), name)
-    last = agent_scores(results_of("last_parameters").episodes.filter(scenario=scenario), name + LAST)
+    averaged, last = scores_of(folder, name, scenario), scores_of("last_parameters", name + LAST, scenario)
     assert averaged.runs.keys() == last.runs.keys()
     for tasks in task_sets(scenario, training)[:2]:
         for seed in last.runs:
@@ -53,9 +52,8 @@ def gain_of_average(agent: str, scenario: str) -> tuple[str, list[str]]:
 
 def test_the_findings_say_how_many_gradient_steps_the_runs_had():
     for folder, name, training in RUNS.values():
-        runs = [ROOT / "results" / folder / "runs" / name / scenario / training for scenario in SCENARIOS]
-        steps = sorted(metrics_of(run)[-1]["num_updates"] for of_scenario in runs for run in of_scenario.iterdir())
-        assert f": {steps[0]:,} to {steps[-1]:,} gradient steps, " in WORDS
+        steps = [n for one in SCENARIOS for n in last_updates(f"{folder}/runs/{name}/{one}/{training}/*")]
+        assert f": {min(steps):,} to {max(steps):,} gradient steps, " in WORDS
 
 
 def test_the_findings_say_what_ppo_loses_on_the_training_tasks():
@@ -73,6 +71,5 @@ def test_the_findings_say_what_each_run_gains(agent: str):
 
 
 def test_the_summary_says_what_averaged_parameters_give():
-    summary = PAGE.partition("## In short")[2].partition("\n## ")[0]
     gains = " | | | ".join(gain_of_average("Rainbow", scenario)[0] for scenario in SCENARIOS)
-    assert f"in evaluation, beside segmented frames and four tasks | {gains} | yes |" in summary
+    assert f"in evaluation, beside segmented frames and four tasks | {gains} | yes |" in SUMMARY

@@ -7,34 +7,44 @@ import numpy as np
 import polars as pl
 
 from gvz.evaluation.episode_log import read_rows
-from gvz.evaluation.statistics import difference
 from gvz.evaluation.zoo import run_directory
-from gvz.reports.scores import agent_scores, estimate, estimate_groups
-from gvz.tasks import Task, named_tasks, parse_task, scenario_named, scenarios
-from tests.score_tables import ROOT, WORDS, in_words, means, of_first_seed, results_of, rows_of, score_cells, task_sets
+from gvz.reports.scores import agent_scores, estimate
+from gvz.tasks import Task, named_tasks, parse_task, scenarios
+from tests.score_tables import (
+    ROOT,
+    WORDS,
+    gain,
+    in_words,
+    last_updates,
+    means,
+    of_first_seed,
+    results_of,
+    rows_of,
+    score_row,
+    scores_of,
+    task_sets,
+    words_of,
+)
+
+AGENT = "rainbow_segmented"
 
 
 def test_the_findings_say_what_compositions_of_attributes_gave():
     folders = {"8 tasks": "general_short", "compositions": "general_compositions"}
     scores = {
-        (name, called): agent_scores(results_of(folder).episodes.filter(scenario=name), "rainbow_segmented")
-        for name in scenarios()
-        for called, folder in folders.items()
+        (name, called): scores_of(folder, AGENT, name) for name in scenarios() for called, folder in folders.items()
     }
     for (name, called), of_agent in scores.items():
-        assert f"| {scenario_named(name).title} | {called} | {score_cells(of_agent, name)} |" in WORDS
+        assert score_row(name, called, of_agent) in WORDS
     for called in folders:
         *cells, on_level_4 = means({name: scores[name, called] for name in scenarios()})
         assert f"| mean | {called} | {' | '.join(cells)} | {on_level_4} |" in WORDS
     assert f"has {on_level_4} there after the same time" in WORDS
 
-    def gains(column: int) -> list[str]:
-        pairs = [
-            [(scores[name, called], task_sets(name)[column]) for called in reversed(folders)] for name in scenarios()
-        ]
-        return [estimate_groups(pair, difference).text for pair in pairs]
-
-    gate, hardest = gains(1), gains(3)
+    gate, hardest = (
+        [gain(scores[one, "compositions"], scores[one, "8 tasks"], task_sets(one)[column]) for one in scenarios()]
+        for column in (1, 3)
+    )
     where = "no; level 4 gains with time: `--training-set compositions`"
     assert f"as tasks, too, beside segmented frames | {' | '.join(gate)} | {where} |" in WORDS
     assert f"level 4 gains {hardest[0]} points**, though the run" in WORDS
@@ -53,13 +63,12 @@ def test_the_findings_say_what_compositions_gave_with_more_time():
         ("8 tasks", "5,400 s", "general"),
     )
     of_seed = {
-        (name, row): agent_scores(of_first_seed(results_of(row[2]).episodes).filter(scenario=name), "rainbow_segmented")
+        (name, row): agent_scores(of_first_seed(results_of(row[2]).episodes).filter(scenario=name), AGENT)
         for name in scenarios()
         for row in rows
     }
     for (name, (called, seconds, _)), of_agent in of_seed.items():
-        cells = score_cells(of_agent, name)
-        assert f"| {scenario_named(name).title} | {called} | {seconds} | {cells} |" in WORDS
+        assert score_row(name, f"{called} | {seconds}", of_agent) in WORDS
     for row in rows:
         *cells, on_level_4 = means({name: of_seed[name, row] for name in scenarios()})
         assert f"| mean | {row[0]} | {row[1]} | {' | '.join(cells)} | {on_level_4} |" in WORDS
@@ -77,20 +86,14 @@ def test_the_findings_say_what_compositions_gave_with_more_time():
 
 
 def test_the_findings_say_what_three_seeds_of_compositions_have_beside_eight_tasks_with_twice_the_time():
-    episodes = [results_of(folder).episodes for folder in ("general_compositions_long", "general")]
-
-    def gains(column: int) -> list[str]:
-        found = []
-        for name in scenarios():
-            both = [agent_scores(rows.filter(scenario=name), "rainbow_segmented") for rows in episodes]
-            assert {len(scores.runs) for scores in both} == {3}
-            found.append(estimate_groups([(scores, task_sets(name)[column]) for scores in both], difference).text)
-        return found
-
-    trained, gate, test, hardest = map(gains, range(4))
-    assert (
-        f"with half the time**: by {in_words(test)} points. On level 4 they are better by {in_words(hardest)}." in WORDS
-    )
+    gains: list[list[str]] = []
+    for name in scenarios():
+        both = [scores_of(folder, AGENT, name) for folder in ("general_compositions_long", "general")]
+        assert {len(scores.runs) for scores in both} == {3}
+        gains.append([gain(*both, tasks) for tasks in task_sets(name)])
+    trained, gate, test, hardest = map(list, zip(*gains, strict=True))
+    on_level_4 = f"On level 4 they are better by {in_words(hardest)}."
+    assert f"with half the time**: by {in_words(test)} points. {on_level_4}" in WORDS
     assert f"no difference is shown**: {in_words(trained)} points. On the gate tasks the" in WORDS
     assert f"the differences are {in_words(gate)}." in WORDS
     assert f"not eight tasks for 5,400 s | {' | '.join(gate)} |" in WORDS
@@ -102,22 +105,18 @@ def test_the_findings_say_what_further_seeds_of_compositions_gave_with_more_time
     runs = further.select("scenario", "run_seed").unique().rows()
     assert WORDS.count("| 2222 |") + WORDS.count("| 3333 |") == len(runs) > 0
     for name, seed in runs:
-        of_agent = agent_scores(further.filter(scenario=name, run_seed=seed), "rainbow_segmented")
-        assert f"| {scenario_named(name).title} | {seed} | {score_cells(of_agent, name)} |" in WORDS
-    *_, on_test, on_level_4 = means(
-        {name: agent_scores(episodes.filter(scenario=name), "rainbow_segmented") for name in scenarios()}
-    )
+        of_agent = agent_scores(further.filter(scenario=name, run_seed=seed), AGENT)
+        assert score_row(name, str(seed), of_agent) in WORDS
+    *_, on_test, on_level_4 = means({name: scores_of("general_compositions_long", AGENT, name) for name in scenarios()})
     assert f"With all seeds the mean is {on_level_4} on level 4 and {on_test} on the test tasks." in WORDS
     assert episodes.select("scenario", "run_seed").unique().height == 3 * len(scenarios())
     assert f"and {on_level_4} after three times the time, with three seeds." in WORDS
     percent, interval = on_test.split(" ", 1)
-    readme = " ".join((ROOT / "README.md").read_text().split())
-    assert f"for 45 minutes, such agents have {percent}% {interval} (three seeds). " in readme
-    guide = " ".join((ROOT / "docs" / "how-to" / "train.md").read_text().split())
+    assert f"for 45 minutes, such agents have {percent}% {interval} (three seeds). " in words_of("README.md")
+    guide = words_of("docs/how-to/train.md")
     assert f"Such agents have {percent}% of the bound on the 28 test tasks." in guide
     for folder, words in (("general_short", "after 15 minutes"), ("general", "after 90.")):
-        rows = results_of(folder).episodes
-        eight = {name: agent_scores(rows.filter(scenario=name), "rainbow_segmented") for name in scenarios()}
+        eight = {name: scores_of(folder, AGENT, name) for name in scenarios()}
         assert re.search(rf"\[{means(eight)[2].split()[0]}%\]\([^)]*\) {words}", guide)
 
 
@@ -133,16 +132,13 @@ def test_the_pages_say_how_near_the_test_tasks_are_to_compositions():
     parts = [task.id for task in test if any(set(task.attributes) < one for one in sets[task.scenario.id])]
     assert f"attributes of {len(parts)} of the {len(test)} test tasks stand together in one of them" in WORDS
     assert f"and {sum(map(near, test))} of the {len(test)} become one if one" in WORDS
-    benchmark, readme = (" ".join((ROOT / page).read_text().split()) for page in ("docs/BENCHMARK.md", "README.md"))
-    assert (
-        f"attributes of {len(parts)} of the {len(test)} test tasks stand together in one of them, and "
-        f"{sum(map(near, test))} become one"
-    ) in benchmark
-    assert f"attributes of {len(parts)} of the {len(test)} test tasks stand together in one of these" in readme
+    near_ones = f"attributes of {len(parts)} of the {len(test)} test tasks stand together in one of"
+    assert f"{near_ones} them, and {sum(map(near, test))} become one" in words_of("docs/BENCHMARK.md")
+    assert f"{near_ones} these" in words_of("README.md")
 
     def scores(folder: str) -> list[str]:
         """On these tasks, and on the others."""
-        mine = results_of(folder).episodes.filter(agent="rainbow_segmented").filter(pl.col("task").is_in([*ids]))
+        mine = results_of(folder).episodes.filter(agent=AGENT).filter(pl.col("task").is_in([*ids]))
         return [f"{part['normalized_score'].mean():.1f}" for part in (mine.filter(is_part), mine.filter(~is_part))]
 
     ids, is_part = [task.id for task in test], pl.col("task").is_in(parts)
@@ -152,29 +148,18 @@ def test_the_pages_say_how_near_the_test_tasks_are_to_compositions():
 
 
 def test_the_findings_say_how_long_agents_of_compositions_learned():
-
-    def last_steps(folder: str, *runs: str) -> list[int]:
-        root = ROOT / "results" / folder / "runs" / "rainbow_segmented"
-        files = [file for run in runs for file in root.glob(f"{run}/metrics.jsonl.gz")]
-        rows = [rows_of(file)[-1] for file in files]
-        return sorted(row["num_updates"] for row in rows)
-
     for folder, runs, words in (
-        (
-            "general",
-            ("*/*/seed_1111",),
-            "{:,} to {:,} gradient steps. The training seed is 1111. Intervals",
-        ),
-        ("general_compositions", ("*/*/*",), "{:,} to {:,} gradient steps (eight tasks:"),
-        ("general_short", ("*/train8/*",), "gradient steps (eight tasks: {:,} to {:,})"),
+        ("general", "*/*/seed_1111", "{:,} to {:,} gradient steps. The training seed is 1111. Intervals"),
+        ("general_compositions", "*/*/*", "{:,} to {:,} gradient steps (eight tasks:"),
+        ("general_short", "*/train8/*", "gradient steps (eight tasks: {:,} to {:,})"),
         (
             "general_compositions_long",
-            ("*/*/seed_1111",),
+            "*/*/seed_1111",
             "{:,} to {:,} gradient steps ([records](../results/general_compositions_long",
         ),
-        ("general_compositions_long", ("*/*/seed_[23]*",), "2,700 seconds, with {:,} to {:,} gradient steps:"),
+        ("general_compositions_long", "*/*/seed_[23]*", "2,700 seconds, with {:,} to {:,} gradient steps:"),
     ):
-        steps = last_steps(folder, *runs)
+        steps = last_updates(f"{folder}/runs/{AGENT}/{runs}")
         assert words.format(steps[0], steps[-1]) in WORDS
 
 

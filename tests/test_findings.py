@@ -7,21 +7,26 @@ import re
 import numpy as np
 import pytest
 
-from gvz.evaluation.statistics import difference
 from gvz.reports.experiment_section import comparison_table, result_table
 from gvz.reports.results import read_results
-from gvz.reports.scores import agent_scores, estimate, estimate_groups
+from gvz.reports.scores import agent_scores, estimate
 from gvz.tasks import named_tasks, scenario_named, scenarios
 from tests.score_tables import (
     PAGE,
     ROOT,
+    SUMMARY,
     WORDS,
+    gain,
+    last_updates,
+    mean_score,
     metrics_of,
     results_of,
     rows_of,
     score_cells,
+    scores_of,
     task_sets,
     training_episodes,
+    words_of,
 )
 from tests.test_average_findings import RUNS, SCENARIOS, gain_of_average
 
@@ -41,10 +46,8 @@ def test_the_findings_compare_the_general_agents_as_their_records_do(words, othe
     assert len(names) > 1
     agents = {"rainbow_general (8 tasks)": words, other: words_of_other}
     for name, (agent, called) in itertools.product(names, agents.items()):
-        scores = agent_scores(episodes.filter(scenario=name), agent)
-        sets = [[task.id for task in named_tasks(name, split=split)] for split in ("train8", "gate", "test")]
-        cells = " | ".join(estimate(scores, tasks).text for tasks in sets)
-        assert f"| {scenario_named(name).title} | {called} | {cells} |" in PAGE
+        cells = score_cells(scores_of("general_short", agent, name), name).split(" | ")[:3]  # level 4 is not shown
+        assert f"| {scenario_named(name).title} | {called} | {' | '.join(cells)} |" in PAGE
 
 
 def test_the_findings_say_what_anyone_reaches_on_level_4():
@@ -111,24 +114,21 @@ def test_the_findings_say_how_training_went_with_more_gradient_steps_beside_segm
 
 
 def test_the_findings_say_what_seven_minutes_of_a_gpu_gave():
-    folder, short = ROOT / "results" / "general_gpu", results_of("general_short").episodes
-    episodes = {
-        "rainbow_general (8 tasks)": ("`rainbow_general`, 2 cores", short),
-        "rainbow_general_gpu": ("`rainbow_general_gpu`, 16 cores and a GPU", results_of("general_gpu").episodes),
-        "rainbow_segmented": ("`rainbow_segmented`, 2 cores", short),
+    agents = {
+        "rainbow_general (8 tasks)": ("`rainbow_general`, 2 cores", "general_short"),
+        "rainbow_general_gpu": ("`rainbow_general_gpu`, 16 cores and a GPU", "general_gpu"),
+        "rainbow_segmented": ("`rainbow_segmented`, 2 cores", "general_short"),
     }
     name = "seek_and_kill"
     shadows = {}
-    for agent, (called, found) in episodes.items():
-        scores = agent_scores(found.filter(scenario=name), agent)
-        assert f"| {called} | {score_cells(scores, name)} |" in WORDS
-        rows = found.filter(agent=agent, task=f"{name}/blue+shadows")["normalized_score"]
-        shadows[agent] = f"{rows.mean():.0f}"
+    for agent, (called, folder) in agents.items():
+        assert f"| {called} | {score_cells(scores_of(folder, agent, name), name)} |" in WORDS
+        shadows[agent] = mean_score(results_of(folder).episodes, agent=agent, task=f"{name}/blue+shadows")
     said = f"`blue+shadows` has {shadows['rainbow_general_gpu']} (segmented frames: {shadows['rainbow_segmented']})."
     assert said in WORDS
-    (file,) = folder.glob("runs/**/metrics.jsonl.gz")
+    (file,) = (ROOT / "results" / "general_gpu").glob("runs/**/metrics.jsonl.gz")
     rows = rows_of(file)
-    readme, last = " ".join((folder / "README.md").read_text().split()), rows[-1]
+    readme, last = words_of("results/general_gpu/README.md"), rows[-1]
     counts = f"{last['num_updates']:,} gradient steps", f"{last['actors/env_steps']:,} decisions"
     assert f"{counts[0]}, {counts[1]}, training seed 1111" in readme
     assert f"{counts[0]} and {counts[1]}; one seed" in WORDS
@@ -144,12 +144,10 @@ def test_the_findings_say_what_seven_minutes_of_a_gpu_gave():
 
 
 def test_the_findings_say_what_the_first_loss_of_sight_gave():
-    episodes = results_of("gates").episodes
     agents = {"rainbow_general+plain": "none", "rainbow_general+sight_loss": "first form"}
     for name, (agent, called) in itertools.product(("defend_the_center", "seek_and_kill"), agents.items()):
-        scores = agent_scores(episodes.filter(scenario=name), agent)
-        sets = [[task.id for task in named_tasks(name, split=split)] for split in ("train8", "gate")]
-        cells = " | ".join(estimate(scores, tasks).text for tasks in sets)
+        scores = scores_of("gates", agent, name)
+        cells = " | ".join(estimate(scores, tasks).text for tasks in task_sets(name)[:2])
         (line,) = [
             line for line in PAGE.splitlines() if line.startswith(f"| {scenario_named(name).title} | {called} |")
         ]
@@ -175,14 +173,14 @@ def test_the_findings_say_what_the_gates_records_give():
         _, _, *cells = result_table(results, augmented, trained=trained).rows[1]
         assert [cell.text for cell in cells[:1]] == ["-"], "its run is that of general_sight_loss"
         assert f" | {' | '.join(cell.text for cell in cells[1:])} |" in PAGE
-    for _, compared, gain, _ in comparison_table(results, world).rows[:2]:
-        value, _, interval = gain.text.partition(" ")
+    for _, compared, more, _ in comparison_table(results, world).rows[:2]:
+        value, _, interval = more.text.partition(" ")
         assert compared.text == "8 tasks against 4 tasks"
         assert value in PAGE
         assert interval in PAGE
     pooled = {row[0].text: row[2].text for row in comparison_table(results, sight).rows[:3]}
     assert list(pooled) == ["Dodge Projectiles", "Health Gathering", "Defend the Center"]
-    assert all(gain in PAGE for gain in pooled.values())
+    assert all(more in PAGE for more in pooled.values())
 
 
 def test_the_findings_say_how_training_went_on_in_the_gates_of_the_replay_and_the_horizon():
@@ -217,34 +215,25 @@ def test_the_findings_say_how_training_went_on_in_the_gates_of_the_replay_and_th
 
 
 def test_the_summary_of_the_findings_has_the_gains_of_the_gates():
-    summary = PAGE.partition("## In short")[2].partition("\n## ")[0]
-    named = set(re.findall(r"-?\d+\.\d \[-?\d+\.\d, -?\d+\.\d\]", summary))
-    results, episodes = results_of("gates"), results_of("general_short").episodes
-    folders = ("general_compositions", "general_compositions_long", "general_train4", "general")
-    composed, composed_long, four, long = (results_of(folder).episodes for folder in folders)
+    named = set(re.findall(r"-?\d+\.\d \[-?\d+\.\d, -?\d+\.\d\]", SUMMARY))
+    results = results_of("gates")
+    folders = ("general_short", "general", "general_compositions", "general_compositions_long")
     gains = {row[2].text for gate in results.asked for row in comparison_table(results, gate).rows}
     of_segmented, of_training_sets = [], set[str]()
     for name in scenarios():
-        tasks, mine = [task.id for task in named_tasks(name, split="gate")], episodes.filter(scenario=name)
-        agents = [agent_scores(mine, agent) for agent in ("rainbow_segmented", "rainbow_general (8 tasks)")]
-        of_segmented.append(estimate_groups([(scores, tasks) for scores in agents], difference).text)
-        others, others_longer = (
-            agent_scores(rows.filter(scenario=name), "rainbow_segmented") for rows in (composed, composed_long)
-        )
-        fewer = agent_scores(four.filter(scenario=name), "rainbow_segmented+train4_network")
-        longer = agent_scores(long.filter(scenario=name), "rainbow_segmented")
-        for pair in ((others, agents[0]), (agents[0], fewer), (longer, agents[0]), (others_longer, longer)):
-            of_training_sets.add(estimate_groups([(scores, tasks) for scores in pair], difference).text)
-    tasks, mine = (
-        [task.id for task in named_tasks("seek_and_kill", split="gate")],
-        episodes.filter(scenario="seek_and_kill"),
-    )
-    agents = [agent_scores(mine, agent) for agent in ("rainbow_segmented+longer_network", "rainbow_segmented")]
-    of_network = estimate_groups([(scores, tasks) for scores in agents], difference).text
+        gate_tasks = task_sets(name)[1]
+        short, long, composed, composed_long = (scores_of(folder, "rainbow_segmented", name) for folder in folders)
+        of_segmented.append(gain(short, scores_of("general_short", "rainbow_general (8 tasks)", name), gate_tasks))
+        four = scores_of("general_train4", "rainbow_segmented+train4_network", name)
+        for pair in ((composed, short), (short, four), (long, short), (composed_long, long)):
+            of_training_sets.add(gain(*pair, gate_tasks))
+    agents = ("rainbow_segmented+longer_network", "rainbow_segmented")
+    both = [scores_of("general_short", agent, "seek_and_kill") for agent in agents]
+    of_network = gain(*both, task_sets("seek_and_kill")[1])
     assert len(named) > 10
     of_average = {gain_of_average(agent, name)[0] for agent in RUNS for name in SCENARIOS}
     assert named <= gains | {*of_segmented, of_network} | of_training_sets | of_average
-    assert f"game variables | {' | '.join(of_segmented)} | in `rainbow_segmented` |" in summary
+    assert f"game variables | {' | '.join(of_segmented)} | in `rainbow_segmented` |" in SUMMARY
 
 
 def test_the_findings_say_how_far_apart_two_seeds_of_one_agent_lie():
@@ -301,10 +290,8 @@ def test_the_findings_say_what_pairs_of_attributes_gave():
     agents = [f"rainbow_general ({words})" for words in ("8 tasks and pairs", "8 tasks")]
     gains = []
     for name in names:
-        both = [agent_scores(episodes.filter(scenario=name), agent) for agent in agents]
-        gains.append(
-            [estimate_groups([(scores, tasks) for scores in both], difference).text for tasks in task_sets(name)]
-        )
+        both = [scores_of("general_short", agent, name) for agent in agents]
+        gains.append([gain(*both, tasks) for tasks in task_sets(name)])
     (_, gate, test, _), (trained, gate_of_other, test_of_other, _) = gains
     assert f"the gate tasks lose, and the test tasks gain**: {gate} and {test} points." in WORDS
     assert f"is shown**: {gate_of_other} points on the gate tasks and {test_of_other} on the test tasks." in WORDS
@@ -316,7 +303,7 @@ def test_the_findings_say_what_pairs_of_attributes_gave():
         "seek_and_kill/mixed_enemies+red",
     )
     for task in tasks:
-        found = [f"{episodes.filter(agent=agent, task=task)['normalized_score'].mean():.0f}" for agent in agents]
+        found = [mean_score(episodes, agent=agent, task=task) for agent in agents]
         called = re.escape(task.partition("/")[2])
         assert re.search(f"`{called}` (has )?{' instead of '.join(found)}", WORDS)
     runs = ROOT / "results" / "general_short" / "runs" / "rainbow_general"
@@ -330,7 +317,7 @@ def test_the_findings_say_what_classes_and_the_screen_have_on_single_tasks():
 
     def scores(task: str) -> list[str]:
         """With classes and with the screen."""
-        return [f"{episodes.filter(agent=agent, task=task)['normalized_score'].mean():.0f}" for agent in agents]
+        return [mean_score(episodes, agent=agent, task=task) for agent in agents]
 
     shaded, sized, poison = (
         scores(f"health_gathering/{task}")
@@ -350,11 +337,10 @@ def test_the_findings_say_how_many_games_ran_at_once():
         return {len({row["lane"] for row in episodes if "lane" in row}) for episodes in rows}
 
     assert games("general_short/runs/rainbow_segmented/*/train8") == {16}
-    files = (ROOT / "results").glob("general_short/runs/rainbow_segmented/*/train8/*/metrics.jsonl.gz")
-    steps = [rows_of(file)[-1]["num_updates"] for file in files]
+    steps = last_updates("general_short/runs/rainbow_segmented/*/train8/*")
     assert len(steps) == 12
-    assert f"({min(steps):,} to {max(steps):,} gradient steps, 16 games at once)" in WORDS
-    assert f"(eight tasks: {min(steps):,} to {max(steps):,}, with 16 games)" in WORDS
+    assert f"({steps[0]:,} to {steps[-1]:,} gradient steps, 16 games at once)" in WORDS
+    assert f"(eight tasks: {steps[0]:,} to {steps[-1]:,}, with 16 games)" in WORDS
     assert games("general_short/runs/rainbow_general+sight_loss") == {8}
     assert "with a weight of 0.1. One seed with 8 games at once" in WORDS
     readme = (ROOT / "results" / "general" / "README.md").read_text()

@@ -4,7 +4,7 @@ from PIL import Image
 
 from gvz.tasks import LEVELS, named_tasks
 from tests.level_scores import PICTURE, PLAYERS, level_row, parts_row
-from tests.score_tables import PAGE, ROOT, WORDS
+from tests.score_tables import PAGE, WORDS, words_of
 
 
 def test_the_findings_say_and_show_what_players_have_by_level():
@@ -18,8 +18,7 @@ def test_the_findings_say_what_players_have_on_parts_of_the_levels():
     rows = [parts_row(player) for player in PLAYERS]
     assert "\n".join(rows) in PAGE
     own = [row.split(" | ")[-1].split()[0] for row in (rows[1], rows[-1])]
-    readme = " ".join((ROOT / "README.md").read_text().split())
-    assert "with own kills alone, the two means are {}% and {}%.".format(*own) in readme
+    assert "with own kills alone, the two means are {}% and {}%.".format(*own) in words_of("README.md")
 
 
 def test_the_findings_say_which_levels_have_tasks_of_training_and_of_gates():

@@ -6,17 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gvz.evaluation.statistics import difference
-from gvz.reports.scores import agent_scores, estimate_groups
+from gvz.reports.scores import Scores
 from gvz.tasks import scenario_named, scenarios
 from tests.score_tables import (
     PAGE,
     ROOT,
+    SUMMARY,
     WORDS,
+    gain,
     means,
     metrics_of,
-    results_of,
-    score_cells,
+    score_row,
+    scores_of,
     task_sets,
     training_episodes,
 )
@@ -35,37 +36,34 @@ def runs_of(agent: str, scenario: str) -> list[Path]:
 
 def gains(scenario: str) -> list[str]:
     """What PPO has less what Rainbow has, on each of `task_sets`."""
-    rainbow, ppo = scores_of(scenario)
-    return [estimate_groups([(s, tasks) for s in (ppo, rainbow)], difference).text for tasks in task_sets(scenario)]
+    rainbow, ppo = both(scenario)
+    return [gain(ppo, rainbow, tasks) for tasks in task_sets(scenario)]
 
 
-def scores_of(scenario: str):
-    return [
-        agent_scores(results_of(folder).episodes.filter(scenario=scenario), agent)
-        for folder, agent in (("general", "rainbow_segmented"), ("general_on_policy", "ppo_segmented"))
-    ]
+def both(scenario: str) -> tuple[Scores, Scores]:
+    """Rainbow's scores and PPO's."""
+    return scores_of("general", "rainbow_segmented", scenario), scores_of(FOLDER.name, "ppo_segmented", scenario)
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_the_findings_say_what_ppo_has_beside_segmented_frames(scenario):
     title = scenario_named(scenario).title
-    rainbow, ppo = scores_of(scenario)
-    assert f"| {title} | Rainbow, {SEEDS[len(rainbow.runs)]} | {score_cells(rainbow, scenario)} |" in PAGE
-    assert f"| {title} | PPO, one seed | {score_cells(ppo, scenario)} |" in PAGE
+    rainbow, ppo = both(scenario)
+    assert score_row(scenario, f"Rainbow, {SEEDS[len(rainbow.runs)]}", rainbow) in PAGE
+    assert score_row(scenario, "PPO, one seed", ppo) in PAGE
     assert f"| {title} | PPO minus Rainbow | {' | '.join(gains(scenario))} |" in PAGE
 
 
 def test_the_findings_say_what_ppo_has_in_the_mean_of_the_scenarios():
-    rainbow, ppo = (means({name: scores_of(name)[agent] for name in scenarios()}) for agent in (0, 1))
+    rainbow, ppo = (means({name: both(name)[agent] for name in scenarios()}) for agent in (0, 1))
     assert f"| mean | Rainbow, three seeds | {' | '.join(rainbow)} |" in PAGE
     assert f"| mean | PPO, one seed | {' | '.join(ppo)} |" in PAGE
     assert f"On level 4 it has {ppo[3]}, Rainbow {rainbow[3]}." in WORDS
 
 
 def test_the_summary_says_what_ppo_gives_on_the_gate_tasks():
-    summary = PAGE.partition("## In short")[2].partition("\n## ")[0]
     cells = " | ".join(gains(name)[1].split()[0] for name in SCENARIOS)
-    assert f"not Rainbow, beside segmented frames | {cells} | no |" in summary
+    assert f"not Rainbow, beside segmented frames | {cells} | no |" in SUMMARY
 
 
 def test_the_findings_say_how_many_gradient_steps_and_decisions_ppo_had():
@@ -103,7 +101,7 @@ def test_the_findings_say_how_ppo_learned_beside_segmented_frames(scenario):
 )
 def test_the_findings_say_where_ppo_is_better_or_worse_than_rainbow(task, said):
     scenario, _, name = task.partition("/")
-    had, has = (np.mean([by_task[task].mean() for by_task in scores.runs.values()]) for scores in scores_of(scenario))
+    had, has = (np.mean([by_task[task].mean() for by_task in scores.runs.values()]) for scores in both(scenario))
     assert said.format(name, has, had) in WORDS
 
 
@@ -115,11 +113,9 @@ def test_the_findings_say_what_ppo_gains_in_health_gathering_and_on_level_4_of_d
 def test_the_findings_say_what_a_longer_horizon_and_more_entropy_gave_ppo():
     name, variants = "defend_the_center", ("plain", "discount_99", "entropy_03", "both")
     trained, gate, *_ = task_sets(name)
-    episodes = results_of("gates").episodes.filter(scenario=name)
-    plain, *others = (agent_scores(episodes, f"ppo_segmented+{variant}") for variant in variants)
+    plain, *others = (scores_of("gates", f"ppo_segmented+{variant}", name) for variant in variants)
     (_, of_entropy, of_both), (_, costs, gains_in_training) = (
-        [estimate_groups([(scores, tasks), (plain, tasks)], difference).text for scores in others]
-        for tasks in (gate, trained)
+        [gain(scores, plain, tasks) for scores in others] for tasks in (gate, trained)
     )
     assert f"the training tasks gain {gains_in_training} points" in WORDS
     assert f"no gain is shown with both**: {of_both} points." in WORDS

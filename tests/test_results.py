@@ -17,7 +17,7 @@ from gvz.reports.joint_section import joint_sections
 from gvz.reports.results import read_results
 from gvz.reports.scores import agent_scores, estimate
 from gvz.tasks import LEVELS, Task, TaskSet, named_tasks, scenarios
-from tests.score_tables import PAGE, ROOT, WORDS, metrics_of, results_of, rows_of
+from tests.score_tables import PAGE, ROOT, WORDS, metrics_of, results_of, rows_of, words_of
 
 
 def test_the_quick_runs_are_better_than_chance_on_the_same_episodes():
@@ -75,7 +75,7 @@ def test_the_quick_comparison_says_what_players_that_do_not_learn_have_on_the_sa
 
     levels = [named_tasks(scenario, level=level) for level in LEVELS]
     train, test = (named_tasks(scenario, split=split) for split in ("train4", "test"))
-    readme, words = (folder / "README.md").read_text(), " ".join((folder / "README.md").read_text().split())
+    readme, words = (folder / "README.md").read_text(), words_of("results/quick_comparison/README.md")
     for player in ("random", "sweep", "scripted"):
         rows = first_episodes(player)
         assert f"| {player} | {' | '.join(f'{mean(rows, tasks):.1f}' for tasks in (*levels, test))} |" in readme
@@ -151,7 +151,7 @@ def test_the_joint_run_says_what_its_records_give():
 
 def test_the_hour_of_the_main_job_says_what_its_records_give():
     folder = ROOT / "results" / "rainbow_4task"
-    page, guide = (" ".join(file.read_text().split()) for file in (folder / "README.md", ROOT / "docs/how-to/train.md"))
+    page, guide = words_of("results/rainbow_4task/README.md"), words_of("docs/how-to/train.md")
     last = metrics_of(folder / "seed_1111")[-1]
     updates, decisions = f"{last['num_updates']:,} gradient steps", f"{round(last['actors/env_steps'], -3):,} decisions"
     assert f"{updates}, {decisions} and {last['run/processor_s']:,.0f} seconds of processor time" in page
@@ -220,7 +220,7 @@ def test_every_run_has_all_episodes_of_its_evaluation(folder: str, split: TaskSe
 
 def test_the_page_of_the_gates_says_how_many_runs_are_missing():
     folder = ROOT / "results" / "gates"
-    page = " ".join((folder / "README.md").read_text().split())
+    page = words_of("results/gates/README.md")
     (command,) = re.findall("gvz experiment run (.*?) --results", page)
     missing = {}
     for gate in re.findall(r"gate_\w+", command):
@@ -285,7 +285,7 @@ def test_the_readme_says_how_fast_the_records_are():
 
 
 def test_the_page_of_the_tuned_engine_says_what_its_records_give():
-    page = " ".join((ROOT / "docs" / "ENGINE.md").read_text().split())
+    page = words_of("docs/ENGINE.md")
     equal, speed = (
         json.loads((ROOT / "results" / "engine" / f"{name}.json").read_text()) for name in ("equality", "speed")
     )
@@ -310,7 +310,7 @@ def test_pages_say_what_a_gpu_gave():
     cores, device = (rows[f"the run, actors.inference {where}"] for where in ("actors", "device"))
     alone = [row["updates_per_s"]["median"] for name, row in rows.items() if name.startswith("learner, ")]
     updates = [run["updates_per_s"]["median"] for run in (cores, device)]
-    guide = " ".join((ROOT / "docs" / "how-to" / "train.md").read_text().split())
+    guide = words_of("docs/how-to/train.md")
     assert f"`rainbow_4task` makes {updates[0]:.0f} gradient steps a second" in guide
     assert f"chooses the actions, too, and it makes {updates[1]:.0f} ([measured]" in guide
     assert f"The learner alone makes up to {float(f'{max(alone):.3g}'):,.0f}." in guide
@@ -323,7 +323,7 @@ def test_pages_say_what_a_gpu_gave():
         )
         in guide
     )
-    readme = " ".join((ROOT / "README.md").read_text().split())
+    readme = words_of("README.md")
     decisions = [round(run["decisions_per_s"]["median"], -1) for run in (cores, device)]
     assert (
         f"makes {updates[0]:.0f} gradient steps and plays {decisions[0]:,.0f} decisions a second, with "
@@ -335,7 +335,7 @@ def test_pages_say_what_a_gpu_gave():
     )
     acting, learning = sum(act), sum(train_step)
     assert f"it was {acting + learning:.0f} of 180 seconds" in guide
-    page = " ".join((ROOT / "results" / "general_gpu" / "README.md").read_text().split())
+    page = words_of("results/general_gpu/README.md")
     assert f"for five batch sizes ({acting:.0f} s), then the gradient step ({learning:.0f} s)" in page
     assert (len(act), len(train_step)) == (5, 1)
 

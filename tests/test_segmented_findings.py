@@ -4,20 +4,32 @@ import itertools
 
 import numpy as np
 
-from gvz.evaluation.statistics import difference
 from gvz.reports.experiment_section import comparison_table
-from gvz.reports.scores import agent_scores, estimate, estimate_groups
-from gvz.tasks import named_tasks, scenario_named, scenarios
-from tests.score_tables import PAGE, ROOT, WORDS, of_first_seed, results_of, rows_of, score_cells, task_sets
+from gvz.reports.scores import agent_scores, estimate
+from gvz.tasks import named_tasks, scenarios
+from tests.score_tables import (
+    PAGE,
+    ROOT,
+    WORDS,
+    gain,
+    last_updates,
+    mean_score,
+    of_first_seed,
+    results_of,
+    rows_of,
+    score_cells,
+    score_row,
+    scores_of,
+    task_sets,
+)
 
 
 def test_the_findings_say_what_segmented_agents_have_on_single_tasks():
     episodes = results_of("general_short").episodes
 
     def score(task: str, agent: str = "rainbow_segmented") -> str:
-        scores = episodes.filter(agent=agent, task=task)["normalized_score"].to_numpy()
-        assert len(scores) == (150 if agent == "rainbow_segmented" else 50)
-        return f"{scores.mean():.0f}"
+        assert len(episodes.filter(agent=agent, task=task)) == (150 if agent == "rainbow_segmented" else 50)
+        return mean_score(episodes, agent=agent, task=task)
 
     center, gathering, dodging = "defend_the_center", "health_gathering", "dodge_projectiles"
     assert f"`gore+mossy_bricks` {score(f'{center}/gore+mossy_bricks')} instead of 81" in WORDS
@@ -29,8 +41,7 @@ def test_the_findings_say_what_segmented_agents_have_on_single_tasks():
     water, classes = f"{gathering}/short_agent+water", "rainbow_general+classes"
     assert f"frames of classes have {score(water, classes)} there, segmented ones {score(water)}." in WORDS
     assert f"`poison+stimpacks` has {score(f'{gathering}/poison+stimpacks')} instead of 73." in WORDS
-    gate_tasks = [task.id for task in named_tasks(gathering, split="gate")]
-    of_gate = estimate(agent_scores(episodes.filter(scenario=gathering), "rainbow_segmented"), gate_tasks).text
+    of_gate = estimate(scores_of("general_short", "rainbow_segmented", gathering), task_sets(gathering)[1]).text
     assert f"**Health Gathering has {of_gate} instead of 80.2" in WORDS
     trained = [score(f"{gathering}/{name}") for name in ("supreme", "poison")]
     assert f"`supreme` and `poison`, training tasks, stand at {' and '.join(trained)}, and" in WORDS
@@ -79,12 +90,8 @@ def test_the_findings_say_how_much_agents_of_the_gate_moved_and_what_it_gave_by_
     plain = results_of("gates").episodes.filter(agent="rainbow_segmented+plain")
     seeds = sorted(means_by_seed(plain, "dodge_projectiles", ["dodge_projectiles/arachnotron"]))
     assert "`arachnotron`, where agents had {:.0f} to {:.0f}.".format(*seeds) in WORDS
-    files = [
-        file
-        for variant in (*variants, "shift_moved")
-        for file in (runs / f"rainbow_segmented+{variant}" / "dodge_projectiles").glob("**/metrics.jsonl.gz")
-    ]
-    steps = [rows_of(file)[-1]["num_updates"] for file in files]
+    names = [f"rainbow_segmented+{variant}" for variant in (*variants, "shift_moved")]
+    steps = [n for name in names for n in last_updates(f"gates/runs/{name}/dodge_projectiles/**")]
     assert len(steps) == 9
     assert f"new enemies do. 900 seconds of processor time a run, {min(steps):,} to {max(steps):,} gradient" in WORDS
 
@@ -97,7 +104,7 @@ def test_the_findings_say_what_shifted_frames_gave():
             assert len(rows) == 40
             said.append(f"{rows['normalized_score'].mean():.0f}")
     assert "`arachnotron` has {} instead of {}, `mancubus+resized_agent` {} instead of {}.".format(*said) in WORDS
-    gate_tasks = [task.id for task in named_tasks("dodge_projectiles", split="gate")]
+    trained_tasks, gate_tasks, *_ = task_sets("dodge_projectiles")
     in_zoo = episodes.filter(episodes["task"].is_in(gate_tasks), agent="rainbow_segmented+shift", run_seed=2222)
     assert f"is in the zoo, rounded: seed 2222, which has {in_zoo['normalized_score'].mean():.1f} there (20" in WORDS
     longer = results_of("general").episodes.filter(agent="rainbow_segmented")
@@ -107,16 +114,14 @@ def test_the_findings_say_what_shifted_frames_gave():
     assert (
         f"one has {of_seeds.mean()['normalized_score'].max():.1f} (100 episodes), but its policy was not kept." in WORDS
     )
-    sets = [[task.id for task in named_tasks("dodge_projectiles", split=split)] for split in ("gate", "train8")]
     on_gate, trained, on_gate_more, trained_more = (
         episodes.filter(episodes["task"].is_in(tasks), agent=f"rainbow_segmented+{variant}")["normalized_score"].mean()
         for variant in ("shift", "shift_moved")
-        for tasks in sets
+        for tasks in (gate_tasks, trained_tasks)
     )
     assert f"0.002 has {on_gate:.1f} on the gate tasks and {trained:.1f} on the training tasks." in WORDS
     assert f"0.005 has {on_gate_more:.1f} and {trained_more:.1f}. It has one seed" in WORDS
-    tasks = [task.id for task in named_tasks("defend_the_center", split="train8")]
-    of_tasks = episodes.filter(episodes["task"].is_in(tasks))
+    of_tasks = episodes.filter(episodes["task"].is_in(task_sets("defend_the_center")[0]))
     plain, everywhere, vertical = (
         of_tasks.filter(agent=f"rainbow_segmented+{name}")["normalized_score"].mean()
         for name in ("moved_most", "shift", "vertical")
@@ -159,9 +164,8 @@ def test_the_findings_say_what_pairs_gave_beside_segmented_frames():
 
 
 def test_the_findings_say_what_six_times_the_time_gave():
-    files = (ROOT / "results" / "general" / "runs" / "rainbow_segmented").glob("**/metrics.jsonl.gz")
-    steps = [rows_of(file)[-1]["num_updates"] for file in files]
-    assert f"of [segmented frames](#segmented-frames-yes), {min(steps):,} to {max(steps):,} gradient steps." in PAGE
+    steps = last_updates("general/runs/rainbow_segmented/**")
+    assert f"of [segmented frames](#segmented-frames-yes), {steps[0]:,} to {steps[-1]:,} gradient steps." in PAGE
     agents = {"rainbow_general+sight_loss": "loss of sight", "rainbow_segmented": "segmented"}
     long = results_of("general").episodes
     runs = sorted(long.filter(long["agent"].is_in(agents)).select("scenario", "agent", "run_seed").unique().rows())
@@ -169,11 +173,9 @@ def test_the_findings_say_what_six_times_the_time_gave():
     for name, agent, seed in runs:
         scores = agent_scores(long.filter(scenario=name, run_seed=seed), agent)
         called = agents[agent] if seed == 1111 else f"{agents[agent]}, seed {seed}"
-        assert f"| {scenario_named(name).title} | {called} | 5,400 s | {score_cells(scores, name)} |" in PAGE
-    short = results_of("general_short").episodes
+        assert score_row(name, f"{called} | 5,400 s", scores) in PAGE
     for name, agent in {(name, agent) for name, agent, _ in runs}:
-        scores = agent_scores(short.filter(scenario=name), agent)
-        assert f"| {scenario_named(name).title} | {agents[agent]} | 900 s | {score_cells(scores, name)} |" in PAGE
+        assert score_row(name, f"{agents[agent]} | 900 s", scores_of("general_short", agent, name)) in PAGE
 
 
 def means_by_seed(episodes, name: str, tasks: list[str]) -> list[float]:
@@ -212,8 +214,8 @@ def test_the_findings_say_what_all_segmented_agents_gained_in_six_times_the_time
     short, long = (results_of(f).episodes.filter(agent="rainbow_segmented") for f in ("general_short", "general"))
     of_both = []
     for name in ("defend_the_center", "seek_and_kill", "dodge_projectiles", "health_gathering"):
-        both = [agent_scores(episodes.filter(scenario=name), "rainbow_segmented") for episodes in (long, short)]
-        of_both += [estimate_groups([(scores, tasks) for scores in both], difference).text for tasks in task_sets(name)]
+        both = [scores_of(folder, "rainbow_segmented", name) for folder in ("general", "general_short")]
+        of_both += [gain(*both, tasks) for tasks in task_sets(name)]
     assert (
         f"beside segmented frames | {of_both[1]} | {of_both[9]} | {of_both[13]} | {of_both[5]} | as you like" in WORDS
     )
@@ -279,8 +281,7 @@ def test_the_findings_say_what_single_tasks_gained_with_a_loss_of_sight_in_six_t
         "defend_the_center/mossy_bricks",
     ):
         for folder in ("general_short", "general"):
-            rows = results_of(folder).episodes.filter(agent="rainbow_general+sight_loss", task=task)
-            said.append(f"{rows['normalized_score'].mean():.0f}")
+            said.append(mean_score(results_of(folder).episodes, agent="rainbow_general+sight_loss", task=task))
     shadows, complete, fast, bricks = zip(said[::2], said[1::2], strict=True)
     assert "`blue+shadows` falls from {} to {}, and level 4 stays at {}.".format(*shadows, complete[0]) in WORDS
     assert complete[0] == complete[1]
@@ -304,35 +305,30 @@ def test_the_findings_say_how_segmented_agents_learned_in_six_times_the_time():
 
 def test_the_findings_say_what_agents_have_whose_network_learned_longer():
     name = "seek_and_kill"
-    used, longer = (
-        agent_scores(results_of(folder).episodes.filter(scenario=name), agent)
-        for folder, agent in (
-            ("general_short", "rainbow_segmented"),
-            ("general_short", "rainbow_segmented+longer_network"),
-        )
-    )
+    agents = ("rainbow_segmented", "rainbow_segmented+longer_network")
+    used, longer = (scores_of("general_short", agent, name) for agent in agents)
     for called, scores in (("the network that is used", used), ("the one that learned longer", longer)):
         assert f"| {called} | {score_cells(scores, name)} |" in WORDS
     _, gate_tasks, *_ = task_sets(name)
-    gain = estimate_groups([(scores, gate_tasks) for scores in (longer, used)], difference).text
-    assert f"The difference on the gate tasks is {gain} points." in WORDS
-    assert f"beside segmented frames | | | | {gain} | no |" in WORDS
+    more = gain(longer, used, gate_tasks)
+    assert f"The difference on the gate tasks is {more} points." in WORDS
+    assert f"beside segmented frames | | | | {more} | no |" in WORDS
 
 
 def test_the_findings_say_what_a_longer_horizon_gave_in_health_gathering():
     episodes = results_of("gates").episodes
 
     def score(variant: str, name: str) -> str:
-        rows = episodes.filter(agent=f"rainbow_segmented+{variant}", task=f"health_gathering/{name}")
-        assert len(rows) == 40
-        return f"{rows['normalized_score'].mean():.0f}"
+        chosen = {"agent": f"rainbow_segmented+{variant}", "task": f"health_gathering/{name}"}
+        assert len(episodes.filter(**chosen)) == 40
+        return mean_score(episodes, **chosen)
 
     assert f"`poison+stimpacks` has {score('far', 'poison+stimpacks')} instead of" in WORDS
     assert f"instead of {score('near', 'poison+stimpacks')}, and `poison` {score('far', 'poison')} instead of" in WORDS
     assert f"instead of {score('near', 'poison')}. `supreme` has {score('far', 'supreme')} instead of" in WORDS
     assert f"instead of {score('near', 'supreme')}." in WORDS
     name, short = "health_gathering", results_of("general_short").episodes.filter(agent="rainbow_segmented")
-    scores = agent_scores(short.filter(scenario=name), "rainbow_segmented")
+    scores = scores_of("general_short", "rainbow_segmented", name)
     assert f"With 0.98 they have {estimate(scores, task_sets(name)[1]).text} (`general_segmented`)." in WORDS
     in_gate, in_short = (
         dict(rows.filter(scenario=name).select("run_seed", "params").unique().rows())

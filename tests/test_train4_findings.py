@@ -6,10 +6,20 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from gvz.evaluation.statistics import difference
-from gvz.reports.scores import Scores, agent_scores, estimate_groups
+from gvz.reports.scores import Scores
 from gvz.tasks import scenario_named, scenarios
-from tests.score_tables import ROOT, WORDS, in_words, means, results_of, rows_of, score_cells, task_sets
+from tests.score_tables import (
+    ROOT,
+    WORDS,
+    gain,
+    in_words,
+    last_updates,
+    means,
+    score_cells,
+    score_row,
+    scores_of,
+    task_sets,
+)
 
 AGENTS = {
     "4 tasks": ("general_train4", "rainbow_segmented+train4_network"),
@@ -21,13 +31,12 @@ SAID = (
     ("health_gathering", "poison+resized_kits+shaded_kits"),
     ("seek_and_kill", "blue+shadows"),
 )
-STEPS = "general_train4{}/runs/**/metrics.jsonl.gz"
 
 
 @pytest.fixture(scope="module")
 def scores() -> dict[tuple[str, str], Scores]:
     return {
-        (name, called): agent_scores(results_of(folder).episodes.filter(scenario=name), agent)
+        (name, called): scores_of(folder, agent, name)
         for name in scenarios()
         for called, (folder, agent) in AGENTS.items()
     }
@@ -35,7 +44,7 @@ def scores() -> dict[tuple[str, str], Scores]:
 
 def test_the_findings_say_what_agents_of_four_training_tasks_have(scores: dict[tuple[str, str], Scores]):
     for (name, called), of_agent in scores.items():
-        assert f"| {scenario_named(name).title} | {called} | {score_cells(of_agent, name, 'train4')} |" in WORDS
+        assert score_row(name, called, of_agent, "train4") in WORDS
     trained = []
     for called in AGENTS:
         cells = means({name: scores[name, called] for name in scenarios()}, "train4")
@@ -45,13 +54,10 @@ def test_the_findings_say_what_agents_of_four_training_tasks_have(scores: dict[t
 
     def gains(column: int) -> list[str]:
         """Of eight tasks, by scenario."""
-        pairs = (
-            [(scores[name, called], task_sets(name)[column]) for called in reversed(AGENTS)] for name in scenarios()
-        )
-        return [estimate_groups(pair, difference).text for pair in pairs]
+        return [gain(scores[one, "8 tasks"], scores[one, "4 tasks"], task_sets(one)[column]) for one in scenarios()]
 
     def rounded(column: int) -> str:
-        return "{:.0f}, {:.0f}, {:.0f} and {:.0f}".format(*(float(gain.split()[0]) for gain in gains(column)))
+        return "{:.0f}, {:.0f}, {:.0f} and {:.0f}".format(*(float(one.split()[0]) for one in gains(column)))
 
     assert f"not four, beside segmented frames | {' | '.join(gains(1))} | yes |" in WORDS
     assert f"they have {rounded(2)} points less**" in WORDS
@@ -84,7 +90,7 @@ def test_the_findings_say_what_networks_of_four_training_tasks_find():
 def test_the_findings_say_what_six_times_the_time_gave_on_four_training_tasks(scores: dict[tuple[str, str], Scores]):
     folders = {"4 tasks": "general_train4_long", "8 tasks": "general"}
     longer = {
-        (name, called): agent_scores(results_of(folder).episodes.filter(scenario=name), AGENTS[called][1])
+        (name, called): scores_of(folder, AGENTS[called][1], name)
         for name in scenarios()
         for called, folder in folders.items()
     }
@@ -100,12 +106,7 @@ def test_the_findings_say_what_six_times_the_time_gave_on_four_training_tasks(sc
 
     def differences(pair: Callable[[str], tuple[Scores, Scores]], column: int) -> str:
         """By scenario, on a set of `task_sets`."""
-        return in_words(
-            [
-                estimate_groups([(of, task_sets(name, "train4")[column]) for of in pair(name)], difference).text
-                for name in scenarios()
-            ]
-        )
+        return in_words([gain(*pair(name), task_sets(name, "train4")[column]) for name in scenarios()])
 
     def more_time(name: str) -> tuple[Scores, Scores]:
         return longer[name, "4 tasks"], scores[name, "4 tasks"]
@@ -128,10 +129,10 @@ def test_the_findings_say_what_six_times_the_time_gave_on_four_training_tasks(sc
         )
         said = f"`{task}` has {four:.0f} (after 900 seconds {four_short:.0f}, with eight tasks {eight:.0f})"
         assert said in WORDS
-    steps = sorted(rows_of(file)[-1]["num_updates"] for file in (ROOT / "results").glob(STEPS.format("_long")))
+    steps = last_updates("general_train4_long/runs/**")
     assert f"in Health Gathering also 2222; {steps[0]:,} to {steps[-1]:,} gradient steps, 50 episodes" in WORDS
 
 
 def test_the_findings_say_how_long_agents_of_four_training_tasks_learned():
-    steps = sorted(rows_of(file)[-1]["num_updates"] for file in (ROOT / "results").glob(STEPS.format("")))
+    steps = last_updates("general_train4/runs/**")
     assert f"{steps[0]:,} to {steps[-1]:,} gradient steps on four tasks" in WORDS

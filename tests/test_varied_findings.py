@@ -5,9 +5,20 @@ import json
 import numpy as np
 
 from gvz.evaluation.statistics import bootstrap, difference
-from gvz.reports.scores import agent_scores, estimate, estimate_groups
+from gvz.reports.scores import estimate, estimate_groups
 from gvz.tasks import named_tasks, scenario_named, scenarios
-from tests.score_tables import PAGE, ROOT, WORDS, results_of, rows_of, score_cells, task_sets
+from tests.score_tables import (
+    PAGE,
+    ROOT,
+    WORDS,
+    last_updates,
+    mean_score,
+    results_of,
+    rows_of,
+    score_row,
+    scores_of,
+    task_sets,
+)
 
 AGENTS = {"varied maps": "general_varied", "8 tasks": "general_short"}
 SCENARIOS = ("defend_the_center", "seek_and_kill")
@@ -15,7 +26,7 @@ SCENARIOS = ("defend_the_center", "seek_and_kill")
 
 def test_the_findings_say_what_agents_of_varied_maps_have():
     scores = {
-        (name, called): agent_scores(results_of(folder).episodes.filter(scenario=name), "rainbow_segmented")
+        (name, called): scores_of(folder, "rainbow_segmented", name)
         for name in SCENARIOS
         for called, folder in AGENTS.items()
     }
@@ -36,13 +47,9 @@ def test_the_findings_say_what_agents_of_varied_maps_have():
 
     steps = []
     for name in SCENARIOS:
-        (file,) = (ROOT / "results" / "general_varied" / "runs" / "rainbow_segmented" / name).glob(
-            "**/metrics.jsonl.gz"
-        )
-        steps.append(rows_of(file)[-1]["num_updates"])
+        steps += last_updates(f"general_varied/runs/rainbow_segmented/{name}/**")
         for called in AGENTS:
-            cells = score_cells(scores[name, called], name)
-            assert f"| {scenario_named(name).title} | {called} | {cells} |" in WORDS
+            assert score_row(name, called, scores[name, called]) in WORDS
     assert "{:,} gradient steps in Defend the Center and {:,} in Seek and Kill".format(*steps) in WORDS
     center, seek = SCENARIOS
     assert f"not eight tasks, beside segmented frames | -{lower(center, 1)} | | | -{lower(seek, 1)} | no |" in WORDS
@@ -133,17 +140,12 @@ def test_the_findings_say_what_a_network_gave_that_has_seen_varied_maps():
     sets = task_sets(name)[:2]
     cells = [str(bootstrap([np.array(scores[task]) for task in tasks])) for tasks in sets]
     assert f"| varied maps | varied maps | {' | '.join(cells)} |" in WORDS
-    of_others = {
-        "varied maps | eight tasks": results_of("general_varied").episodes,
-        "8 tasks | eight tasks": results_of("general_short").episodes,
-    }
-    for called, episodes in of_others.items():
-        found = agent_scores(episodes.filter(scenario=name), "rainbow_segmented")
-        assert f"| {called} | {' | '.join(estimate(found, tasks).text for tasks in sets)} |" in WORDS
+    for called, of_others in AGENTS.items():
+        found = scores_of(of_others, "rainbow_segmented", name)
+        assert f"| {called} | eight tasks | {' | '.join(estimate(found, tasks).text for tasks in sets)} |" in WORDS
 
     def with_eight_tasks(task: str) -> str:
-        found = results_of("general_short").episodes.filter(agent="rainbow_segmented", task=task)
-        return f"{found['normalized_score'].mean():.0f}"
+        return mean_score(results_of("general_short").episodes, agent="rainbow_segmented", task=task)
 
     red, sized, default = (f"{name}/{task}" for task in ("red", "red+resized_enemies", "default"))
     of_red, of_sized, of_default = (f"{np.mean(scores[task]):.0f}" for task in (red, sized, default))

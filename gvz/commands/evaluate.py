@@ -16,6 +16,7 @@ from gvz.core.registry import OwnFiles
 from gvz.core.stop import StopRequest
 from gvz.evaluation.selection import ALL_TASKS, TaskSelection
 from gvz.evaluation.simple import SimplePlayerName
+from gvz.run.rundir import EVALUATION_RECORDS
 from gvz.scenarios.base import Task
 
 if TYPE_CHECKING:
@@ -121,7 +122,7 @@ class Evaluate:
         from gvz.evaluation.zoo import run_directory
 
         if self.player is not None:
-            out = Path("evaluation.jsonl") if self.out is None else self.out
+            out = Path(EVALUATION_RECORDS) if self.out is None else self.out
             env = EnvConfig(profile=self.profile or "thesis")
             return {simple_player(self.player, env): (self.select.resolve(), out)}
         found = {}
@@ -130,7 +131,7 @@ class Evaluate:
             tasks = self.select.of_run([scenario.id for scenario in config.table.scenarios])
             check_tasks(config, tasks)
             check_profile(config, self.profile)
-            out = run_dir / "evaluation.jsonl" if self.out is None else self.out
+            out = run_dir / EVALUATION_RECORDS if self.out is None else self.out
             for num_updates in find_checkpoints(run_dir, self.checkpoints):
                 found[trained_player(run_dir, config, num_updates)] = (tasks, out)
         return found

@@ -10,7 +10,8 @@ import tyro
 
 from gvz.core.errors import ConfigError, GvzError
 from gvz.core.registry import OwnFiles
-from gvz.evaluation.zoo import EVALUATION, PREFIX, pack, run_directory, score_card, zoo_names
+from gvz.evaluation.zoo import PREFIX, pack, run_directory, score_card, zoo_names
+from gvz.run.rundir import EVALUATION_RECORDS
 
 if TYPE_CHECKING:
     from gvz.run.config import RunConfig
@@ -102,7 +103,7 @@ def _read(name: str, own_files: OwnFiles) -> _Policy:
     directory = run_directory(Path(f"{PREFIX}{name}"))
     config = read_run_config(directory, own_files)
     [num_updates] = find_checkpoints(directory, ["newest"])
-    rows = score_card(records.read_stored(directory / EVALUATION)[0])
+    rows = score_card(records.read_stored(directory / EVALUATION_RECORDS)[0])
     metrics, _ = records.read_stored(directory / "metrics.jsonl")
     tasks = TaskSelection(split="test").of_run([scenario.id for scenario in config.table.scenarios])
     scores = score_rows(rows, {}, tasks, episodes=10**9)

@@ -200,10 +200,10 @@ def end_if_ours(game: Startable, directory: Path, owner_pid: int) -> None:
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(game))
 
 
-def log_tail(log: Path, num_lines: int = 8) -> str:
+def log_tail(log: Path) -> str:
     """The last lines of an engine's log, to be added to an error message."""
     lines = records.last_lines(log)
-    return "; its last lines:\n  " + "\n  ".join(lines[-num_lines:]) if lines else "; it printed nothing"
+    return "; its last lines:\n  " + "\n  ".join(lines[-8:]) if lines else "; it printed nothing"
 
 
 class Watched(Protocol):

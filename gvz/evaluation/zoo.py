@@ -22,6 +22,7 @@ from gvz.core.cache import cache_directory
 from gvz.core.errors import ConfigError, ResourceError, nearest
 from gvz.core.libraries import require_learner
 from gvz.core.registry import NO_OWN_FILES, OwnFiles
+from gvz.run.rundir import EVALUATION_RECORDS, START_RECORDS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,8 +31,7 @@ ZOO_DIRECTORY = Path(__file__).parent.parent / "zoo"
 PREFIX = "zoo:"
 MAX_BYTES = 2_000_000
 """of a file"""
-EVALUATION = "evaluation.jsonl"
-RECORDS = ("config.json", "metrics.jsonl", "episodes.jsonl", "starts.jsonl", EVALUATION)
+RECORDS = ("config.json", "metrics.jsonl", "episodes.jsonl", START_RECORDS, EVALUATION_RECORDS)
 MAX_ROWS = {"metrics.jsonl": 100, "episodes.jsonl": 4_000}
 """that are kept of a run's records of training, at equal distances, the last one among them"""
 
@@ -94,7 +94,7 @@ def _unpack(file: Path, directory: Path) -> None:
 def _is_whole(path: Path, entry: zipfile.ZipInfo) -> bool:
     if entry.is_dir():
         return path.is_dir()
-    own = path.name == EVALUATION  # episodes that the user played since are there, too
+    own = path.name == EVALUATION_RECORDS  # episodes that the user played since are there, too
     return path.is_file() and (own or path.stat().st_size == entry.file_size)
 
 
@@ -151,9 +151,9 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", own_files: OwnFil
         (packed / RECORDS[0]).write_text(json.dumps(saved, indent=2) + "\n")
         checkpoints.write(packed / "policies" / str(num_updates), _rounded(params), {"num_updates": num_updates})
         player = trained_player(packed, read_run_config(packed, own_files), num_updates)
-        rows = score_card(records.read_stored(run_dir / EVALUATION)[0])
+        rows = score_card(records.read_stored(run_dir / EVALUATION_RECORDS)[0])
         rows = [row for row in rows if player.identity.items() <= row.items()]
-        (packed / EVALUATION).write_text("".join(json.dumps(row) + "\n" for row in rows))
+        (packed / EVALUATION_RECORDS).write_text("".join(json.dumps(row) + "\n" for row in rows))
         file = packed.with_suffix(".zip")
         with zipfile.ZipFile(file, "w", zipfile.ZIP_BZIP2) as archive:  # records take half of what deflate leaves
             for path in sorted(packed.rglob("*")):

@@ -13,7 +13,7 @@ from gvz.experiments.plan import Evaluation
 from gvz.experiments.scale import CHECK_BELOW, scaled_settings
 from gvz.run.config_files import load_config
 from gvz.run.machine import cpu_model
-from gvz.run.rundir import START_RECORDS
+from gvz.run.rundir import EVALUATION_RECORDS, START_RECORDS
 from gvz.tasks import scenario_named
 
 NEWEST_RUNS = 3
@@ -70,7 +70,7 @@ def read_rates(results: Path, agent: str, scale: float, num_cores: int) -> Rates
     logs = {run: inventory.log_file(results, str(run.relative_to(planned))) for run in runs if planned in run.parents}
     seconds = {run: inventory.seconds_of(log, "evaluate") for run, log in logs.items()}
     evaluated = [run for run in runs if seconds.get(run)]
-    steps = sum(sum(_numbers(run / "evaluation.jsonl", "length_steps")) for run in evaluated)
+    steps = sum(sum(_numbers(run / EVALUATION_RECORDS, "length_steps")) for run in evaluated)
     return Rates(
         updates_per_s=statistics.median(updates) if updates else None,
         evaluation_steps_per_s=steps / sum(seconds.values()) if steps else None,

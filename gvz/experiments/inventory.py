@@ -13,6 +13,7 @@ from gvz.core import records
 from gvz.core.durable import saved_steps
 from gvz.experiments.base import TrainingRun
 from gvz.experiments.plan import Evaluation
+from gvz.run.rundir import EVALUATION_RECORDS
 
 END_MARK = "# ended with exit code "
 """begins the line that closes a command's part of a log"""
@@ -63,7 +64,7 @@ def log_file(results: Path, job: str) -> Path:
 def run_progress(results: Path, run: TrainingRun, evaluation: Evaluation) -> RunProgress:
     """Reads how far a run is, from its policies and records alone."""
     directory = run_directory(results, run)
-    held = _held_episodes(directory / "evaluation.jsonl")
+    held = _held_episodes(directory / EVALUATION_RECORDS)
     saved = sorted({*saved_steps(directory / "policies"), *held})  # policies of a finished run may have been removed
     num_updates, processor_s = last_update(directory), last_processor_s(directory)
     if run.max_processor_s is not None and num_updates:  # a later one is of what was discarded: its checkpoint failed

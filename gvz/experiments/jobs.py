@@ -15,6 +15,7 @@ from gvz.experiments.plan import Evaluation
 from gvz.experiments.scale import scaled_settings
 from gvz.run.config_files import config_from_dict, with_settings
 from gvz.run.resume import differences
+from gvz.run.rundir import EVALUATION_RECORDS
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -106,7 +107,7 @@ class RunJob:
         if step == "train":
             by_time = self.run.max_processor_s is not None
             return int(inventory.last_processor_s(directory)) if by_time else inventory.last_update(directory)
-        return inventory.count_rows(directory / "evaluation.jsonl")
+        return inventory.count_rows(directory / EVALUATION_RECORDS)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -13,6 +13,7 @@ import polars as pl
 from gvz.core import records
 from gvz.evaluation.dataset import fits
 from gvz.experiments.inventory import PROCESSOR_S
+from gvz.run.rundir import START_RECORDS
 from gvz.tasks import TrainingSet, all_scenarios, named_tasks
 
 TRAINING_SETS: dict[TrainingSet, str] = {
@@ -114,7 +115,7 @@ def read_run(file: Path, results: Path) -> tuple[Run | None, list[str]]:
     """The run, if it can be read, and what is wrong with it."""
     metrics, problems = _read_columns(file.parent / "metrics.jsonl", _METRICS)
     episodes, more = _read_columns(file.parent / "episodes.jsonl", _TRAINING_EPISODES)
-    starts, unread = _read_starts(file.parent / "starts.jsonl")
+    starts, unread = _read_starts(file.parent / START_RECORDS)
     try:
         saved = json.loads(file.read_text())
         json.dumps(saved, ensure_ascii=False).encode()  # text that no file can hold has no place in a report

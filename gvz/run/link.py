@@ -8,6 +8,7 @@ from typing import Any
 
 from gvz.core.errors import ConfigError, GroupError, WaitTimeoutError
 from gvz.core.stop import exit_at_once
+from gvz.core.watchdog import AwakeClock
 from gvz.run.relay import close, decode, encode
 
 JOIN_TIMEOUT_S = 600.0
@@ -31,7 +32,8 @@ class Link:
         self._process, self._num_processes = process, num_processes
         self._changed = threading.Condition()
         self._values: dict[tuple[str, int], dict[int, Any]] = {}
-        self._heard_s = dict.fromkeys(range(num_processes), time.monotonic())
+        self._clock = AwakeClock(2 * BEAT_PERIOD_S)  # what a stopped process does not hear is nobody's silence
+        self._heard_s = dict.fromkeys(range(num_processes), 0.0)
         self._refused: str | None = None
         self._done = set[int]()
         self.failure: str | None = None
@@ -127,7 +129,7 @@ class Link:
             self._fail(process)
             return
         with self._changed:
-            self._heard_s[process] = time.monotonic()
+            self._heard_s[process] = self._clock.now_s
             if kind == "refused":
                 self._refused = message["value"]
             elif kind == "stop":
@@ -150,15 +152,12 @@ class Link:
             self._changed.notify_all()
 
     def _watch(self) -> None:
-        looked_s = time.monotonic()
         while not self._closed and self.failure is None:
             self.send("beat")
             time.sleep(BEAT_PERIOD_S)
-            before_s, looked_s = looked_s, time.monotonic()
-            paused_s = looked_s - before_s - BEAT_PERIOD_S
+            now_s = self._clock.look()
             for process, heard_s in self._heard_s.items():
-                # this process itself may have been stopped (Ctrl-Z, a paused container): then it has heard of nobody
-                if self.hellos_complete and looked_s - heard_s - paused_s > SILENCE_TIMEOUT_S:
+                if self.hellos_complete and now_s - heard_s > SILENCE_TIMEOUT_S:
                     self._fail(process, f"is silent for {SILENCE_TIMEOUT_S:.0f} s")
         self._end_if_stuck()
 

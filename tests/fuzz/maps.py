@@ -15,7 +15,7 @@ from gvz.wad.decorate import declared_actors
 from gvz.wad.lumps import ENTRY, HEADER, Lump, read_maps, read_wad, write_wad
 from gvz.wad.stock import engine_directory, scenario_wad
 from gvz.wad.textures import check_textures, flats, wall_patches, wall_textures
-from gvz.wad.udmf import parse_textmap, write_textmap
+from gvz.wad.udmf import UdmfMap, parse_textmap, write_textmap
 from tests.fuzz.target import Target
 
 SMALL_WADS = ("basic.wad", "health_gathering.wad", "defend_the_center.wad")
@@ -73,20 +73,16 @@ def wad(_directory: Path) -> Target:
 
 def udmf(_directory: Path) -> Target:
     """The text of a map."""
-    textures = frozenset(("CEIL5_2", "STONE2"))
 
     def run(data: bytes) -> bool:
         try:
             level = parse_textmap(data.decode("latin-1"))
-            text = write_textmap(level)
-        except WadError:  # reading takes every character of Latin-1 in a string, writing only printable ones
-            return False
-        again = parse_textmap(text)
-        assert again == level
-        assert write_textmap(again) == text
-        with contextlib.suppress(WadError):
-            check_textures(level, textures)
-        return True
+        except WadError as error:
+            refusal = str(error)
+        else:
+            return _comes_back(level)
+        assert refusal.startswith("TEXTMAP line ")
+        return False
 
     words = "namespace vertex linedef sidedef sector thing v1 v2 sidefront sideback texturefloor x y type true // /* */"
     small = b"""namespace = "zdoom"; vertex { x = 0.0; y = -1.5e3; } vertex { x = 1.0; y = 0x10; }
@@ -96,6 +92,20 @@ def udmf(_directory: Path) -> Target:
     return Target(
         run=run, seeds=[small, *_lumps("TEXTMAP")], words=[*words.encode().split(), b'"', b"{", b"}", b"= ", b";"]
     )
+
+
+def _comes_back(level: UdmfMap) -> bool:
+    """Whether a map can be written; then it is the same when it is read."""
+    try:
+        text = write_textmap(level)
+    except WadError:  # reading takes every character of Latin-1 in a string, writing only printable ones
+        return False
+    again = parse_textmap(text)
+    assert again == level
+    assert write_textmap(again) == text
+    with contextlib.suppress(WadError):
+        check_textures(level, frozenset(("CEIL5_2", "STONE2")))
+    return True
 
 
 def texture_lump(_directory: Path) -> Target:
@@ -136,20 +146,6 @@ def decorate(_directory: Path) -> Target:
 def acs(_directory: Path) -> Target:
     """ACS source."""
 
-    def run(data: bytes) -> bool:
-        source = data.decode("latin-1")
-        try:
-            behavior = compile_acs(source, actor_classes=["Poison"])
-        except AcsError as error:
-            refusal = error
-        else:
-            _check_object_file(behavior)
-            return True
-        lines = source.split("\n")
-        assert 1 <= refusal.line <= len(lines)
-        assert 1 <= refusal.column <= len(lines[refusal.line - 1]) + 1
-        return False
-
     sources = _lumps("SCRIPTS")
     words = {token.text.encode("latin-1") for s in sources for token in tokenize(s.decode("latin-1")) if token.text}
     words |= set(b"switch case default do until continue break return terminate #define static function".split())
@@ -168,7 +164,22 @@ def acs(_directory: Path) -> Target:
         b"a[",
         b"]",
     }
-    return Target(run=run, seeds=sources, words=sorted(words))
+    return Target(run=lambda data: compiles(data.decode("latin-1")), seeds=sources, words=sorted(words))
+
+
+def compiles(source: str) -> bool:
+    """Whether ACS source compiles: to an object file that the engine can read, or to an error with its place."""
+    try:
+        behavior = compile_acs(source, actor_classes=["Poison", "MarineChainsawVzd"])
+    except AcsError as error:
+        refusal = error
+    else:
+        _check_object_file(behavior)
+        return True
+    lines = source.split("\n")
+    assert 1 <= refusal.line <= len(lines)
+    assert 1 <= refusal.column <= len(lines[refusal.line - 1]) + 1
+    return False
 
 
 def _check_object_file(data: bytes) -> None:

@@ -9,6 +9,7 @@ import os
 import socket
 import struct
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 
@@ -114,6 +115,9 @@ def message(_directory: Path) -> Target:
         except TransportError:
             return False
         assert decode(encode(heard)) == heard
+        hints = get_type_hints(type(heard))
+        for name in heard.__struct_fields__:
+            assert hints[name] not in (int, str, bool, bytes) or type(getattr(heard, name)) is hints[name]
         return True
 
     names = sorted({name for one in MESSAGES for name in (one.__struct_config__.tag, *one.__struct_fields__)})

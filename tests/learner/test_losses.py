@@ -187,13 +187,6 @@ def test_gradients_equal_finite_differences():
 # --- rlax, an independent public implementation -------------------------------------------------------------------
 
 
-@pytest.fixture
-def rlax() -> ModuleType:
-    import rlax
-
-    return rlax
-
-
 @pytest.mark.isa
 # Importing rlax touches names that jax has deprecated, and rlax points from its own cross-entropy to distrax's.
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore:Rlax:PendingDeprecationWarning")

@@ -15,11 +15,8 @@ from learner.agents.configs.ppo import PPOConfig
 from learner.agents.configs.pqn import PQNConfig
 from learner.config import agent_config_class
 from learner.observation import Observation
+from tests.learner.small_agents import SPEC, A, B, made_up_params
 
-B, A = 6, 3
-SPEC = AgentSpec(
-    obs_shape=(10, 10, 2), num_actions=A, num_tasks=2, v_min=-2.0, v_max=3.0, num_variables=2, num_past_actions=3
-)
 MASKED = replace(SPEC, masked=True)
 MASK = np.array([[True, False, True]] * (B - 1) + [[False, True, False]])
 NAMES = [
@@ -40,12 +37,6 @@ def made(name: str, spec: AgentSpec = SPEC):
 def jitted(name: str, spec: AgentSpec = SPEC):
     agent = made(name, spec)
     return agent, jax.jit(agent.act), jax.jit(agent.evaluate), jax.jit(agent.losses)
-
-
-def made_up_params(agent, seed: int):
-    rng = np.random.default_rng(seed)
-    shapes = jax.eval_shape(agent.init, jax.random.key(0))
-    return jax.tree.map(lambda leaf: rng.normal(0, 0.3, leaf.shape).astype(np.float32), shapes)
 
 
 def observation(mask: np.ndarray | None = None) -> Observation:

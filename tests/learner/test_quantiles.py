@@ -108,13 +108,6 @@ def test_quantile_loss_equals_finite_differences_and_stops_at_the_target():
     assert not jax.grad(loss)(b["z_t"]).any()
 
 
-@pytest.fixture
-def rlax() -> ModuleType:
-    import rlax
-
-    return rlax
-
-
 @pytest.mark.isa
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore:Rlax:PendingDeprecationWarning")
 @pytest.mark.parametrize("double", [False, True])

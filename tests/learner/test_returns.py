@@ -138,13 +138,6 @@ def test_entropy_is_scipys():
 # --- rlax ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def rlax() -> ModuleType:
-    import rlax
-
-    return rlax
-
-
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore:Rlax:PendingDeprecationWarning")
 def test_returns_and_ppo_agree_with_rlax(rlax: ModuleType):
     b = rollout(1)

@@ -5,12 +5,10 @@ import struct
 import threading
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from gvz.core.errors import TransportError, WaitTimeoutError
 from gvz.transport.channel import MAX_MESSAGE_BYTES, Channel
-from gvz.transport.messages import Fault, Ready, Stop, encode
+from gvz.transport.messages import Fault, Ready, Stop
 
 
 @pytest.fixture
@@ -80,21 +78,3 @@ def test_an_absurd_length_is_refused():
         channel.receive()
     left.close()
     channel.close()
-
-
-@settings(max_examples=300)
-@given(data=st.binary(max_size=200), cut=st.integers(0, 200))
-def test_any_bytes_give_messages_or_a_named_error(data: bytes, cut: int):
-    left, right = socket.socketpair()
-    channel = Channel(right, peer="A")
-    whole = struct.pack("<I", len(encode(Stop()))) + encode(Stop())
-    try:
-        left.sendall(whole + data[:cut])
-        left.sendall(data[cut:])
-        left.close()
-        try:
-            assert channel.receive()[0] == Stop()
-        except TransportError:
-            assert len(data) >= 4
-    finally:
-        channel.close()

@@ -1,7 +1,6 @@
 """Shared memory segments: anonymous, proved on attaching, freed by the kernel whoever dies."""
 
 import contextlib
-import mmap
 import os
 import resource
 import subprocess
@@ -11,11 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from gvz.core.errors import ResourceError, TransportError
-from gvz.transport.segment import HEADER_BYTES, Segment, hash_layout
+from gvz.transport.segment import Segment, hash_layout
 
 PAYLOAD, LAYOUT = 1000, hash_layout("test", 1)
 
@@ -144,20 +141,6 @@ def test_attach_wants_the_right_header(segment: Segment, word: int, field: str):
     os.pwrite(segment.descriptor, b"\x07" * 8, 8 * word)
     with pytest.raises(TransportError, match=f"got {field} 0x707070707070707, want"):
         attach(segment)
-
-
-@settings(max_examples=200)
-@given(header=st.binary(min_size=32, max_size=32))
-def test_random_headers_are_refused(header: bytes):
-    segment = Segment.create("gvz-test", PAYLOAD, layout_hash=LAYOUT)
-    try:
-        right = mmap.mmap(segment.descriptor, HEADER_BYTES)[:32]
-        os.pwrite(segment.descriptor, header, 0)
-        if header != right:
-            with pytest.raises(TransportError, match="want 0x"):
-                attach(segment)
-    finally:
-        segment.close()
 
 
 def test_layout_hashes_differ_with_their_parts():
