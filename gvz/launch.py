@@ -18,7 +18,7 @@ from gvz.core.libraries import require_learner
 from gvz.core.stop import StopRequest, exit_at_once, say
 from gvz.run.config import RunConfig, with_agent
 from gvz.run.config_files import load_config
-from gvz.run.rundir import RunDir, move_aside
+from gvz.run.rundir import RunDir, move_aside, refuse_other_contents
 
 DEFAULT_CONFIG = "rainbow_4task.py"
 
@@ -98,6 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 raise ConfigError("--fresh: got it for a group of learner processes; give all another --run-dir")
             if launch.fresh and (moved := move_aside(directory)) is not None:
                 say(f"moved the old run to {moved}")
+            refuse_other_contents(directory)
             with RunDir(Path(directory), in_another=launch.run.group.own_id > 0) as run:
                 config = resumed_config(run, launch.run)
                 for note in run.check_resumable(config):

@@ -30,6 +30,8 @@ START_RECORDS = "starts.jsonl"
 """A row for every start of the run: machine, versions, commit. Never cut back."""
 EVALUATION_RECORDS = "evaluation.jsonl"
 """Where `gvz evaluate` writes, whose lock is its own."""
+_BEFORE_A_RUN = ("checkpoints", "policies", "process_", ".")
+"""Beginnings of names that may be there before a run: links to another disk, learners of its group, hidden files."""
 
 
 class RunDir:
@@ -232,6 +234,25 @@ def _move_into(folder: Path, directory: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(folder / directory.name, ignore_errors=True)
     directory.rename(folder / directory.name)
+
+
+def refuse_other_contents(path: Path) -> None:
+    """Refuses a directory for a new run that holds something else: a run's files would lie among them, the run replaces
+    what has the names of its own, and `--fresh` moves the whole directory.
+
+    Raises:
+        ConfigError: names what is in it. ResumeError: it is no directory, or cannot be read.
+    """
+    with disk_checked(path):
+        if not path.exists() or any((path / name).exists() for name in ("config.json", "lock")):
+            return
+        others = sorted(entry.name for entry in path.iterdir() if not entry.name.startswith(_BEFORE_A_RUN))
+    if others:
+        more = " and more" if others[1:] else ""
+        raise ConfigError(
+            f"--run-dir: {path} holds {others[0]}{more}, and no run (no config.json); want an empty or a new one, "
+            f"for example {path / 'run'}"
+        )
 
 
 def move_aside(path: Path) -> Path | None:

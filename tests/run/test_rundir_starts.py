@@ -3,9 +3,10 @@
 import pytest
 
 from gvz.core import records
-from gvz.core.errors import ResumeError
+from gvz.core.errors import ConfigError, ResumeError
+from gvz.launch import main
 from gvz.run import rundir
-from gvz.run.rundir import RunDir
+from gvz.run.rundir import RunDir, refuse_other_contents
 
 
 def test_a_directory_that_is_moved_before_it_is_locked_is_not_held(tmp_path, monkeypatch):
@@ -56,3 +57,28 @@ def test_no_evaluation_begins_before_later_policies_are_discarded(tmp_path, monk
     assert began == [False]
     assert file.read_text() == ""
     assert not list((tmp_path / "policies").iterdir())
+
+
+@pytest.mark.parametrize("flags", [[], ["--fresh"]])
+def test_a_directory_that_holds_something_else_is_not_made_a_run(tmp_path, capsys, flags):
+    """A run makes `segmenters/` anew, and a later `--fresh` would move all that lies beside the run."""
+    (tmp_path / "segmenters").mkdir()
+    (tmp_path / "segmenters" / "mine.onnx").write_text("precious")
+    assert main(["--config", "rainbow_quick", "--run-dir", str(tmp_path), *flags]) == 2
+    assert str(tmp_path) in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["segmenters"]
+    with pytest.raises(
+        ConfigError, match=r"--run-dir: .* holds segmenters, and no run \(no config\.json\); want an empty"
+    ):
+        refuse_other_contents(tmp_path)
+
+
+def test_links_to_another_disk_and_what_an_earlier_start_left_are_no_other_contents(tmp_path):
+    (tmp_path / "checkpoints").symlink_to(tmp_path / "another_disk")
+    refuse_other_contents(tmp_path)
+    RunDir(tmp_path).close()
+    (tmp_path / "notes.txt").write_text("of a run that did not fit into the memory")
+    refuse_other_contents(tmp_path)
+    refuse_other_contents(tmp_path / "new")
+    with pytest.raises(ResumeError, match=r"notes\.txt: Not a directory; mend this, or choose another with --run-dir"):
+        refuse_other_contents(tmp_path / "notes.txt")
