@@ -13,7 +13,7 @@ from gvz.core.errors import ConfigError
 from gvz.core.stop import StopRequest
 from gvz.evaluation.play import Episode, PlayerSpec, Row, play
 from gvz.evaluation.players import CLASSES, Player
-from gvz.evaluation.simple import SimplePlayerName, player_env
+from gvz.evaluation.simple import SIMPLE_PLAYERS, SimplePlayerName, player_env
 from gvz.tasks import Task, id_for_processes, parse_task
 
 _ANOTHER_FILE = "move the file aside or give another with --out"
@@ -144,7 +144,7 @@ def play_and_record(
 
 def evaluate_player(
     make_player: Callable[[], Player],
-    tasks: Sequence[Task | str],
+    tasks: Task | str | Sequence[Task | str],
     out: Path | str,
     *,
     name: str,
@@ -158,10 +158,10 @@ def evaluate_player(
 
     Args:
         make_player: makes it, in each process that plays; picklable unless `num_workers` is 0.
-        tasks: tasks or their ids.
+        tasks: tasks or their ids, or one of them.
         out: record file, JSON lines; may hold other players' rows too.
         name: of the player, unique in the file: with agent, seed and checkpoint. What is trained again, or changed,
-            needs another one.
+            needs another one. Those of the simple players ("random", ...) are theirs alone.
         episodes: of each task.
         base_seed: another one draws other episodes; comparisons use 0.
         env: what it plays in; default the thesis's. Actions are not repeated by chance, whatever it says.
@@ -171,9 +171,21 @@ def evaluate_player(
         The rows of all these episodes, by task and episode, with those that the file held before.
 
     Raises:
-        ConfigError, TaskError: an unknown task, one that only this process knows, or a file that cannot be written.
+        ConfigError, TaskError: an unknown task, one that only this process knows, no task or episode, a name or base
+            seed that is none, or a file that cannot be written.
         GvzError: an episode could not be played.
     """
+    if not name.strip() or name in SIMPLE_PLAYERS:
+        raise ConfigError(
+            f"evaluate_player: name: got {name!r}, want a name of its own, not {', '.join(SIMPLE_PLAYERS)}"
+        )
+    if episodes < 1 or not 0 <= base_seed < 2**63:  # what a report reads
+        raise ConfigError(
+            f"evaluate_player: got {episodes} episodes, base_seed {base_seed}; want 1 or more, a seed of 0 to 2^63 - 1"
+        )
+    tasks = [tasks] if isinstance(tasks, Task | str) else tasks
+    if not tasks:
+        raise ConfigError("evaluate_player: tasks: got none, want at least one")
     env = EnvConfig() if env is None else env
     identity = row_identity({"player": name}, env) | _observes(env)
     player_spec = PlayerSpec(make_player=make_player, env=env, identity=identity)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from actors.preprocess import push_frame, start_stack
+from gvz.core.errors import ConfigError
 from gvz.evaluation.scenarios.base import Sight, script_of, sweep
 
 if TYPE_CHECKING:
@@ -112,10 +113,16 @@ class FramePlayer:
     """
 
     def __init__(self, choose: Callable[[np.ndarray], "Action"], stack_size: int = 4):
+        if stack_size < 1:
+            raise ConfigError(f"FramePlayer: stack_size: got {stack_size}, want at least 1")
         self._choose, self._stack_size = choose, stack_size
 
     def begin(self, env: "DoomEnv", observation: "Observation", info: dict[str, Any], seed: int) -> None:
-        assert isinstance(observation, np.ndarray)
+        if not isinstance(observation, np.ndarray):
+            raise ConfigError(
+                f"FramePlayer: got observations of {', '.join(observation)} (env.buffers), want frames alone; a player "
+                "of your own (docs/EVALUATION.md) can have the others"
+            )
         height, width, channels = observation.shape
         self._stack = np.zeros((height, width, self._stack_size * channels), np.uint8)
         start_stack(self._stack, observation)

@@ -231,3 +231,25 @@ def test_a_compressed_file_is_not_written_to(tmp_path):
 def test_a_player_is_not_evaluated_on_an_unknown_task(tmp_path):
     with pytest.raises(TaskError, match="unknown scenario 'nowhere'"):
         evaluate_player(RandomPlayer, ["nowhere/default"], tmp_path / "rows.jsonl", name="mine")
+
+
+@pytest.mark.parametrize(
+    ("tasks", "options", "message"),
+    [
+        ([TASK], {"name": "random"}, r"name: got 'random', want a name of its own, not random, idle, sweep, scripted"),
+        ([TASK], {"name": " "}, "name: got ' ', want a name of its own"),
+        ([TASK], {"name": "mine", "episodes": 0}, "got 0 episodes, base_seed 0; want 1 or more"),
+        ([TASK], {"name": "mine", "base_seed": -1}, "got 100 episodes, base_seed -1; .* a seed of 0 to"),
+        ([], {"name": "mine"}, "tasks: got none, want at least one"),
+    ],
+)
+def test_an_evaluation_that_gives_no_rows_of_a_player_is_refused(tmp_path, tasks, options, message):
+    """Rows named "random" would be those of random play in a report."""
+    with pytest.raises(ConfigError, match=message):
+        evaluate_player(RandomPlayer, tasks, tmp_path / "rows.jsonl", **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_task_may_be_named_alone(tmp_path):
+    with pytest.raises(TaskError, match="unknown scenario 'nowhere'"):
+        evaluate_player(RandomPlayer, "nowhere/default", tmp_path / "rows.jsonl", name="mine")

@@ -1,5 +1,7 @@
 """Players: chance, nobody, scripts, functions of frames, in the real game."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -104,3 +106,12 @@ def test_a_function_of_frames_may_choose_several_buttons():
     finally:
         env.close()
     assert row["length_steps"] > 5
+
+
+def test_a_function_of_frames_needs_frames_alone():
+    with pytest.raises(ConfigError, match="stack_size: got 0, want at least 1"):
+        FramePlayer(lambda _stack: 0, stack_size=0)
+    buffers: Any = {"screen": np.zeros((4, 4, 3), np.uint8), "depth": np.zeros((4, 4, 1), np.uint8)}
+    env: Any = None
+    with pytest.raises(ConfigError, match=r"got observations of screen, depth \(env\.buffers\), want frames alone"):
+        FramePlayer(lambda _stack: 0).begin(env, buffers, {}, 1)
