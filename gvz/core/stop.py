@@ -1,4 +1,6 @@
-"""Ctrl-C and SIGTERM: the first asks the loop to finish its update, a second one ends it at once. Standard library."""
+"""Signals that ask a command to stop: Ctrl-C, SIGTERM, and SIGHUP, which comes when a terminal is closed. The first
+asks the loop to finish its update, a second one ends it at once. Standard library.
+"""
 
 import atexit
 import contextlib
@@ -6,12 +8,17 @@ import functools
 import os
 import signal
 import sys
+from collections.abc import Generator
 from types import FrameType
 from typing import NoReturn
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 
 class StopRequest:
-    """Catches SIGINT and SIGTERM while it is entered.
+    """Catches SIGNALS while it is entered; SIGHUP only where it is not ignored, as by `nohup`.
+
+    A SIGHUP after another signal is no second one: a closed terminal sends two, and systemd sends it with SIGTERM.
 
     Attributes:
         signal: number of the first signal caught, or None.
@@ -27,8 +34,9 @@ class StopRequest:
         self._before: dict[int, object] = {}
 
     def __enter__(self) -> "StopRequest":
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._before[number] = signal.signal(number, self._handle)
+        for number in SIGNALS:
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                self._before[number] = signal.signal(number, self._handle)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -38,6 +46,8 @@ class StopRequest:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         del frame
         again = self.signal is not None
+        if again and number == signal.SIGHUP:
+            return
         if not again:
             self.signal = number
         if self.importing:
@@ -55,6 +65,26 @@ class StopRequest:
     def exit_code(self) -> int:
         """128 + the signal's number, as shells expect; 0 without one."""
         return 0 if self.signal is None else 128 + self.signal
+
+
+@contextlib.contextmanager
+def blocked_signals() -> Generator[None]:
+    """Within it this thread gets none of SIGNALS, nor does a process that is started here. What comes meanwhile is not
+    lost: another thread gets it, or this one afterwards. A terminal sends a signal to all processes of a command, and a
+    process that has just begun cannot yet say that it is not to end by it.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def ignore_signals() -> None:
+    """For a process that another one ends: it gets none of SIGNALS, also if it was started with `blocked_signals`."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
 
 
 def say(message: str) -> None:

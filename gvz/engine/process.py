@@ -19,7 +19,7 @@ from typing import Protocol
 
 from gvz.core import janitor, records
 from gvz.core.errors import EXIT_INTERRUPTED, EngineError, ResourceError
-from gvz.core.stop import exit_at_once
+from gvz.core.stop import blocked_signals, exit_at_once
 from gvz.core.watchdog import AwakeClock
 from gvz.engine import queue_locks
 
@@ -135,7 +135,8 @@ class _Attempt:
     def _init(self) -> None:
         _starting.add(self)
         try:
-            self._game.init()
+            with blocked_signals():  # a launcher that Ctrl-C ends would take this process with it
+                self._game.init()
         except Exception as error:  # handed to the waiting thread
             self.error = error
         try:

@@ -96,7 +96,7 @@ def test_tensorboard_gets_the_animation_at_the_policys_gradient_step(small_run, 
 
 
 @pytest.mark.engine
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_an_interrupted_recording_leaves_nothing(tmp_path, number, code):
     command = [
         *(sys.executable, "-m", "gvz.cli", "record", "--player", "scripted", "--task", "defend_the_center/default"),

@@ -1,0 +1,67 @@
+"""Signals that ask a command to stop."""
+
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+from gvz.core.stop import SIGNALS, StopRequest, blocked_signals
+
+
+@pytest.fixture(autouse=True)
+def handlers() -> Iterator[None]:
+    """Those of before."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    yield
+    assert {number: signal.getsignal(number) for number in SIGNALS} == before
+
+
+@pytest.mark.parametrize("first", SIGNALS)
+def test_the_first_signal_asks_and_the_second_ends(first: signal.Signals):
+    with StopRequest() as stop:
+        signal.raise_signal(first)
+        assert (stop.requested, stop.exit_code) == (True, 128 + first)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+        assert stop.exit_code == 128 + first
+
+
+@pytest.mark.parametrize("first", SIGNALS)
+def test_a_hangup_is_no_second_signal(first: signal.Signals):
+    """A closed terminal sends two, and systemd sends one right after SIGTERM: the run is still saved."""
+    with StopRequest() as stop:
+        signal.raise_signal(first)
+        signal.raise_signal(signal.SIGHUP)
+        assert stop.exit_code == 128 + first
+
+
+def test_under_nohup_a_hangup_stays_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with StopRequest() as stop:
+            signal.raise_signal(signal.SIGHUP)
+            assert not stop.requested
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_a_process_is_started_without_signals_until_it_ignores_them():
+    code = (
+        "import signal, sys; from gvz.core.stop import SIGNALS, ignore_signals\n"
+        "print(flush=True); sys.stdin.read(1); ignore_signals()\n"
+        "assert not signal.pthread_sigmask(signal.SIG_BLOCK, ())\n"
+        "[signal.raise_signal(number) for number in SIGNALS]"
+    )
+    command = [sys.executable, "-c", code]
+    with blocked_signals():
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        for number in SIGNALS:  # it has no handler yet, perhaps not even Python's
+            process.send_signal(number)
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"\n"
+    for number in SIGNALS:
+        process.send_signal(number)
+    assert process.communicate(b"x", timeout=60) == (b"", b"")
+    assert process.returncode == 0
