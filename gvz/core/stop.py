@@ -8,11 +8,15 @@ import functools
 import os
 import signal
 import sys
+import threading
+import time
 from collections.abc import Generator
 from types import FrameType
 from typing import NoReturn
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_PATIENCE_S = 1.0
+"""a call that lasts longer after a signal is spoken of"""
 
 
 class StopRequest:
@@ -65,6 +69,30 @@ class StopRequest:
     def exit_code(self) -> int:
         """128 + the signal's number, as shells expect; 0 without one."""
         return 0 if self.signal is None else 128 + self.signal
+
+
+@contextlib.contextmanager
+def told_of_delay(stop: StopRequest) -> Generator[None]:
+    """Within it a line is said if a signal comes while the main thread is in a long call, such as a compilation. Python
+    runs handlers after the call, and who sees no sign of the first Ctrl-C presses it again.
+    """
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+
+    def tell() -> None:
+        with open(reading, "rb", buffering=0) as pipe:  # noqa: PTH123
+            while number := pipe.read(1):
+                time.sleep(_PATIENCE_S)
+                if number[0] in SIGNALS and stop.signal is None:
+                    say("stopping as soon as the call under way ends; a compilation can take a minute")
+
+    threading.Thread(target=tell, name="signals", daemon=True).start()
+    before = signal.set_wakeup_fd(writing)
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        os.close(writing)
 
 
 @contextlib.contextmanager

@@ -1,13 +1,16 @@
 """Signals that ask a command to stop."""
 
+import ctypes
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 
 import pytest
 
-from gvz.core.stop import SIGNALS, StopRequest, blocked_signals
+from gvz.core import stop as stops
+from gvz.core.stop import SIGNALS, StopRequest, blocked_signals, told_of_delay
 
 
 @pytest.fixture(autouse=True)
@@ -45,6 +48,25 @@ def test_under_nohup_a_hangup_stays_ignored():
             assert not stop.requested
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_a_call_that_a_signal_does_not_end_is_spoken_of(monkeypatch: pytest.MonkeyPatch):
+    libc, mutex, said = ctypes.CDLL(None), ctypes.create_string_buffer(64), list[str]()
+
+    def hear(line: str) -> None:
+        said.append(line)
+        libc.pthread_mutex_unlock(mutex)
+
+    monkeypatch.setattr(stops, "say", hear)
+    at_last = threading.Timer(60, libc.pthread_mutex_unlock, [mutex])
+    with StopRequest() as stop, told_of_delay(stop):
+        libc.pthread_mutex_lock(mutex)
+        at_last.start()
+        threading.Timer(0.1, signal.pthread_kill, [threading.main_thread().ident, signal.SIGTERM]).start()
+        libc.pthread_mutex_lock(mutex)
+        at_last.cancel()
+        assert stop.signal == signal.SIGTERM
+    assert said == ["stopping as soon as the call under way ends; a compilation can take a minute"]
 
 
 def test_a_process_is_started_without_signals_until_it_ignores_them():
