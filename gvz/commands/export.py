@@ -11,6 +11,7 @@ import tyro
 
 from gvz.core import records
 from gvz.core.errors import ConfigError
+from gvz.core.files import written_whole
 from gvz.run.rundir import RECORD_FILES, START_RECORDS
 
 if TYPE_CHECKING:
@@ -109,16 +110,13 @@ def write_table(table: "pl.DataFrame", file: Path) -> Path:
     """Writes .csv (lists as their elements with a +) or .parquet; the file appears once it is whole."""
     import polars as pl
 
-    temporary = file.with_name(file.name + ".tmp")
-    try:
+    with written_whole(file) as writing:
         if file.suffix == ".csv":
             lists = [name for name, kind in table.schema.items() if isinstance(kind, pl.List)]
-            table.with_columns(pl.col(lists).list.join("+")).write_csv(temporary)
+            table.with_columns(pl.col(lists).list.join("+")).write_csv(writing)
         else:
-            table.write_parquet(temporary)
-        return temporary.replace(file)
-    finally:
-        temporary.unlink(missing_ok=True)
+            table.write_parquet(writing)
+    return file
 
 
 def _flat(row: dict[str, Any]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from gvz.core.errors import ConfigError
+from gvz.core.files import written_whole
 from gvz.evaluation.choice import ANY_EPISODE, EpisodeChoice
 
 if TYPE_CHECKING:
@@ -78,8 +79,8 @@ class Record:
 
         rate = Fraction(TICS_PER_SECOND, 1 if every_tic else player_spec.env.frame_skip)
         try:
-            with contextlib.closing(pictures()) as drawn:
-                write_video(self.out, drawn, rate)
+            with written_whole(self.out) as writing, contextlib.closing(pictures()) as drawn:
+                write_video(writing, drawn, rate)
         except KeyboardInterrupt as interruption:
             raise KeyboardInterrupt("nothing was written") from interruption
         if self.tensorboard and self.choice.run_dir is not None:

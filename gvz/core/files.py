@@ -1,9 +1,45 @@
-"""Files of a directory and of all below it, also where these are links to directories elsewhere."""
+"""Files of a directory and of all below it, also where these are links to directories elsewhere; and files that are
+written whole.
+"""
 
+import contextlib
 import fnmatch
 import heapq
 import os
+from collections.abc import Generator
 from pathlib import Path
+
+from gvz.core import records
+from gvz.core.errors import ConfigError
+
+
+@contextlib.contextmanager
+def written_whole(path: Path) -> Generator[Path]:
+    """A file to write to, which takes the place of `path` at the end of the block: nobody sees half of it, and one
+    process at a time writes it. An error leaves what was there before. What a killed process has left goes with
+    the next one. Directories are made.
+
+    Raises:
+        ConfigError: it cannot be made, or another process writes it.
+    """
+    writing = path.with_name(f".writing-{path.name}")
+    if path.is_dir():
+        raise ConfigError(f"{path} is a directory; want the name of a file")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = writing.open("ab")
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be written: {error.strerror}; give a place that you can write to") from error
+    with file:
+        if not (records.lock(file) and records.is_at(file, writing)):
+            raise ConfigError(f"{path} is being written by another process; wait for its end, or give another name")
+        file.truncate(0)  # of what a killed process left
+        try:
+            yield writing
+            writing.replace(path)
+        except BaseException:
+            writing.unlink(missing_ok=True)
+            raise
 
 
 def files_below(directory: Path, pattern: str) -> list[Path]:
