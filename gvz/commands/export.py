@@ -1,5 +1,6 @@
 """`gvz export`: records of runs as tables."""
 
+import io
 import json
 import sys
 from collections.abc import Sequence
@@ -110,12 +111,14 @@ def write_table(table: "pl.DataFrame", file: Path) -> Path:
     """Writes .csv (lists as their elements with a +) or .parquet; the file appears once it is whole."""
     import polars as pl
 
+    data = io.BytesIO()  # polars has errors of its own for a full disk
+    if file.suffix == ".csv":
+        lists = [name for name, kind in table.schema.items() if isinstance(kind, pl.List)]
+        table.with_columns(pl.col(lists).list.join("+")).write_csv(data)
+    else:
+        table.write_parquet(data)
     with written_whole(file) as writing:
-        if file.suffix == ".csv":
-            lists = [name for name, kind in table.schema.items() if isinstance(kind, pl.List)]
-            table.with_columns(pl.col(lists).list.join("+")).write_csv(writing)
-        else:
-            table.write_parquet(writing)
+        writing.write_bytes(data.getbuffer())
     return file
 
 
