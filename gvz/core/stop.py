@@ -17,12 +17,15 @@ from typing import NoReturn
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _PATIENCE_S = 1.0
 """a call that lasts longer after a signal is spoken of"""
+_AGAIN_S = 0.05
 
 
 class StopRequest:
     """Catches SIGNALS while it is entered; SIGHUP only where it is not ignored, as by `nohup`.
 
     A SIGHUP after another signal is no second one: a closed terminal sends two, and systemd sends it with SIGTERM.
+    Python drops an exception that is raised inside a destructor or a callback of the garbage collector; it is raised
+    again soon after.
 
     Attributes:
         signal: number of the first signal caught, or None.
@@ -41,9 +44,11 @@ class StopRequest:
         for number in SIGNALS:
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 self._before[number] = signal.signal(number, self._handle)
+        self._hook_before, sys.unraisablehook = sys.unraisablehook, self._handle_dropped
         return self
 
     def __exit__(self, *_: object) -> None:
+        sys.unraisablehook = self._hook_before
         for number, handler in self._before.items():
             signal.signal(number, handler)  # pyright: ignore[reportArgumentType]  # what signal.signal returned
 
@@ -60,6 +65,12 @@ class StopRequest:
         if again or self.at_once:
             raise KeyboardInterrupt
 
+    def _handle_dropped(self, dropped: "sys.UnraisableHookArgs") -> None:
+        if issubclass(dropped.exc_type, KeyboardInterrupt):
+            threading.Timer(_AGAIN_S, _interrupt_again).start()  # here it would be dropped, too
+        else:
+            self._hook_before(dropped)
+
     @property
     def requested(self) -> bool:
         """A signal has asked the run to stop."""
@@ -69,6 +80,12 @@ class StopRequest:
     def exit_code(self) -> int:
         """128 + the signal's number, as shells expect; 0 without one."""
         return 0 if self.signal is None else 128 + self.signal
+
+
+def _interrupt_again() -> None:
+    main = threading.main_thread().ident
+    if main is not None and callable(signal.getsignal(signal.SIGTERM)):  # else the command has ended
+        signal.pthread_kill(main, signal.SIGTERM)
 
 
 @contextlib.contextmanager

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from gvz.core import records
 from gvz.core.errors import ConfigError
 from gvz.core.files import files_below, written_whole
 from tests.full_disk import full_disk
@@ -87,6 +88,16 @@ def test_a_full_disk_leaves_what_was_there_before(tmp_path):
     with pytest.raises(OSError, match="File too large"), full_disk(3), written_whole(file) as writing:
         writing.write_text("after")
     assert [(path, path.read_text()) for path in tmp_path.iterdir()] == [(file, "before")]
+
+
+def test_an_interruption_while_it_is_made_leaves_nothing(tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(records, "lock", interrupted)
+    with pytest.raises(KeyboardInterrupt), written_whole(tmp_path / "report.md"):
+        pass
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_one_process_at_a_time_writes_a_file(tmp_path):

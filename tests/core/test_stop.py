@@ -40,6 +40,21 @@ def test_a_hangup_is_no_second_signal(first: signal.Signals):
         assert stop.exit_code == 128 + first
 
 
+@pytest.mark.parametrize("number", SIGNALS)
+def test_what_a_signal_raises_inside_a_destructor_is_raised_again(number: signal.Signals):
+    class Interrupted:
+        def __del__(self) -> None:
+            signal.raise_signal(number)
+
+    def play() -> None:
+        Interrupted()
+        pytest.fail(f"waited {threading.Event().wait(60)}")
+
+    with pytest.raises(KeyboardInterrupt), StopRequest(at_once=True) as stop:
+        play()
+    assert stop.signal == number
+
+
 def test_under_nohup_a_hangup_stays_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
