@@ -15,7 +15,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from gvz.core import janitor
 from gvz.core.errors import GvzError
-from gvz.core.stop import blocked_signals, ignore_signals
+from gvz.core.stop import blocked_signals, ignore_signals, uninterrupted
 from gvz.transport.child import one_core
 
 P = ParamSpec("P")
@@ -38,15 +38,16 @@ def worker_processes(num_workers: int, died: str) -> Generator[Executor, None, N
     try:
         executor.start()
         yield executor
+        executor.shutdown(cancel_futures=True)
         ended = True
     except BrokenProcessPool as error:
         raise GvzError(died) from error
     finally:
         if not ended:  # what they do is not wanted any more, and one of them may hang
-            executor.kill()
-        executor.shutdown(wait=True, cancel_futures=True)
-        if not ended:
-            janitor.clean_dead_instances()
+            with uninterrupted():
+                executor.kill()
+                executor.shutdown(cancel_futures=True)
+                janitor.clean_dead_instances()
 
 
 class _Processes(Executor):
