@@ -13,7 +13,7 @@ import tyro
 import gvz
 from gvz.core.errors import EXIT_INTERRUPTED, GvzError
 from gvz.core.registry import discover
-from gvz.core.stop import say
+from gvz.core.stop import StopRequest, say
 
 EXIT_BROKEN_PIPE = 141
 """exit code that a shell shows for a program that SIGPIPE ended"""
@@ -25,20 +25,24 @@ DESCRIPTION = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns the exit code: 0 done, 1 failed, 2 bad input, 130 interrupted."""
+    """Runs the command; returns the exit code: 0 done, 1 failed, 2 bad input; 130, 143 and 129 ended by SIGINT, SIGTERM
+    and SIGHUP.
+    """
     if sys.stdout is None:  # closed by who started us
         sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115
+    stop = StopRequest(at_once=True)
     try:
-        try:
-            return run(list(sys.argv[1:] if arguments is None else arguments))
-        finally:  # a help text ends by SystemExit
-            sys.stdout.flush()
+        with stop:
+            try:
+                return run(list(sys.argv[1:] if arguments is None else arguments))
+            finally:  # a help text ends by SystemExit
+                sys.stdout.flush()
     except GvzError as error:
         say(f"error: {error}")
         return error.exit_code
-    except KeyboardInterrupt:  # of a command that has nothing to say about it
-        say("interrupted")
-        return EXIT_INTERRUPTED
+    except KeyboardInterrupt as interruption:  # some commands have something to say about it
+        say("; ".join(["interrupted", *interruption.args]))
+        return stop.exit_code or EXIT_INTERRUPTED
     except BrokenPipeError:  # the reader of our output has closed it: gvz tasks | head
         _drop_unwritten()
         return EXIT_BROKEN_PIPE

@@ -15,7 +15,7 @@ import tyro
 
 from gvz.core.errors import ConfigError, GvzError
 from gvz.core.libraries import require_learner
-from gvz.core.stop import StopRequest, exit_at_once, say
+from gvz.core.stop import StopRequest, exit_at_once, say, told_of_delay
 from gvz.run.config import RunConfig, with_agent
 from gvz.run.config_files import load_config
 from gvz.run.rundir import RunDir, move_aside, refuse_other_contents
@@ -89,7 +89,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns the exit code: 0 done, 1 failed, 2 bad input, 130 and 143 stopped and saved."""
     arguments = sys.argv[1:] if arguments is None else arguments
     in_group = False
-    with StopRequest(at_once=True) as stop:  # before the trainer exists, a signal ends the command at once
+    # before the trainer exists, a signal ends the command at once
+    with StopRequest(at_once=True) as stop, told_of_delay(stop):
         try:
             launch = parse(arguments)
             require_learner("training")

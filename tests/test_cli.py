@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import signal
 import subprocess
 import sys
 from importlib.metadata import version
@@ -141,12 +142,10 @@ def test_tasks_of_later_scenarios_are_listed_by_their_suite(capsys):
     assert "GViZDoom/FindTheKey-Default-v0" in [row["gymnasium_id"] for row in rows]
 
 
-def test_ctrl_c_gives_one_line_and_the_exit_code_that_shells_expect(capsys, monkeypatch):
-    def interrupted(_: object) -> int:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(cli, "run", interrupted)
-    assert cli.main(["gallery"]) == 130
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_gives_one_line_and_the_exit_code_that_shells_expect(number, capsys, monkeypatch):
+    monkeypatch.setattr(cli, "run", lambda _: signal.raise_signal(number))
+    assert cli.main(["gallery"]) == 128 + number
     assert capsys.readouterr() == ("", "interrupted\n")
 
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ import tyro
 from gvz.core.env_config import EnvConfig, Profile
 from gvz.core.errors import EXIT_INTERRUPTED, ConfigError
 from gvz.core.registry import OwnFiles
-from gvz.core.stop import StopRequest
+from gvz.core.stop import StopRequest, say
 from gvz.evaluation.selection import ALL_TASKS, TaskSelection
 from gvz.evaluation.simple import SimplePlayerName
 from gvz.run.rundir import EVALUATION_RECORDS
@@ -86,7 +85,7 @@ class Evaluate:
             for player_spec, (tasks, _) in player_specs.items():
                 self._print_scores(player_spec, tasks, held[player_spec].rows)
         except KeyboardInterrupt:
-            print("interrupted; the same command goes on from here", file=sys.stderr)
+            say("interrupted; the same command goes on from here")
             return stop.exit_code or EXIT_INTERRUPTED
         finally:
             for file in files.values():

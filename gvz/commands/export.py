@@ -1,5 +1,6 @@
 """`gvz export`: records of runs as tables."""
 
+import io
 import json
 import sys
 from collections.abc import Sequence
@@ -11,6 +12,7 @@ import tyro
 
 from gvz.core import records
 from gvz.core.errors import ConfigError
+from gvz.core.files import written_whole
 from gvz.run.rundir import RECORD_FILES, START_RECORDS
 
 if TYPE_CHECKING:
@@ -109,16 +111,15 @@ def write_table(table: "pl.DataFrame", file: Path) -> Path:
     """Writes .csv (lists as their elements with a +) or .parquet; the file appears once it is whole."""
     import polars as pl
 
-    temporary = file.with_name(file.name + ".tmp")
-    try:
-        if file.suffix == ".csv":
-            lists = [name for name, kind in table.schema.items() if isinstance(kind, pl.List)]
-            table.with_columns(pl.col(lists).list.join("+")).write_csv(temporary)
-        else:
-            table.write_parquet(temporary)
-        return temporary.replace(file)
-    finally:
-        temporary.unlink(missing_ok=True)
+    data = io.BytesIO()  # polars has errors of its own for a full disk
+    if file.suffix == ".csv":
+        lists = [name for name, kind in table.schema.items() if isinstance(kind, pl.List)]
+        table.with_columns(pl.col(lists).list.join("+")).write_csv(data)
+    else:
+        table.write_parquet(data)
+    with written_whole(file) as writing:
+        writing.write_bytes(data.getbuffer())
+    return file
 
 
 def _flat(row: dict[str, Any]) -> dict[str, Any]:

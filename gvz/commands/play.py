@@ -2,7 +2,6 @@
 
 import contextlib
 import itertools
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from gvz.core.env_config import EnvConfig, Profile
-from gvz.core.errors import EXIT_INTERRUPTED, ConfigError
+from gvz.core.errors import ConfigError
 from gvz.scenarios.base import Task
 from gvz.tasks import parse_task
 
@@ -67,9 +66,8 @@ class Play:
         ):
             try:
                 self._play(window, task, file)
-            except KeyboardInterrupt:
-                print("interrupted; the same command goes on from here", file=sys.stderr)
-                return EXIT_INTERRUPTED
+            except KeyboardInterrupt as interruption:
+                raise KeyboardInterrupt("the same command goes on from here") from interruption
         return 0
 
     def _check(self) -> None:

@@ -2,7 +2,6 @@
 
 import contextlib
 import math
-import sys
 from collections.abc import Generator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -11,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from gvz.core.errors import EXIT_INTERRUPTED, ConfigError
-from gvz.core.stop import StopRequest
+from gvz.core.errors import ConfigError
+from gvz.core.files import written_whole
 from gvz.evaluation.choice import ANY_EPISODE, EpisodeChoice
 
 if TYPE_CHECKING:
@@ -79,13 +78,11 @@ class Record:
                         return
 
         rate = Fraction(TICS_PER_SECOND, 1 if every_tic else player_spec.env.frame_skip)
-        stop = StopRequest(at_once=True)
         try:
-            with stop, contextlib.closing(pictures()) as drawn:
-                write_video(self.out, drawn, rate)
-        except KeyboardInterrupt:
-            print("interrupted; nothing was written", file=sys.stderr)
-            return stop.exit_code or EXIT_INTERRUPTED
+            with written_whole(self.out) as writing, contextlib.closing(pictures()) as drawn:
+                write_video(writing, drawn, rate)
+        except KeyboardInterrupt as interruption:
+            raise KeyboardInterrupt("nothing was written") from interruption
         if self.tensorboard and self.choice.run_dir is not None:
             events = run_directory(self.choice.run_dir) / "tensorboard" / "episodes"
             add_to_tensorboard(self.out, events, f"episode/{task.id}", player_spec.identity["num_updates"])

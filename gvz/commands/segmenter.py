@@ -14,6 +14,7 @@ from typing import Annotated, Literal, TypeVar
 import tyro
 
 from gvz.core.errors import ConfigError
+from gvz.core.files import written_whole
 
 TrainSet = Literal["train4", "train8", "varied"]
 _LOOK_PERIOD_STEPS = 20
@@ -68,20 +69,11 @@ class TrainSegmenter:
             raise ConfigError(f"--processor-s: got {self.processor_s:g}, want more than 0")
         if self.out.suffix != ".onnx":
             raise ConfigError(f"--out: got {self.out}, want a name that ends in .onnx")
-        if not self.out.parent.is_dir():
-            raise ConfigError(f"--out: {self.out.parent} is no directory")
-        if self.out.is_dir():
-            raise ConfigError(f"--out: {self.out} is a directory; want the name of a file")
         if find_spec("onnx") is None:
             raise ConfigError("gvz segmenter: the package onnx is missing; pip install 'gvizdoom[segmenter]'")
         from gvz.tasks import named_tasks
 
         gate_tasks = named_tasks(self.scenario, split="gate")
-        unfinished, record_file = self.out.with_suffix(".unfinished"), self.out.with_suffix(".json")
-        try:
-            unfinished.touch()
-        except OSError as error:
-            raise ConfigError(f"--out: {self.out} cannot be written: {error.strerror}") from error
         import jax
         import numpy as np
 
@@ -96,8 +88,8 @@ class TrainSegmenter:
         tasks = segmentation.training_tasks(self.scenario, self.training_set)
         of_machine = machine.describe()  # with the commit of the code that is loaded now
         begun_s, steps, loss = machine.processor_s(), 0, 0.0
-        with Bars(line_period_s=10.0) as bars, contextlib.ExitStack() as until_trained:
-            until_trained.callback(unfinished.unlink, missing_ok=True)
+        with contextlib.ExitStack() as until_trained, Bars(line_period_s=10.0) as bars:
+            unfinished = until_trained.enter_context(written_whole(self.out))
 
             def show(unit: str, done: int, total: int, text: str) -> None:
                 bars.show([Bar(name=unit, done=done, total=total, unit=unit, text=text)])
@@ -141,8 +133,8 @@ class TrainSegmenter:
                     "fewer --frames"
                 )
             write_onnx(params, unfinished, INPUT_HEIGHT, INPUT_WIDTH)
+            record_file = self.out.with_suffix(".json")
             record_file.unlink(missing_ok=True)  # of a network that was there before
-            unfinished.replace(self.out)
             until_trained.close()
             segment, scores = Segmenter(str(self.out)), {}
             for task in gate_tasks:
@@ -163,7 +155,8 @@ class TrainSegmenter:
             "machine": of_machine,
             "average_precision": {task: {k: round(v, 3) for k, v in found.items()} for task, found in scores.items()},
         }
-        record_file.write_text(json.dumps(record, indent=2) + "\n")
+        with written_whole(record_file) as writing:
+            writing.write_text(json.dumps(record, indent=2) + "\n")
         print(f"{self.out}: {steps:,} gradient steps in {spent_s:,.0f} processor seconds", file=sys.stderr)
         for task, found in scores.items():
             print(f"{task}: " + ", ".join(f"{name} {value:.2f}" for name, value in found.items()))

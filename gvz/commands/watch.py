@@ -2,13 +2,12 @@
 
 import contextlib
 import math
-import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from gvz.core.errors import EXIT_INTERRUPTED, ConfigError
+from gvz.core.errors import ConfigError
 from gvz.evaluation.choice import ANY_EPISODE, EpisodeChoice
 from gvz.scenarios.base import Task
 
@@ -49,13 +48,9 @@ class Watch:
         )
         episode = self.choice.episode
         with contextlib.closing(window):
-            try:
-                while not window.closed and (self.episodes is None or episode < self.choice.episode + self.episodes):
-                    self._show(window, player_spec, task, episode)
-                    episode += 1
-            except KeyboardInterrupt:
-                print("interrupted", file=sys.stderr)
-                return EXIT_INTERRUPTED
+            while not window.closed and (self.episodes is None or episode < self.choice.episode + self.episodes):
+                self._show(window, player_spec, task, episode)
+                episode += 1
         return 0
 
     def _show(self, window: "Window", player_spec: "PlayerSpec", task: Task, episode: int) -> None:

@@ -1,9 +1,52 @@
-"""Files of a directory and of all below it, also where these are links to directories elsewhere."""
+"""Files of a directory and of all below it, also where these are links to directories elsewhere; and files that are
+written whole.
+"""
 
+import contextlib
 import fnmatch
 import heapq
 import os
+from collections.abc import Generator
 from pathlib import Path
+from typing import IO
+
+from gvz.core import records
+from gvz.core.errors import ConfigError
+
+
+@contextlib.contextmanager
+def written_whole(path: Path) -> Generator[Path]:
+    """A file to write to, which takes the place of `path` at the end of the block: nobody sees half of it, and one
+    process at a time writes it. An error leaves what was there before. What a killed process has left goes with
+    the next one. Directories are made.
+
+    Raises:
+        ConfigError: it cannot be made, or another process writes it.
+    """
+    writing, in_another = path.with_name(f".writing-{path.name}"), False
+    if path.is_dir():
+        raise ConfigError(f"{path} is a directory; want the name of a file")
+    try:
+        with _opened(writing, path) as file:
+            in_another = not (records.lock(file) and records.is_at(file, writing))
+            if in_another:
+                raise ConfigError(f"{path} is being written by another process; wait for its end, or give another name")
+            file.truncate(0)  # of what a killed process left
+            yield writing
+            writing.replace(path)
+    except BaseException:
+        if not in_another:
+            with contextlib.suppress(OSError):
+                writing.unlink()
+        raise
+
+
+def _opened(writing: Path, path: Path) -> IO[bytes]:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return writing.open("ab")
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be written: {error.strerror}; give a place that you can write to") from error
 
 
 def files_below(directory: Path, pattern: str) -> list[Path]:

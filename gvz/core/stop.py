@@ -1,4 +1,6 @@
-"""Ctrl-C and SIGTERM: the first asks the loop to finish its update, a second one ends it at once. Standard library."""
+"""Signals that ask a command to stop: Ctrl-C, SIGTERM, and SIGHUP, which comes when a terminal is closed. The first
+asks the loop to finish its update, a second one ends it at once. Standard library.
+"""
 
 import atexit
 import contextlib
@@ -6,12 +8,24 @@ import functools
 import os
 import signal
 import sys
+import threading
+import time
+from collections.abc import Generator
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_PATIENCE_S = 1.0
+"""a call that lasts longer after a signal is spoken of"""
+_AGAIN_S = 0.05
 
 
 class StopRequest:
-    """Catches SIGINT and SIGTERM while it is entered.
+    """Catches SIGNALS while it is entered; SIGHUP only where it is not ignored, as by `nohup`.
+
+    A SIGHUP after another signal is no second one: a closed terminal sends two, and systemd sends it with SIGTERM.
+    Python drops an exception that is raised inside a destructor or a callback of the garbage collector; it is raised
+    again soon after.
 
     Attributes:
         signal: number of the first signal caught, or None.
@@ -27,17 +41,22 @@ class StopRequest:
         self._before: dict[int, object] = {}
 
     def __enter__(self) -> "StopRequest":
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._before[number] = signal.signal(number, self._handle)
+        for number in SIGNALS:
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                self._before[number] = signal.signal(number, self._handle)
+        self._hook_before, sys.unraisablehook = sys.unraisablehook, self._handle_dropped
         return self
 
     def __exit__(self, *_: object) -> None:
+        sys.unraisablehook = self._hook_before
         for number, handler in self._before.items():
             signal.signal(number, handler)  # pyright: ignore[reportArgumentType]  # what signal.signal returned
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         del frame
         again = self.signal is not None
+        if again and number == signal.SIGHUP:
+            return
         if not again:
             self.signal = number
         if self.importing:
@@ -45,6 +64,12 @@ class StopRequest:
             os._exit(self.exit_code)
         if again or self.at_once:
             raise KeyboardInterrupt
+
+    def _handle_dropped(self, dropped: "sys.UnraisableHookArgs") -> None:
+        if issubclass(dropped.exc_type, KeyboardInterrupt):
+            threading.Timer(_AGAIN_S, _interrupt_again).start()  # here it would be dropped, too
+        else:
+            self._hook_before(dropped)
 
     @property
     def requested(self) -> bool:
@@ -55,6 +80,74 @@ class StopRequest:
     def exit_code(self) -> int:
         """128 + the signal's number, as shells expect; 0 without one."""
         return 0 if self.signal is None else 128 + self.signal
+
+
+def _interrupt_again() -> None:
+    main = threading.main_thread().ident
+    if main is not None and callable(signal.getsignal(signal.SIGTERM)):  # else the command has ended
+        signal.pthread_kill(main, signal.SIGTERM)
+
+
+@contextlib.contextmanager
+def told_of_delay(stop: StopRequest) -> Generator[None]:
+    """Within it a line is said if a signal comes while the main thread is in a long call, such as a compilation. Python
+    runs handlers after the call, and who sees no sign of the first Ctrl-C presses it again.
+    """
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+
+    def tell() -> None:
+        with open(reading, "rb", buffering=0) as pipe:  # noqa: PTH123
+            while number := pipe.read(1):
+                time.sleep(_PATIENCE_S)
+                if number[0] in SIGNALS and stop.signal is None:
+                    say("stopping as soon as the call under way ends; a compilation can take a minute")
+
+    threading.Thread(target=tell, name="signals", daemon=True).start()
+    before = signal.set_wakeup_fd(writing)
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        os.close(writing)
+
+
+@contextlib.contextmanager
+def blocked_signals() -> Generator[None]:
+    """Within it this thread gets none of SIGNALS, nor does a process that is started here. What comes meanwhile is not
+    lost: another thread gets it, or this one afterwards. A terminal sends a signal to all processes of a command, and a
+    process that has just begun cannot yet say that it is not to end by it.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Generator[None]:
+    """For a clean-up that is sure to end: what handlers would raise comes after it. Other threads get no exceptions."""
+    came: list[int] = []
+    before: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {number: handler for number in SIGNALS if callable(handler := signal.getsignal(number))}
+    for number in before:
+        signal.signal(number, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in came:
+            signal.raise_signal(number)
+
+
+def ignore_signals() -> None:
+    """For a process that another one ends: it gets none of SIGNALS, also if it was started with `blocked_signals`."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
 
 
 def say(message: str) -> None:

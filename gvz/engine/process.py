@@ -19,7 +19,7 @@ from typing import Protocol
 
 from gvz.core import janitor, records
 from gvz.core.errors import EXIT_INTERRUPTED, EngineError, ResourceError
-from gvz.core.stop import exit_at_once
+from gvz.core.stop import blocked_signals, exit_at_once, uninterrupted
 from gvz.core.watchdog import AwakeClock
 from gvz.engine import queue_locks
 
@@ -135,7 +135,8 @@ class _Attempt:
     def _init(self) -> None:
         _starting.add(self)
         try:
-            self._game.init()
+            with blocked_signals():  # a launcher that Ctrl-C ends would take this process with it
+                self._game.init()
         except Exception as error:  # handed to the waiting thread
             self.error = error
         try:
@@ -183,12 +184,13 @@ def one_of(lock_names: Sequence[str], deadline: float) -> Generator[None, None, 
 
 def end(game: Startable, directory: Path) -> None:
     """Ends an engine and removes what it had. The order matters: dead and with free locks, `game.close` cannot hang."""
-    instance = janitor.read_instance(directory)
-    queues = [] if instance is None else queue_locks.mapped(instance[2])
-    janitor.clean_engine(directory)
-    queue_locks.free(queues)
-    game.close()
-    janitor.forget(directory)
+    with uninterrupted():
+        instance = janitor.read_instance(directory)
+        queues = [] if instance is None else queue_locks.mapped(instance[2])
+        janitor.clean_engine(directory)
+        queue_locks.free(queues)
+        game.close()
+        janitor.forget(directory)
 
 
 def end_if_ours(game: Startable, directory: Path, owner_pid: int) -> None:

@@ -27,6 +27,10 @@ def main(owner_pid: int, directory: str, log: str, engine: str, arguments: list[
             Path(f"/dev/shm/ViZDoom{queue}{instance_id}").unlink(missing_ok=True)
         sys.exit(1)
     os.setpgid(0, 0)  # the terminal's Ctrl-C is for the owner. No session: see gvz/transport/child.py
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # the owner blocks them: what came until now ...
+        before = signal.signal(number, signal.SIG_IGN)  # ... is dropped
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {number})
+        signal.signal(number, before)
     os.chdir(directory)  # the engine writes _vizdoom/ here ...
     os.environ["HOME"] = directory  # ... and would look for its settings in the user's home
     os.environ["ALSOFT_DRIVERS"] = "null"  # we play no sound, but OpenAL would leave /tmp/pulse-... of every engine

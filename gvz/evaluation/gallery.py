@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from gvz.core.env_config import EnvConfig
+from gvz.core.files import written_whole
 from gvz.core.libraries import require_learner
 from gvz.engine.engine import Engine, EngineConfig
 from gvz.engine.probe import ensure_loads
@@ -217,7 +218,9 @@ def write_contact_sheet(scenario: Scenario, directory: Path, kind: str = "galler
     """Writes `<kind>_<scenario>.png`, a sheet of `SHEETS`, and returns its path."""
     file, sheet = directory / f"{kind}_{scenario.id}.png", SHEETS[kind](scenario)
     # the game has 256 colours: as a palette, the same picture is a third of the size
-    sheet.quantize(256, dither=Image.Dither.NONE).save(file, optimize=True)
+    picture = sheet.quantize(256, dither=Image.Dither.NONE)
+    with written_whole(file) as writing:
+        picture.save(writing, optimize=True)
     return file
 
 
@@ -254,5 +257,7 @@ def write_moving_picture(file: Path) -> Path:
         columns.append(column)
     pictures = [tiled(cells, 2) for cells in zip(*columns, strict=True)]
     frame_ms = 1000 * EnvConfig().frame_skip // TICS_PER_SECOND
-    pictures[0].save(file, save_all=True, append_images=pictures[1:], duration=frame_ms, loop=0, quality=50, method=6)
+    more = pictures[1:]
+    with written_whole(file) as writing:
+        pictures[0].save(writing, save_all=True, append_images=more, duration=frame_ms, loop=0, quality=50, method=6)
     return file

@@ -18,46 +18,27 @@ SUFFIXES = (".mp4", ".gif", ".webp")
 
 
 def check_video_file(file: Path) -> None:
-    """Checks that `write_video` can write this file.
+    """Checks that `write_video` can write such a file.
 
     Raises:
-        ConfigError: another kind of file, PyAV is missing for an MP4, or no such file can be made.
+        ConfigError: another kind of file, or PyAV is missing for an MP4.
     """
     if file.suffix not in SUFFIXES:
         raise ConfigError(f"--out: got {file.name}, want a name that ends with {', '.join(SUFFIXES)}")
     if file.suffix == ".mp4" and importlib.util.find_spec("av") is None:
         raise ConfigError("--out: .mp4 needs PyAV: pip install 'gvizdoom[video]', or write .webp or .gif")
-    if file.is_dir():
-        raise ConfigError(f"--out: {file} is a directory; want the name of a file")
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        _writing(file).touch()
-        _writing(file).unlink()
-    except OSError as error:
-        raise ConfigError(f"--out: {file} cannot be made: {error.strerror}") from error
 
 
 def write_video(file: Path, pictures: Iterable[Image.Image], rate: Fraction) -> None:
-    """Writes a video; the file appears once it is whole.
+    """Writes a video.
 
     Args:
         file: where to; its suffix, one of SUFFIXES, says which kind.
         pictures: at least one, all of one size, both sides even. Each is read before the next one is taken.
         rate: pictures a second.
     """
-    writing = _writing(file)
-    try:
-        if file.suffix == ".mp4":
-            _write_mp4(writing, pictures, rate)
-        else:
-            _write_animation(writing, pictures, rate)
-        writing.replace(file)
-    finally:
-        writing.unlink(missing_ok=True)
-
-
-def _writing(file: Path) -> Path:
-    return file.with_name(f".writing-{file.name}")
+    write = _write_mp4 if file.suffix == ".mp4" else _write_animation
+    write(file, pictures, rate)
 
 
 def add_to_tensorboard(gif: Path, directory: Path, tag: str, step: int) -> None:

@@ -4,7 +4,6 @@ import contextlib
 import multiprocessing
 import os
 import queue
-import signal
 import traceback
 from collections.abc import Callable, Generator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -16,6 +15,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from gvz.core import janitor
 from gvz.core.errors import GvzError
+from gvz.core.stop import blocked_signals, ignore_signals, uninterrupted
 from gvz.transport.child import one_core
 
 P = ParamSpec("P")
@@ -38,15 +38,16 @@ def worker_processes(num_workers: int, died: str) -> Generator[Executor, None, N
     try:
         executor.start()
         yield executor
+        executor.shutdown(cancel_futures=True)
         ended = True
     except BrokenProcessPool as error:
         raise GvzError(died) from error
     finally:
         if not ended:  # what they do is not wanted any more, and one of them may hang
-            executor.kill()
-        executor.shutdown(wait=True, cancel_futures=True)
-        if not ended:
-            janitor.clean_dead_instances()
+            with uninterrupted():
+                executor.kill()
+                executor.shutdown(cancel_futures=True)
+                janitor.clean_dead_instances()
 
 
 class _Processes(Executor):
@@ -73,7 +74,7 @@ class _Processes(Executor):
             try:
                 ours, theirs = _SPAWN.Pipe()
                 self._pipes.append(ours)
-                with theirs:
+                with theirs, blocked_signals():
                     process = _SPAWN.Process(target=_work, args=(os.getpid(), theirs), daemon=True)
                     process.start()
             except OSError as error:
@@ -117,8 +118,7 @@ class _Processes(Executor):
 def _work(parent_pid: int, pipe: Connection) -> None:
     """The life of a process: calls come over the pipe, results or errors go back."""
     janitor.die_with_parent(parent_pid)
-    for number in (signal.SIGINT, signal.SIGTERM):  # they go to the whole process group; the parent ends this process
-        signal.signal(number, signal.SIG_IGN)
+    ignore_signals()  # they go to the whole process group; the parent ends this process
     os.set_inheritable(pipe.fileno(), False)  # it is to close with this process, not with its engines
     os.environ |= one_core()
     with contextlib.suppress(EOFError, ConnectionError):

@@ -17,7 +17,7 @@ from gvz.run.rundir import EVALUATION_RECORDS
 
 END_MARK = "# ended with exit code "
 """begins the line that closes a command's part of a log"""
-STOPPED_CODES = (130, 143)
+STOPPED_CODES = (129, 130, 143)
 """exit codes of a job that saved its run and stopped after a signal"""
 
 PROCESSOR_S = "run/processor_s"

@@ -18,6 +18,7 @@ from matplotlib.rcsetup import cycler
 from matplotlib.ticker import FuncFormatter
 from PIL import Image
 
+from gvz.core.files import written_whole
 from gvz.evaluation.statistics import Estimate
 from gvz.reports.curves import Curve
 from gvz.reports.document import Figure
@@ -276,18 +277,17 @@ def _short_number(value: float, _: int) -> str:
 
 
 def _written(picture: Picture, out: Path, id: str, caption: str, *, wide: bool = False) -> Figure:
-    directory = out / "figures"
-    directory.mkdir(parents=True, exist_ok=True)
     layout = picture.get_layout_engine()
     assert layout is not None
     layout.execute(picture)
     picture.set_layout_engine("none")  # once for all three files: it takes longer than drawing
-    svg = io.BytesIO()
+    svg, pdf, png, small_png = (io.BytesIO() for _ in range(4))
     picture.savefig(svg, format="svg", metadata={"Date": None})
-    picture.savefig(directory / f"{id}.pdf", metadata={"CreationDate": None})
-    png = io.BytesIO()
+    picture.savefig(pdf, format="pdf", metadata={"CreationDate": None})
     picture.savefig(png, dpi=150)
     # 256 colours show the same figure in a third of the bytes.
-    Image.open(png).convert("RGB").quantize(dither=Image.Dither.NONE).save(directory / f"{id}.png", optimize=True)
-    (directory / f"{id}.svg").write_bytes(svg.getvalue())
+    Image.open(png).convert("RGB").quantize(dither=Image.Dither.NONE).save(small_png, format="png", optimize=True)
+    for suffix, data in (("svg", svg), ("pdf", pdf), ("png", small_png)):
+        with written_whole(out / "figures" / f"{id}.{suffix}") as writing:
+            writing.write_bytes(data.getvalue())
     return Figure(id=id, caption=caption, svg=svg.getvalue(), wide=wide)

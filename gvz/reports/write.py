@@ -9,6 +9,7 @@ from pathlib import Path
 import jinja2
 from markupsafe import Markup, escape
 
+from gvz.core.files import written_whole
 from gvz.reports.document import Cell, Document, Figure, Table
 
 _TEMPLATES = Path(__file__).parent / "templates"
@@ -34,7 +35,8 @@ def write_document(document: Document) -> list[Path]:
         files[f"tables/{table.id}.tex"] = to_latex(table)
     (document.out / "tables").mkdir(parents=True, exist_ok=True)
     for name, text in files.items():
-        (document.out / name).write_text(text)
+        with written_whole(document.out / name) as writing:
+            writing.write_text(text)
     return [document.out / name for name in files]
 
 

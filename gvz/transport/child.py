@@ -148,7 +148,7 @@ class ChildProcess:
 def begin(parent_pid: int, descriptor: int, *, parent: str, last_signal: int = signal.SIGKILL) -> Channel:
     """What such a process does first; returns its end of the channel.
 
-    Ctrl-C is left to the parent. SIGTERM raises SystemExit, once. SIGUSR1 writes the stacks of all threads.
+    Ctrl-C and SIGHUP are left to the parent. SIGTERM raises SystemExit, once. SIGUSR1 writes the stacks of all threads.
 
     Args:
         parent_pid: as given on the command line.
@@ -163,6 +163,7 @@ def begin(parent_pid: int, descriptor: int, *, parent: str, last_signal: int = s
         sys.exit(128 + number)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, leave)
     janitor.die_with_parent(parent_pid, last_signal)
     faulthandler.enable()

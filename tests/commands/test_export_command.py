@@ -8,6 +8,7 @@ import polars as pl
 import pytest
 
 from gvz import cli
+from tests.full_disk import full_disk
 
 
 @pytest.fixture
@@ -64,6 +65,18 @@ def test_compressed_records_and_starts_are_tables_too(run_dirs, tmp_path, capsys
     starts = pl.read_csv(tmp_path / "t" / "starts.csv")
     assert starts["cores"].to_list() == [2]
     assert json.loads(starts["versions"][0]) == {"jax": "0.7"}
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_a_full_disk_is_one_line_and_leaves_the_table_of_before(kind, run_dirs, tmp_path, capsys):
+    table = tmp_path / "tables" / f"metrics.{kind}"
+    table.parent.mkdir()
+    table.write_text("of before")
+    with full_disk(50):
+        assert cli.main(["export", str(run_dirs[0]), "--format", kind, "--out", str(table.parent)]) == 1
+    printed = capsys.readouterr()
+    assert printed.err == "error: File too large; make room or give a place that you can write to\n"
+    assert [(file, file.read_text()) for file in table.parent.iterdir()] == [(table, "of before")]
 
 
 def test_tables_of_an_earlier_export_that_are_not_written_again_are_removed(run_dirs, tmp_path, capsys):

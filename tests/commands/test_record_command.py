@@ -29,7 +29,7 @@ from tests.waiting import wait_until
             "--profile: got levdoom, but small keeps the rules that it was trained by, ",
         ),
         ("{run} --encoder none.py --out v.webp", "--encoder: no file none.py here ("),
-        ("{run} --out {file}/v.webp", "cannot be made: File exists"),
+        ("{run} --out {file}/v.webp", "cannot be written: File exists; give a place"),
         ("{run} --out v.webp --seconds 0", "--seconds: got 0, want more than 0"),
         ("{run} --out v.webp --seconds nan", "--seconds: got nan, want more than 0"),
         ("{run} --out {tmp_path}/d.webp", "d.webp is a directory; want the name of a file"),
@@ -96,7 +96,7 @@ def test_tensorboard_gets_the_animation_at_the_policys_gradient_step(small_run, 
 
 
 @pytest.mark.engine
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_an_interrupted_recording_leaves_nothing(tmp_path, number, code):
     command = [
         *(sys.executable, "-m", "gvz.cli", "record", "--player", "scripted", "--task", "defend_the_center/default"),

@@ -19,13 +19,12 @@ from gvz.segmentation import SEGMENTERS
     [
         ("--scenario seek_and_kil --out n.onnx", "unknown scenario 'seek_and_kil' (did you mean 'seek_and_kill'?)"),
         ("--scenario seek_and_kill --out n.pt", "--out: got n.pt, want a name that ends in .onnx"),
-        ("--scenario seek_and_kill --out none/n.onnx", "--out: none is no directory"),
         ("--scenario seek_and_kill --out n.onnx --frames 0", "--frames: got 0, want at least 1"),
         ("--scenario seek_and_kill --out n.onnx --gate-frames 0", "--gate-frames: got 0, want at least 1"),
         ("--scenario seek_and_kill --out n.onnx --processor-s 0", "--processor-s: got 0, want more than 0"),
         ("--scenario seek_and_kill --out n.onnx --workers -1", "--workers: got -1, want at least 0"),
         ("--scenario seek_and_kill --out n.onnx --seed -1", "--seed: got -1, want at least 0"),
-        ("--scenario seek_and_kill --out /proc/n.onnx", "--out: /proc/n.onnx cannot be written: "),
+        ("--scenario seek_and_kill --out /proc/n.onnx", "/proc/n.onnx cannot be written: "),
     ],
 )
 def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, tmp_path, monkeypatch):
@@ -77,7 +76,7 @@ def test_a_network_that_was_not_scored_has_no_record_of_the_one_before_it(capsys
 @pytest.mark.engine
 @pytest.mark.parametrize("workers", [0, 2])
 def test_a_network_is_trained_scored_and_played_with(workers, capsys, tmp_path):
-    file = tmp_path / "mine.onnx"
+    file = tmp_path / "new" / "mine.onnx"
     flags = f"--scenario health_gathering --training-set train4 --out {file} --frames 20 --gate-frames 60"
     flags += f" --workers {workers}"
     assert cli.main([*"segmenter --processor-s 15".split(), *flags.split()]) == 0

@@ -1,10 +1,13 @@
-"""Files below a directory, by links, too."""
+"""Files below a directory, by links, too; and files that are written whole."""
 
 from pathlib import Path
 
 import pytest
 
-from gvz.core.files import files_below
+from gvz.core import records
+from gvz.core.errors import ConfigError
+from gvz.core.files import files_below, written_whole
+from tests.full_disk import full_disk
 
 
 @pytest.fixture
@@ -67,3 +70,59 @@ def test_a_second_name_of_a_run_does_not_take_its_place(here, tmp_path):
     (here / "best").unlink()
     (here / "best").symlink_to(tmp_path / "scratch" / "b")
     assert found(here) == BOTH
+
+
+def test_a_file_appears_when_it_is_whole(tmp_path):
+    file = tmp_path / "new" / "report.md"
+    for text in ("long before", "now"):
+        with written_whole(file) as writing:
+            writing.write_text(text)
+            assert not file.exists() or file.read_text() == "long before"
+        assert file.read_text() == text
+    assert list(file.parent.iterdir()) == [file]
+
+
+def test_a_full_disk_leaves_what_was_there_before(tmp_path):
+    file = tmp_path / "report.md"
+    file.write_text("before")
+    with pytest.raises(OSError, match="File too large"), full_disk(3), written_whole(file) as writing:
+        writing.write_text("after")
+    assert [(path, path.read_text()) for path in tmp_path.iterdir()] == [(file, "before")]
+
+
+def test_an_interruption_while_it_is_made_leaves_nothing(tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(records, "lock", interrupted)
+    with pytest.raises(KeyboardInterrupt), written_whole(tmp_path / "report.md"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_process_at_a_time_writes_a_file(tmp_path):
+    file = tmp_path / "report.md"
+    with written_whole(file) as writing:
+        writing.write_text("ours")
+        with pytest.raises(ConfigError, match=r"report\.md is being written by another process"), written_whole(file):
+            pass
+    assert file.read_text() == "ours"
+
+
+def test_what_a_killed_process_left_is_written_over(tmp_path):
+    (tmp_path / ".writing-report.md").write_text("half of something long")
+    with written_whole(tmp_path / "report.md") as writing:
+        assert writing.read_text() == ""
+        writing.write_text("whole")
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("report.md", "whole")]
+
+
+def test_a_place_that_cannot_be_written_is_an_error(tmp_path):
+    (tmp_path / "file").touch()
+    with (
+        pytest.raises(ConfigError, match=r"b\.md cannot be written: File exists; give"),
+        written_whole(tmp_path / "file" / "b.md"),
+    ):
+        pass
+    with pytest.raises(ConfigError, match="is a directory; want the name of a file"), written_whole(tmp_path):
+        pass

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import vizdoom
 
@@ -114,6 +115,19 @@ def test_close_leaves_nothing_and_may_be_repeated(engine: Engine):
     ):
         with pytest.raises(EngineError, match="it was closed, or died before"):
             use()
+
+
+def test_an_interrupted_close_leaves_nothing(engine: Engine, monkeypatch: pytest.MonkeyPatch):
+    clean = janitor.clean_engine
+
+    def interrupted(directory: Path) -> list[str]:
+        signal.raise_signal(signal.SIGINT)
+        return clean(directory)
+
+    monkeypatch.setattr(janitor, "clean_engine", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        engine.close()
+    assert traces(engine) == []
 
 
 def test_a_forgotten_engine_leaves_nothing():
@@ -241,6 +255,11 @@ def test_the_terminals_ctrl_c_is_not_for_the_engine(engine: Engine):
     assert os.getpgid(engine.pid) == engine.pid != os.getpgid(0)
 
 
+def test_an_engine_blocks_no_signal_although_its_launcher_did(engine: Engine):
+    status = dict(line.split(":\t") for line in Path(f"/proc/{engine.pid}/status").read_text().splitlines())
+    assert int(status["SigBlk"], 16) == 0
+
+
 def test_a_hung_engine_can_be_closed(engine: Engine):
     os.kill(engine.pid, signal.SIGSTOP)
     start = time.monotonic()
@@ -291,6 +310,46 @@ def test_an_interrupted_start_leaves_nothing_and_does_not_abort_the_process(tmp_
         assert process.communicate(timeout=60) == ("", "")
         assert process.returncode == 0
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_signal_of_the_terminal_does_not_end_a_launcher_and_so_its_client(tmp_path: Path):
+    """The launcher is in the client's process group until it is an engine."""
+    code = (
+        "import signal; from gvz.engine import process\n"
+        "write = process.write_launcher\n"
+        "def stopping(*arguments):\n"
+        "    file = write(*arguments)\n"
+        "    begin, become = file.read_text().split('exec ')\n"
+        "    file.write_text(f'{begin}kill -STOP $$\\nexec {become}')\n"
+        "    return file\n"
+        "process.write_launcher = stopping\n"
+        "for number in (signal.SIGTERM, signal.SIGHUP): signal.signal(number, signal.default_int_handler)\n"
+        "for attempt in range(3):\n"
+        "    try: Engine(config)\n"
+        "    except KeyboardInterrupt: print('interrupted', flush=True)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", HEAD + code],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+        process_group=0,
+    ) as process:
+        assert process.stdout is not None
+        launchers: set[psutil.Process] = set()
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            [launcher] = wait_until(lambda: stopped_children(process) - launchers, "the launcher", process=process)
+            launchers.add(launcher)
+            os.killpg(process.pid, number)
+            assert process.stdout.readline() == "interrupted\n"
+        for launcher in launchers:
+            launcher.send_signal(signal.SIGCONT)
+        assert process.wait(60) == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def stopped_children(process: "subprocess.Popen[str]") -> set[psutil.Process]:
+    return {child for child in psutil.Process(process.pid).children() if child.status() == psutil.STATUS_STOPPED}
 
 
 def test_a_second_interruption_does_not_wait_for_the_engine_that_starts(tmp_path: Path):

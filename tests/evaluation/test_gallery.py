@@ -13,6 +13,7 @@ from gvz.evaluation.gallery import (
     COLUMNS,
     FRAME_HEIGHT,
     FRAME_WIDTH,
+    SHEETS,
     moving_frames,
     task_frame,
     task_sight,
@@ -25,6 +26,7 @@ from gvz.scenarios.compiler import task_content
 from gvz.scenarios.find_ammunition import DECOYS
 from gvz.tasks import LEVELS, all_scenarios, named_tasks, parse_task, scenarios
 from learner.augment import AUGMENTATIONS
+from tests.full_disk import full_disk
 
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
 
@@ -178,6 +180,17 @@ def test_segmented_sheets_are_drawn_of_the_scenarios_that_have_a_network(tmp_pat
     )
     assert gallery.COMMAND(out=tmp_path, kind="segmented").run() == 0
     assert drawn == [(name, "segmented") for name in scenarios()]
+
+
+def test_on_a_full_disk_the_sheet_of_before_stays_whole(tmp_path, monkeypatch):
+    noise = Image.fromarray(np.random.default_rng(1).integers(0, 256, (64, 64, 3), np.uint8))
+    monkeypatch.setitem(SHEETS, "gallery", lambda _: noise)
+    [scenario, *_] = scenarios().values()
+    file = write_contact_sheet(scenario, tmp_path)
+    before = file.read_bytes()
+    with full_disk(100), pytest.raises(OSError, match="File too large"):
+        write_contact_sheet(scenario, tmp_path)
+    assert [(path, path.read_bytes()) for path in tmp_path.iterdir()] == [(file, before)]
 
 
 def test_the_sheet_of_severities_in_the_docs_shows_every_attribute():

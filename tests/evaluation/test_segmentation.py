@@ -23,7 +23,7 @@ from gvz.core.errors import GvzError
 from gvz.env import DoomEnv
 from gvz.evaluation import segmentation
 from gvz.evaluation.segmentation import BatchSpec
-from gvz.evaluation.workers import worker_processes
+from gvz.evaluation.workers import _Processes, worker_processes
 from gvz.scenarios.base import Textures
 from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, network_input
 from gvz.tasks import parse_task
@@ -199,6 +199,23 @@ def test_a_worker_that_cannot_be_started_is_told_and_those_before_it_end():
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, limits)
     assert set(multiprocessing.active_children()) <= before
+
+
+def test_a_second_ctrl_c_comes_after_the_clean_up(monkeypatch):
+    before, left, kill = set(multiprocessing.active_children()), [], _Processes.kill
+
+    def interrupted(processes):
+        signal.raise_signal(signal.SIGINT)
+        kill(processes)
+
+    monkeypatch.setattr(_Processes, "kill", interrupted)
+    monkeypatch.setattr(
+        janitor, "clean_dead_instances", lambda: left.append(set(multiprocessing.active_children()) - before)
+    )
+    with pytest.raises(KeyboardInterrupt) as raised, worker_processes(1, "died"):
+        raise KeyboardInterrupt("the first")
+    assert raised.value.args == ()
+    assert left == [set()]
 
 
 def test_a_worker_s_error_is_raised_here_and_the_worker_goes_on():

@@ -1,6 +1,7 @@
 """The same document in four forms: nothing is lost, nothing is mistaken for something else."""
 
 import csv
+import dataclasses
 import io
 
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from gvz.evaluation.statistics import Estimate
 from gvz.reports.document import Block, Document, Figure, Link, Section, Table, missing, ours, theirs, words
 from gvz.reports.write import leftovers, to_csv, to_html, to_latex, to_markdown, write_document
+from tests.full_disk import full_disk
 
 TABLE = Table(
     id="t",
@@ -76,6 +78,14 @@ def test_everything_is_written(tmp_path):
         "tables/t.tex",
     ]
     assert all(file.stat().st_size for file in written)
+
+
+def test_on_a_full_disk_the_report_of_before_stays_whole(tmp_path):
+    before = {file: file.read_text() for file in write_document(document(tmp_path))}
+    longer = dataclasses.replace(document(tmp_path), title="T" * 10_000)
+    with full_disk(10_000), pytest.raises(OSError, match="File too large"):
+        write_document(longer)
+    assert {file: file.read_text() for file in tmp_path.rglob("*.*")} == before
 
 
 def test_a_table_whose_rows_have_not_its_columns_is_a_mistake():

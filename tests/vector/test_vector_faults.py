@@ -76,6 +76,17 @@ def second_seeds(seed: int) -> list[int]:
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed))).integers(2**31, size=2).tolist()
 
 
+def test_ctrl_c_and_a_closed_terminal_are_not_for_the_workers(envs: DoomVectorEnv):
+    envs.reset(seed=1)
+    before = list(envs._crew.pids)
+    for pid in before:
+        os.kill(pid, signal.SIGINT)
+        os.kill(pid, signal.SIGHUP)
+    _, _, _, truncated, _ = envs.step(TURN)
+    assert not truncated.any()
+    assert envs._crew.pids == before
+
+
 def test_a_worker_that_dies_at_an_episodes_begin_begins_it_again(envs: DoomVectorEnv):
     first, _ = envs.reset(seed=1)
     os.kill(envs._crew.pids[0], signal.SIGKILL)
