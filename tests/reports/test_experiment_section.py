@@ -135,6 +135,13 @@ def test_seeds_of_agents_of_single_tasks_are_redrawn_for_each_task(agents_of_tas
     assert estimate(scores, ("one", "other")).estimate == Estimate(value=5.0, low=ends[0], high=ends[1])
 
 
+def test_the_only_seed_that_has_all_tasks_has_an_interval_over_its_episodes():
+    cell = estimate(Scores(runs={1: {"one": np.array([0.0, 10.0] * 9)}, 2: {}}, wanted_seeds=(1, 2)), ["one"])
+    assert cell.estimate is not None
+    assert cell.estimate.low < cell.estimate.value == 5.0 < cell.estimate.high
+    assert cell.note == "1 of 2 seeds"
+
+
 def test_an_experiment_without_any_results_is_a_table_of_missing_cells(tmp_path):
     experiment = experiment_named("algorithm_comparison")
     (tmp_path / "random.jsonl").touch()
