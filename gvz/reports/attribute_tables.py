@@ -18,7 +18,7 @@ def attribute_tables(scenario: Scenario, scores: Mapping[str, Scores], tasks: Se
     default = ids.get(frozenset())
     names = [attribute.name for attribute in scenario.attributes]
     singles = sorted(
-        (task for task in tasks if len(task.attributes) == 1),
+        (task for task in tasks if len(task.attributes) == 1 and task.maps is None),
         key=lambda task: (names.index(task.attributes[0]), task.severity(task.attributes[0])),
     )
     if default is None or not singles:

@@ -79,10 +79,7 @@ class Curriculum:
         rank[np.argsort(-progress, kind="stable")] = np.arange(1, len(progress) + 1)
         by_rank = (1 / rank) ** (1 / config.temperature)
         stale = self._num_draws - self._last_draw
-        by_staleness = stale if stale.any() else np.ones(len(stale))
-        return (1 - config.staleness_share) * by_rank / by_rank.sum() + (
-            config.staleness_share * by_staleness / by_staleness.sum()
-        )
+        return (1 - config.staleness_share) * by_rank / by_rank.sum() + config.staleness_share * stale / stale.sum()
 
     def _count(self, task: int, percent: float) -> None:
         window, recent = self._config.window_episodes, self._recent[task]

@@ -58,6 +58,8 @@ def test_the_bound_is_the_profiles(tmp_path):
     file = tmp_path / "random.jsonl"
     file.write_text(line(profile="levdoom", score=2100.0) + line(normalized_score=12.5, episode=1))
     assert read_evaluations(file)["normalized_score"].to_list() == [100.0, 12.5]
+    file.write_text(line(profile=None))  # of an earlier version
+    assert read_evaluations(file).select("level", "normalized_score").rows() == [(1, 50.0)]
 
 
 def test_rows_of_a_run_say_what_it_was_trained_on(tmp_path):
@@ -106,7 +108,11 @@ def test_episodes_of_a_file_elsewhere_of_which_there_are_several_runs_are_told_o
         (tmp_path / name / "evaluation.jsonl").write_text(line(**policy, params=name))
     (tmp_path / "mine.jsonl").write_text(line(**policy, params="a") + line(**policy, params="a", episode=1))
     frame, (problem,) = collect_evaluations([tmp_path])
-    assert frame.filter(episode=1)["run_dir"].to_list() == [str(tmp_path)]
+    assert frame.select("episode", "run_dir").rows() == [
+        (0, str(tmp_path / "a")),
+        (0, str(tmp_path / "b")),
+        (1, str(tmp_path)),
+    ], "what a run holds is not taken for another run's"
     assert problem.startswith(f"{tmp_path}: has episodes of r, training seed 1, of which there are 2 run directories")
 
 
@@ -116,6 +122,9 @@ def test_two_players_of_one_name_are_told_of(tmp_path):
     frame, (problem,) = collect_evaluations([tmp_path])
     assert problem.startswith("human: 1 of its episodes were found with several results, of which the first is kept")
     assert frame["score"].to_list() == [550.0, 550.0]
+    (tmp_path / "yours.jsonl").write_text(line(player="human", episode=1, length_frames=8))
+    _, (problem,) = collect_evaluations([tmp_path])
+    assert problem.startswith("human: 1 of its episodes were found with several results"), "the score is at its bound"
 
 
 def test_two_policies_of_one_name_are_told_of(tmp_path):

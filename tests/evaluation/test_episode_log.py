@@ -16,6 +16,7 @@ from gvz.evaluation.episode_log import (
     missing_jobs,
     play_and_record,
     read_rows,
+    rows_of,
     simple_player,
     wanted_episodes,
 )
@@ -49,6 +50,9 @@ def test_only_rows_of_the_same_player_rules_and_base_seed_count(file):
         row("idle", 0),  # as written before there were base seeds
         row("random", 1),
         row("idle", 2, profile="levdoom"),
+        row("idle", 2, frame_skip=1),
+        row("idle", 2, action_set="buttons"),
+        row("idle", 2, observes="labels"),
         row("idle", 3, num_updates=5),
         row("idle", 1, base_seed=5),
     ):
@@ -58,6 +62,12 @@ def test_only_rows_of_the_same_player_rules_and_base_seed_count(file):
     assert sorted(job[1] for job in jobs) == [
         *((TASK.id, 0, 5), (TASK.id, 1, 0), (TASK.id, 2, 0), (TASK.id, 2, 5), (TASK.id, 3, 5))
     ]
+
+
+def test_of_two_rows_of_one_episode_the_first_counts(file):
+    for score in (1.0, 2.0):
+        file.append(row("idle", 0, score=score))
+    assert [one["score"] for one in rows_of(IDLE, file.rows).values()] == [1.0]
 
 
 def test_a_half_written_line_is_cut_off(tmp_path):

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections import Counter
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -159,6 +160,37 @@ def test_batches_hold_screens_and_labels_of_all_tasks_and_follow_from_their_numb
         again, labels_again = made.batch(number)
         np.testing.assert_array_equal(again, screens)
         np.testing.assert_array_equal(labels_again, labels)
+
+
+def test_most_views_are_changed_and_moved_and_have_the_surroundings_that_gain_most(monkeypatch):
+    """Of 300 views; each step is noted instead of done, and surroundings gain by their depth."""
+    noted, drawn = Counter[str](), list[int]()
+
+    def gained(shots, surroundings) -> int:
+        assert len(shots) == 3, "a frame and two others"
+        drawn.append(int(surroundings.depth[0, 0]))
+        return drawn[-1]
+
+    def changed(_rng, shot, surroundings, _decorations, others, styles, tints_and_patches):
+        noted["changed"] += 1
+        assert (len(others), styles, tints_and_patches) == (2, ["STYLE_Shadow"], False)
+        assert surroundings.depth[0, 0] == max(drawn[-3:])
+        return shot.frame, shot.labels
+
+    def noting(name: str):
+        return lambda *given: (noted.update([name]), [one for one in given if isinstance(one, np.ndarray)])[1]
+
+    monkeypatch.setattr(segmentation, "num_pixels_gained", gained)
+    monkeypatch.setattr(segmentation, "changed_view", changed)
+    for name in ("moved", "shrunk", "mirrored"):
+        monkeypatch.setattr(segmentation, name, noting(name))
+    frames, labels = np.zeros((1, 2, 2, 3), np.uint8), np.zeros((1, 2, 2), np.uint8)
+    tasks = [segmentation.Labelled(frames, labels, labels + n, "STYLE_Shadow" if n else None) for n in range(4)]
+    segmentation.Batches(tasks, BatchSpec(300, seed=0, tints_and_patches=False)).batch(0)
+    assert len(drawn) == 3 * noted["changed"]
+    assert noted["mirrored"] == noted["moved"] + noted["shrunk"] == 300
+    assert noted["changed"] == pytest.approx(300 * 0.85, abs=24)
+    assert noted["moved"] == pytest.approx(300 * 0.85 * 0.7, abs=32)
 
 
 @pytest.mark.engine

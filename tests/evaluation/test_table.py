@@ -21,6 +21,8 @@ def test_rows_of_earlier_versions_have_what_follows_from_their_score_and_count_o
     rows.append({**rows[0], "score": 1100.0})
     (row,) = score_rows(rows, {"player": "p"}, [default], episodes=9)
     assert (row["episodes"], row["score"], row["normalized_score"]) == (2, 110.0, 10.0)
+    (row,) = score_rows([*rows, {**rows[0], "base_seed": 5}], {"player": "p"}, [default], episodes=9)
+    assert row["episodes"] == 3, "another base seed has other episodes"
     (row,) = score_rows([{**rows[0], "profile": "levdoom", "score": 210.0}], {"player": "p"}, [default], episodes=9)
     assert row["normalized_score"] == 10.0, "of 2100 frames"
     (kills, *_) = named_tasks("seek_and_kill")
@@ -41,6 +43,8 @@ def test_own_kills_stand_beside_a_score_that_is_kills():
     assert first.split()[6:9] == ["3.0", "[3.0,", "3.0]"]
     assert last.split()[3:6] == ["4.5", "[4.5,", "4.5]"]
     assert found[0]["player_kills_high"] == 3.0
+    older = {"player": "p", "task": default.id, "episode": 1, "score": 8.0, "normalized_score": 40.0}
+    assert score_rows([*rows, older], {"player": "p"}, [default], episodes=2)[0]["player_kills"] is None
     mixed = score_rows(rows, {"player": "p"}, [default, gore], episodes=1)
     assert [one["player_kills"] is None for one in mixed] == [False, True, True]
     _, first, second, _ = score_lines(mixed)

@@ -83,6 +83,7 @@ def test_a_run_with_a_limit_of_processor_time_is_trained_when_its_last_row_has_i
         return progress.run_progress(tmp_path, run, evaluation)
 
     assert not found(180, 59.9).trained
+    assert found(180, 60.0).trained
     assert not found(200, 60.1).trained, "its last policy is not saved yet"
     assert found(180, 60.1) == progress.RunProgress(
         num_updates=180, processor_s=60.1, trained=True, missing={180: 2}, absent=0
@@ -140,6 +141,8 @@ def test_a_job_s_state_is_read_from_its_lock_its_results_and_its_log(tmp_path):
     assert progress.last_words(log) == ["launching", "error: the disk is full"]
     assert progress.job_state(tmp_path, "a/b", done=True, begun=True) == "done"
     log.write_text("# ended with exit code 130 after 3 s\n")
+    assert progress.job_state(tmp_path, "a/b", done=False, begun=False) == "stopped", "before it saved anything"
+    log.write_text("# ended with exit code 143 after 3 s\n")
     assert progress.job_state(tmp_path, "a/b", done=False, begun=True) == "stopped"
     log.write_text("killed in the midd")
     assert progress.job_state(tmp_path, "a/b", done=False, begun=True) == "stopped"

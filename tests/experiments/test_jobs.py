@@ -70,7 +70,9 @@ def test_a_trained_run_with_more_processor_time_is_known(saved, used, changed, t
     job = RunJob(results=tmp_path, run=run, evaluation=EVALUATION, scale=1)
     directory = progress.run_directory(tmp_path, run)
     directory.mkdir(parents=True)
-    config = dataclasses.replace(parse(training_flags(run, 1)).run, max_processor_s=saved)
+    config = parse(training_flags(run, 1)).run
+    actors = dataclasses.replace(config.actors, num_actors=3, games_per_actor=5)  # of another machine
+    config = dataclasses.replace(config, max_processor_s=saved, actors=actors)
     (directory / "config.json").write_text(json.dumps(config_to_dict(config)))
     (directory / "metrics.jsonl").write_text(json.dumps({"num_updates": 9, progress.PROCESSOR_S: used}) + "\n")
     assert job.other_settings() == changed

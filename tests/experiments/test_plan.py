@@ -50,6 +50,7 @@ def test_shards_are_disjoint_alike_and_together_everything(count, num_items):
 def test_an_evaluation_joined_with_another_has_the_tasks_of_both_and_the_more_episodes():
     both = Evaluation(tasks=("a", "b"), episodes=2).joined(("b", "c"), 5)
     assert both == Evaluation(tasks=("a", "b", "c"), episodes=5)
+    assert both.joined(("c",), 1) == both
 
 
 def test_plan_json_gathers_what_was_asked_for(tmp_path):

@@ -1,5 +1,7 @@
 """What --scale makes of experiments and of runs."""
 
+import dataclasses
+
 import pytest
 
 from gvz.core.errors import ConfigError
@@ -25,6 +27,15 @@ def test_a_tenth_has_a_tenth_of_updates_and_episodes_and_keeps_grid_and_checkpoi
     assert settings["agent.epsilon_decay_steps"] == 5_000
     assert settings["replay.capacity"] == 16_384  # not below the floor
     assert "env.frame_height" not in settings
+    assert scaled(experiments()["general_short"], 0.1).max_processor_s == 90.0
+
+
+def test_a_scale_makes_nothing_larger_than_the_config_has_it():
+    config = load_config("rainbow_quick")
+    learner = dataclasses.replace(config.learner, warmup_steps=100)
+    config = dataclasses.replace(config, learner=learner, replay=dataclasses.replace(config.replay, capacity=10_000))
+    settings = scaled_settings(config, 7_500, 0.5)
+    assert (settings["learner.warmup_steps"], settings["replay.capacity"]) == (100, 10_000)
 
 
 def test_below_a_tenth_there_is_one_seed():

@@ -206,6 +206,7 @@ def test_two_commands_in_one_directory_are_one_queue(tmp_path):
         (None, range(1), (), [(0,)]),
         (3, range(2), (), [(0,), (1,), (0,)]),
         (None, range(4), ("0",), [(0, 1, 2, 3)]),
+        (None, range(2), ("0", "1", "2"), [(0,), (1,)]),
     ],
 )
 def test_cores_are_shared_out(jobs, cores, devices, shares):
@@ -216,6 +217,8 @@ def test_jobs_of_one_gpu_share_its_memory():
     slots = make_slots(4, range(8), ("0", "3"))
     assert [slot.environment["CUDA_VISIBLE_DEVICES"] for slot in slots] == ["0", "3", "0", "3"]
     assert {slot.environment["XLA_PYTHON_CLIENT_MEM_FRACTION"] for slot in slots} == {"0.450"}
+    shares = [slot.environment["XLA_PYTHON_CLIENT_MEM_FRACTION"] for slot in make_slots(3, range(8), ("0", "3"))]
+    assert shares == ["0.450"] * 3, "the first GPU has two of them"
     assert make_slots(2, range(8), ("0", "3"))[0].environment.keys() == {"CUDA_VISIBLE_DEVICES"}
 
 

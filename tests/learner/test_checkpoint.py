@@ -53,7 +53,10 @@ def save(run: Path, step: int, keep: int = 2, keep_from: int | None = None) -> N
     assert saver.outcome() == ""
 
 
-def test_what_is_written_is_read_back_exactly_and_silently(tmp_path, caplog):
+@pytest.mark.parametrize("block_bytes", [checkpoint.BLOCK_BYTES, 1000])
+def test_what_is_written_is_read_back_exactly_and_silently(tmp_path, caplog, monkeypatch, block_bytes):
+    """Whole, or the 50 frames of 192 bytes in blocks of 5."""
+    monkeypatch.setattr(checkpoint, "BLOCK_BYTES", block_bytes)
     save(tmp_path, 7)
     restored = checkpoint.restore_newest(tmp_path / "checkpoints", jax.eval_shape(example))
     assert caplog.text == ""
@@ -244,6 +247,14 @@ def test_a_snapshot_survives_donation_of_its_source():
     for _ in range(5):
         array = step(array)
     assert float(kept["x"].sum()) == 0.0
+
+
+def test_a_snapshot_stays_as_it_was_when_its_source_is_written_to():
+    """Windows of rollouts are arrays of numpy that go on being filled while a thread writes the checkpoint."""
+    array = np.zeros(3)
+    kept = checkpoint.snapshot({"x": array})
+    array[:] = 1.0
+    assert not kept["x"].any()
 
 
 def random_example(step: int, num_bytes: int = 300_000):

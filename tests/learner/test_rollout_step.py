@@ -307,6 +307,25 @@ def test_every_epoch_goes_through_every_step_once(num_minibatches: int, tmp_path
     assert metrics["number_max"] == steps.max()
 
 
+def test_every_epoch_and_every_rollout_has_an_order_of_its_own(tmp_path: Path):
+    agent, config = Counts(PQNConfig(), SPEC), replace(CONFIG, num_minibatches=2)
+    windows = replace(
+        made_up_windows(1), extras=np.arange(L * W, dtype=np.float32)[:, None], last=np.zeros(L * W, bool)
+    )
+
+    def learnt(state: rollout_step.OnPolicyState, num_updates: int) -> float:
+        state = compiled(agent, config)(jax.tree.map(jnp.copy, state), windows, np.int32(num_updates))
+        return num_updates * read_metrics(state, NAMES, tmp_path)[0]["squares"]
+
+    state = fresh_state(agent, config)
+    first, first_epoch, next_too = (learnt(state, num_updates) for num_updates in (1, 2, 3))
+    assert abs(first - (next_too - first_epoch)) > 1e-3
+    _, later = read_metrics(
+        compiled(agent, config)(jax.tree.map(jnp.copy, state), windows, np.int32(2)), NAMES, tmp_path
+    )
+    assert abs(first - learnt(later, 1)) > 1e-3
+
+
 def test_a_rollout_in_minibatches_is_learnt_from_in_another_order_each_time():
     agent, config = PQN_, replace(CONFIG, num_minibatches=6)
     ends = []

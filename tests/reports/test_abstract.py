@@ -120,6 +120,10 @@ def test_what_cannot_be_told_apart_is_said(tmp_path):
         (tmp_path / f"{player}.jsonl").write_text("".join(json.dumps({"schema": 1, **row}) + "\n" for row in rows))
     (sentence,) = who_has_more(read_results([tmp_path]))
     assert sentence.startswith("Seek and Kill, default: no difference shown between idle and random (0.0 [")
+    for player in ("random", "idle"):
+        write_rows(tmp_path / f"{player}.jsonl", [evaluation_row(player, task, n, 30.0) for n in range(9)])
+    (sentence,) = who_has_more(read_results([tmp_path]))
+    assert "no difference shown between idle and random (0.0 [0.0, 0.0] points)" in sentence
 
 
 def test_few_seeds_are_a_caveat_of_records_without_run_directories_too(tmp_path):
@@ -148,8 +152,10 @@ def test_few_episodes_are_a_caveat_however_many_checkpoints_played_them(tmp_path
     rows = [
         evaluation_row(f"r/1@{updates}", "defend_the_center/gore", n, 50.0, run="r", run_seed=1, num_updates=updates)
         for updates in range(20)
-        for n in range(2)
+        for n in range(10)
     ]
-    write_rows(tmp_path / "rows.jsonl", rows)
+    write_rows(tmp_path / "rows.jsonl", [row for row in rows if row["episode"] < 9])
     _, few = caveats(read_results([tmp_path]))
     assert few.startswith("Fewer than 10 evaluation episodes of some task by r: ")
+    write_rows(tmp_path / "rows.jsonl", rows)
+    assert len(caveats(read_results([tmp_path]))) == 1

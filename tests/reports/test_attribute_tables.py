@@ -9,7 +9,17 @@ from gvz.tasks import attribute_tasks, parse_task, scenario_named
 from tests.reports.conftest import evaluation_row, write_rows
 
 SCENARIO = scenario_named("defend_the_center")
-PERCENT = {"default": 80.0, "mossy_bricks": 60.0, "gore=0.5": 77.0, "gore": 70.0, "gore+mossy_bricks": 45.0}
+PERCENT = {
+    "default": 80.0,
+    "mossy_bricks": 60.0,
+    "gore": 70.0,
+    "gore=0.5": 77.0,
+    "gore+mossy_bricks": 45.0,
+    "varied": 5.0,
+    "varied+gore": 4.0,
+    "fast_enemies+gore": 3.0,
+}
+"""drawn maps, and a pair of which one was not played alone, stand in no table"""
 
 
 def scores_of(tmp_path, percent):

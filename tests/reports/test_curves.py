@@ -45,6 +45,17 @@ def test_a_learning_curve_is_the_mean_of_the_seeds_running_means():
     assert (curve.low[0], curve.high[0]) == (10.0, 20.0)
 
 
+def test_a_learning_curve_is_of_the_gradient_steps_that_all_seeds_have_in_whatever_order_they_stand():
+    runs = [
+        run_of(1, [(99, "a/x", 50.0), (0, "a/x", 10.0)]),
+        run_of(2, [(20, "a/x", 20.0), (79, "a/x", 40.0), (80, "a/x", 0.0)]),
+    ]
+    curve = learning_curve("x", runs, ["a/x"])
+    assert curve is not None
+    assert curve.updates[[0, -1]].tolist() == [20.0, 80.0]
+    assert curve.values[[0, -1]].tolist() == [15.0, 15.0]  # 10 and 20; 10 and (20 + 40 + 0) / 3
+
+
 def test_the_band_is_the_middle_95_percent_of_redrawn_seeds():
     """Means of five of 0, 10, .. 40: their deviation is 14.1 / sqrt(5) = 6.3, and they are multiples of 2."""
     curve = learning_curve("x", [run_of(n, [(0, "a/x", 10.0 * n), (99, "a/x", 10.0 * n)]) for n in range(5)], ["a/x"])
@@ -109,3 +120,6 @@ def test_a_checkpoint_with_more_tasks_leaves_the_tasks_of_the_others():
     rows = [(seed, updates, task, 10.0) for seed in (1, 2) for updates in (100, 200, 300) for task in ("a/x", "a/y")]
     assert sorted(usual_tasks(evaluated([*rows, (1, 300, "a/z", 10.0)]))) == ["a/x", "a/y"]
     assert sorted(usual_tasks(evaluated([*rows, (1, 400, "a/x", 10.0)]))) == ["a/x", "a/y"]
+    alike = evaluated([*rows[:2], (1, 100, "a/z", 10.0), (1, 200, "a/z", 10.0)])
+    for _ in range(10):  # polars groups in any order
+        assert sorted(usual_tasks(alike)) == ["a/x", "a/y", "a/z"], "of equally usual ones the more"

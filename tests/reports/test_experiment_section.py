@@ -64,9 +64,22 @@ def test_aggregates_have_mean_iqm_and_median(compared):
     assert [cell.estimate.value for cell in dqn[1:] if cell.estimate] == [23.0, 23.0, 23.0]
 
 
+def test_aggregates_over_scenarios_that_have_other_seeds_are_missing(tmp_path, monkeypatch):
+    def column_scores(_results, _asked, scenario: str, _column):
+        seeds = (1, 2) if scenario == "seek_and_kill" else (1, 2, 3)
+        return Scores(runs={seed: {"one": np.ones(2)} for seed in seeds}, wanted_seeds=(1, 2, 3)), ("one",)
+
+    monkeypatch.setattr("gvz.reports.experiment_section.column_scores", column_scores)
+    asked = PlannedExperiment(results=tmp_path, experiment=experiment_named("training_set_size"), scale=1.0)
+    table = aggregate_table(read_results([tmp_path]), asked)
+    assert {(cell.kind, cell.note) for row in table.rows for cell in row[1:]} == {
+        ("missing", "scenarios differ in seeds")
+    }
+
+
 def test_published_numbers_stand_below_ours_and_in_no_mean_of_ours(tmp_path, experiments_writer):
     plan = Plan.of("training_set_size", scale=0.01, scenarios=("health_gathering", "seek_and_kill"))
-    experiments_writer(tmp_path, plan, lambda played: float(len(played.run.tasks)))
+    experiments_writer(tmp_path, plan, lambda one: len(one.run.tasks) + 10.0 * (one.run.scenario == "seek_and_kill"))
     results = read_results([tmp_path])
     rows = result_table(results, results.asked[0]).rows
     assert [(row[0].text, row[1].text) for row in rows] == [
@@ -79,7 +92,7 @@ def test_published_numbers_stand_below_ours_and_in_no_mean_of_ours(tmp_path, exp
     ]
     assert [cell.text for cell in rows[1][2:]] == ["27.92", "35.75", "32.91"]
     assert {cell.kind for row in rows for cell in row[2:] if row[1].text == "thesis"} == {"theirs"}
-    assert [cell.estimate.value for cell in rows[4][2:] if cell.estimate] == [1.0, 4.0, 8.0]
+    assert [cell.estimate.value for cell in rows[4][2:] if cell.estimate] == [6.0, 9.0, 13.0]
     assert [cell.text for cell in rows[5][2:]] == ["27.63", "34.50", "28.41"]  # (27.92 + 27.34) / 2, ...
 
 
@@ -133,6 +146,13 @@ def test_seeds_of_agents_of_single_tasks_are_redrawn_for_each_task(agents_of_tas
     runs = {1: {"one": zero, "other": ten}, 2: {"one": ten, "other": zero}}
     scores = Scores(runs=runs, wanted_seeds=(1, 2), agents_of_tasks=agents_of_tasks)
     assert estimate(scores, ("one", "other")).estimate == Estimate(value=5.0, low=ends[0], high=ends[1])
+
+
+def test_the_only_seed_that_has_all_tasks_has_an_interval_over_its_episodes():
+    cell = estimate(Scores(runs={1: {"one": np.array([0.0, 10.0] * 9)}, 2: {}}, wanted_seeds=(1, 2)), ["one"])
+    assert cell.estimate is not None
+    assert cell.estimate.low < cell.estimate.value == 5.0 < cell.estimate.high
+    assert cell.note == "1 of 2 seeds"
 
 
 def test_an_experiment_without_any_results_is_a_table_of_missing_cells(tmp_path):

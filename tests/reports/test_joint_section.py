@@ -31,16 +31,20 @@ def test_an_agent_of_two_scenarios_has_the_mean_of_their_means(tmp_path):
 def test_levels_are_means_over_the_scenarios_and_have_a_figure(tmp_path):
     percent = {"health_gathering": (90.0, 80.0, 60.0, 50.0, 20.0), "seek_and_kill": (30.0, 20.0, 20.0, 10.0, 0.0)}
     rows = [
-        evaluation_row("random", task.id, n, by_level[task.level])
+        evaluation_row(player, task.id, n, by_level[task.level])
         for scenario, by_level in percent.items()
-        for task in named_tasks(scenario)
+        for player, split in (("random", None), ("idle", "test"))
+        for task in named_tasks(scenario, split=split)
         for n in range(2)
     ]
     write_rows(tmp_path / "rows.jsonl", rows)
     (section,) = joint_sections(read_results([tmp_path]), tmp_path)
     _, table = section.blocks[0].tables
     assert table.columns == ("agent", "level 0", "level 1", "level 2", "level 3", "level 4")
-    assert [cell.text.split()[0] for cell in table.rows[0]] == ["random", "60.0", "50.0", "40.0", "30.0", "10.0"]
+    assert [[cell.text.split()[0] for cell in row] for row in table.rows] == [
+        ["idle", "-", "-", "-", "30.0", "10.0"],  # and is not in the figure
+        ["random", "60.0", "50.0", "40.0", "30.0", "10.0"],
+    ]
     (figure,) = section.blocks[0].figures
     assert (tmp_path / "figures" / f"{figure.id}.png").exists()
 

@@ -79,6 +79,11 @@ def test_a_task_is_solved_where_the_newest_checkpoint_of_every_seed_survived(tmp
         for at in range(1, 6)
         for n in range(SOLVED_EPISODES)
     ]
+    rows += [
+        {**row, "task": "defend_the_center/mossy_bricks", "episode": 2 * row["episode"] + dies, **end}
+        for dies, end in ((0, {"truncated": True}), (1, {"truncated": False}))  # in the order in which they ended
+        for row in rows[: 10 * SOLVED_EPISODES]
+    ]
     write_rows(tmp_path / "rows.jsonl", rows)
     (section,) = scenario_sections(read_results([tmp_path]), tmp_path)
     (tasks,) = [table for table in section.blocks[0].tables if table.id.endswith("_tasks")]

@@ -74,6 +74,10 @@ def test_the_next_level_opens_when_every_task_of_the_last_is_learned():
     for _ in range(5):
         lessons.next_task(ended(2), 60.0)
     np.testing.assert_allclose(lessons.probabilities(), [1 / 4] * 4)
+    for _ in range(5):
+        lessons.next_task(ended(0), 0.0)
+    resumed = curriculum(lessons.state(), kind="level", learned_percent=60.0, window_episodes=5)
+    np.testing.assert_allclose(resumed.probabilities(), [1 / 4] * 4, err_msg="a level that was opened stays open")
 
 
 def test_drawn_maps_open_by_their_strength():
@@ -99,6 +103,17 @@ def test_progress_draws_where_the_score_moves_most():
     play(lessons, 30.0, 8)
     squares = np.array([1 / 16, 1 / 9, 1 / 4, 1])  # (1 / rank)^(1 / 0.5)
     np.testing.assert_allclose(sorted(lessons.probabilities()), squares / squares.sum())
+
+
+def test_progress_is_the_distance_of_the_last_score_and_its_average_over_five_windows():
+    """With windows of one episode the average keeps 4/5 of its distance from the score at each episode."""
+    lessons = curriculum(kind="progress", staleness_share=0.0, window_episodes=1)
+    for task, scores in enumerate(([50, 40, 40, 40], [50, 56], [50, 43.4])):  # 10 * 0.8^3 = 5.12, 4.8 and 5.28
+        for score in scores:
+            lessons.next_task(ended(task), score)
+    np.testing.assert_array_equal(lessons.probabilities(), [0, 0, 0, 1], "a task without a score comes first")
+    lessons.next_task(ended(3), 50)
+    np.testing.assert_allclose(lessons.probabilities(), np.array([1 / 2, 1 / 3, 1, 1 / 4]) * 12 / 25)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -152,6 +153,22 @@ def test_a_silent_process_counts_as_gone(monkeypatch):
             groups[0]._link.wait_for_failure(30)
 
 
+@pytest.mark.parametrize(("heard_s", "slept_s", "failed"), [(0.0, 1000.0, []), (-59.0, 2.0, [1])])
+def test_time_in_which_a_process_was_stopped_itself_is_no_silence_of_others(heard_s, slept_s, failed, monkeypatch):
+    """Ctrl-Z, or a paused container: it hears of the others when it goes on."""
+    now_s, found, watching = [0.0], [], link.Link.__new__(link.Link)
+    watching._closed, watching.failure, watching._values, watching._heard_s = False, None, {}, {1: heard_s}
+
+    def sleep(_: float) -> None:
+        now_s[0], watching._closed = slept_s, True  # after one look
+
+    monkeypatch.setattr(link, "time", SimpleNamespace(monotonic=lambda: now_s[0], sleep=sleep))
+    monkeypatch.setattr(watching, "send", lambda _: None)
+    monkeypatch.setattr(watching, "_fail", lambda process, _: found.append(process))
+    watching._watch()
+    assert found == failed
+
+
 def test_processes_that_differ_are_refused_on_both_sides_by_the_name_of_what_differs():
     found = joined(2, learner=replace(CONFIG.learner, batch_size=64))
     assert [type(error) for error in found] == [ConfigError, ConfigError]
@@ -167,14 +184,8 @@ def test_two_processes_with_one_number_and_strangers_are_turned_away(monkeypatch
     monkeypatch.setattr(relay, "HELLO_TIMEOUT_S", 0.2)
     address = "127.0.0.1", free_port("127.0.0.1")
     the_relay = Relay(address, 2)
-    for said in (
-        b"GET / HTTP/1.1\r\n\r\n",
-        b'{"kind": "hello"}\n',
-        b"[]\n",
-        b"[" * 100_000 + b"\n",
-        b"\xff\xfe\n",
-        b"",
-    ):
+    no_hello = (b"GET / HTTP/1.1\r\n\r\n", b'{"kind": "hello"}\n', b"[]\n", b"[" * 100_000 + b"\n", b"\xff\xfe\n", b"")
+    for said in no_hello:
         with socket.create_connection(address) as stranger:
             stranger.sendall(said)
             stranger.settimeout(30)
@@ -183,8 +194,11 @@ def test_two_processes_with_one_number_and_strangers_are_turned_away(monkeypatch
     first = threading.Thread(target=lambda: links.append(link.Link(address, 0, 2, {})), daemon=True)
     first.start()
     wait_until(lambda: the_relay._connections, "the first one's connection", 30)
-    with pytest.raises(ConfigError, match=r"group\.process_id: process_id 0 is taken, or not one of 2; each learner"):
-        link.Link(address, 0, 2, {})
+    for process in (0, 2):
+        with pytest.raises(
+            ConfigError, match=rf"group\.process_id: process_id {process} is taken, or not one of 2; each"
+        ):
+            link.Link(address, process, 2, {})
     links.append(link.Link(address, 1, 2, {"of": 1}))
     assert set(links[-1].hellos[1]) == {"of"}
     first.join(30)

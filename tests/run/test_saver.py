@@ -64,6 +64,7 @@ def test_last_checkpoints_of_a_process_that_ends_alone_leave_the_one_that_all_ha
     for counts.updates in (1000, 2000):
         saver.save_when_due(group)
         assert saver.wait() == ""
+        assert saver.num_saved == counts.updates
         group.num_common_saved = counts.updates
     assert saved_steps(tmp_path / "checkpoints") == [1000, 2000]
     for last in (2100, 2200):  # its actors fail, twice, and no other process has saved since 2000
@@ -130,15 +131,21 @@ def test_a_save_that_cannot_begin_is_reported_and_tried_again(tmp_path, monkeypa
     def fail(*_: object) -> None:
         raise error
 
-    failures: list[str] = []
-    saver, counts = started(tmp_path, 0, report=lambda failure, _: failures.append(failure))
+    now_s, failures, retries_s = [0.0], list[str](), list[float]()
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
+    saver, counts = started(tmp_path, 0, report=lambda *told: (failures.append(told[0]), retries_s.append(told[1])))
     counts.updates = 1000
     with monkeypatch.context() as short:
         short.setattr(*where, fail)
         saver.save_when_due(ALONE)
         assert saver.wait() == failures[0]
+        for now_s[0] in (59.0, 61.0, 180.0, 182.0, 10_000.0, 20_000.0, 30_000.0, 40_000.0, 50_000.0):
+            saver.save_when_due(ALONE)
+            saver.wait()
+    assert retries_s == [60.0, 120.0, 240.0, 480.0, 960.0, 1920.0, 3600.0, 3600.0]
     assert said in failures[0]
     assert saver.behind
+    assert saver.num_saved == 0
     saver.save_last(ALONE, lambda: None)
     assert saved_steps(tmp_path / "checkpoints") == [1000]
-    assert len(failures) == 1
+    assert len(failures) == 8
