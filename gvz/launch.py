@@ -86,7 +86,7 @@ def resumed_config(run: RunDir, config: RunConfig) -> RunConfig:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command; returns the exit code: 0 done, 1 failed, 2 bad input, 130 and 143 stopped and saved."""
+    """Runs the command; returns the exit code: 0 done, 1 failed, 2 bad input, 130, 143 and 129 stopped and saved."""
     arguments = sys.argv[1:] if arguments is None else arguments
     in_group = False
     # before the trainer exists, a signal ends the command at once

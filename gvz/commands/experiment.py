@@ -151,7 +151,7 @@ class RunCommand:
     """likewise, while it trains: a part of a GPU (0.5), or whole ones; default one if a node of the cluster has any"""
 
     def run(self) -> int:
-        """0 all done, 1 some failed, 130 or 143 stopped."""
+        """0 all done, 1 some failed, 130, 143 or 129 stopped."""
         from gvz.experiments.places import Machine
         from gvz.experiments.plan import parse_shard, write_plan
         from gvz.experiments.schedule import run_jobs

@@ -23,22 +23,25 @@ def written_whole(path: Path) -> Generator[Path]:
     Raises:
         ConfigError: it cannot be made, or another process writes it.
     """
-    writing, in_another = path.with_name(f".writing-{path.name}"), False
+    writing = path.with_name(f".writing-{path.name}")
     if path.is_dir():
         raise ConfigError(f"{path} is a directory; want the name of a file")
-    try:
-        with _opened(writing, path) as file:
-            in_another = not (records.lock(file) and records.is_at(file, writing))
-            if in_another:
+    with _opened(writing, path) as file:
+        try:
+            if not _is_ours(file, writing):
                 raise ConfigError(f"{path} is being written by another process; wait for its end, or give another name")
             file.truncate(0)  # of what a killed process left
             yield writing
             writing.replace(path)
-    except BaseException:
-        if not in_another:
+        except BaseException:
             with contextlib.suppress(OSError):
-                writing.unlink()
-        raise
+                if _is_ours(file, writing):
+                    writing.unlink()
+            raise
+
+
+def _is_ours(file: IO[bytes], writing: Path) -> bool:
+    return records.lock(file) and records.is_at(file, writing)
 
 
 def _opened(writing: Path, path: Path) -> IO[bytes]:

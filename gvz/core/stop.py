@@ -130,13 +130,22 @@ def uninterrupted() -> Generator[None]:
     """For a clean-up that is sure to end: what handlers would raise comes after it. Other threads get no exceptions."""
     came: list[int] = []
     before: dict[int, Any] = {}
+    held = True
+
+    def hold(number: int, frame: FrameType | None) -> None:
+        if held:
+            came.append(number)
+        else:  # another one came while handlers were put back, and this one stayed
+            before[number](number, frame)
+
     if threading.current_thread() is threading.main_thread():
         before = {number: handler for number in SIGNALS if callable(handler := signal.getsignal(number))}
-    for number in before:
-        signal.signal(number, lambda number, _: came.append(number))
     try:
+        for number in before:
+            signal.signal(number, hold)
         yield
     finally:
+        held = False
         for number, handler in before.items():
             signal.signal(number, handler)
         for number in came:

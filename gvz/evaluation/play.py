@@ -146,7 +146,7 @@ def play(
     Args:
         jobs: what to play; it is sorted by task, so that few games are started.
         num_workers: processes; 0 plays here.
-        stop: where a signal is noted. Python drops an exception that a signal raises inside a destructor.
+        stop: where a signal is noted, which ends this between two rows.
 
     Raises:
         KeyboardInterrupt: `stop` was requested.

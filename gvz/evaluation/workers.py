@@ -9,6 +9,7 @@ from collections.abc import Callable, Generator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from typing import Any, ParamSpec, TypeVar
@@ -70,6 +71,7 @@ class _Processes(Executor):
         Raises:
             GvzError: one cannot be started. Those before it run.
         """
+        resource_tracker.ensure_running()  # the first process would start it, and Python 3.11 then unblocks signals
         for number in range(self._num_workers):
             try:
                 ours, theirs = _SPAWN.Pipe()

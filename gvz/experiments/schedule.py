@@ -39,7 +39,7 @@ class RunningJob:
 def run_jobs(jobs: Sequence[Job], places: Places) -> int:
     """Runs all jobs that are not done. A job that fails does not stop the others.
 
-    Returns: 0 when all are done, 1 when some failed, 130 or 143 when a signal stopped us; what was running is saved.
+    Returns: 0 when all are done, 1 when some failed, 130, 143 or 129 when a signal stopped us; what ran is saved.
     """
     with StopRequest() as stop, Bars(PLAIN_PERIOD_S) as bars:
         schedule = Schedule(jobs, places, bars)

@@ -30,8 +30,12 @@ START_RECORDS = "starts.jsonl"
 """A row for every start of the run: machine, versions, commit. Never cut back."""
 EVALUATION_RECORDS = "evaluation.jsonl"
 """Where `gvz evaluate` writes, whose lock is its own."""
-_BEFORE_A_RUN = ("checkpoints", "policies", "process_", ".")
-"""Beginnings of names that may be there before a run: links to another disk, learners of its group, hidden files."""
+_BEFORE_A_RUN = ("checkpoints", "policies", "process_", "lost+found", ".")
+"""Beginnings of names that may be there before a run: links to another disk, learners of its group, what a new disk
+holds, hidden files.
+"""
+_LOGS = (".log", ".out", ".err", ".txt")
+"""Ends of such names: files that a shell or Slurm has opened for the output of the run."""
 
 
 class RunDir:
@@ -246,7 +250,8 @@ def refuse_other_contents(path: Path) -> None:
     with disk_checked(path):
         if not path.exists() or any((path / name).exists() for name in ("config.json", "lock")):
             return
-        others = sorted(entry.name for entry in path.iterdir() if not entry.name.startswith(_BEFORE_A_RUN))
+        names = [entry.name for entry in path.iterdir() if not (entry.is_file() and entry.name.endswith(_LOGS))]
+        others = sorted(name for name in names if not name.startswith(_BEFORE_A_RUN))
     if others:
         more = " and more" if others[1:] else ""
         raise ConfigError(

@@ -264,8 +264,8 @@ def train(config: RunConfig, run: RunDir, stop: StopRequest) -> int:
 
     `stop` is entered; from when there is a trainer on, the first signal no longer ends things at once.
 
-    Returns: 0 when all updates are done, or the processor time is used up, whatever signal came then; 130 or 143 when a
-    signal stopped the run before, which is then saved.
+    Returns: 0 when all updates are done, or the processor time is used up, whatever signal came then; 130, 143 or 129
+    when a signal stopped the run before, which is then saved.
 
     Raises:
         ResourceError: the machine is too small. GvzError: what a user can do something about.

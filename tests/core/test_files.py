@@ -91,13 +91,24 @@ def test_a_full_disk_leaves_what_was_there_before(tmp_path):
 
 
 def test_an_interruption_while_it_is_made_leaves_nothing(tmp_path, monkeypatch):
-    def interrupted(*_):
+    file, lock = tmp_path / "report.md", records.lock
+
+    def interrupted(opened):
+        monkeypatch.setattr(records, "lock", lock)  # once
+        lock(opened)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(records, "lock", interrupted)
-    with pytest.raises(KeyboardInterrupt), written_whole(tmp_path / "report.md"):
+    with pytest.raises(KeyboardInterrupt), written_whole(file):
         pass
     assert list(tmp_path.iterdir()) == []
+    with written_whole(file) as writing:
+        writing.write_text("ours")
+        monkeypatch.setattr(records, "lock", interrupted)
+        with pytest.raises(KeyboardInterrupt), written_whole(file):
+            pass
+        assert writing.exists(), "another process writes it"
+    assert file.read_text() == "ours"
 
 
 def test_one_process_at_a_time_writes_a_file(tmp_path):

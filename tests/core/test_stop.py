@@ -6,11 +6,13 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from gvz.core import stop as stops
-from gvz.core.stop import SIGNALS, StopRequest, blocked_signals, told_of_delay
+from gvz.core.stop import SIGNALS, StopRequest, blocked_signals, told_of_delay, uninterrupted
+from tests.waiting import wait_until
 
 
 @pytest.fixture(autouse=True)
@@ -73,11 +75,17 @@ def test_a_call_that_a_signal_does_not_end_is_spoken_of(monkeypatch: pytest.Monk
         libc.pthread_mutex_unlock(mutex)
 
     monkeypatch.setattr(stops, "say", hear)
+    main = threading.get_ident()
+
+    def send_when_it_waits() -> None:
+        wait_until(lambda: mutex[:4] == (2).to_bytes(4, sys.byteorder), "the call")  # glibc: locked, and waited for
+        signal.pthread_kill(main, signal.SIGTERM)
+
     at_last = threading.Timer(60, libc.pthread_mutex_unlock, [mutex])
     with StopRequest() as stop, told_of_delay(stop):
         libc.pthread_mutex_lock(mutex)
         at_last.start()
-        threading.Timer(0.1, signal.pthread_kill, [threading.main_thread().ident, signal.SIGTERM]).start()
+        threading.Thread(target=send_when_it_waits, daemon=True).start()
         libc.pthread_mutex_lock(mutex)
         at_last.cancel()
         assert stop.signal == signal.SIGTERM
@@ -102,3 +110,19 @@ def test_a_process_is_started_without_signals_until_it_ignores_them():
         process.send_signal(number)
     assert process.communicate(b"x", timeout=60) == (b"", b"")
     assert process.returncode == 0
+
+
+def test_a_signal_that_comes_while_handlers_are_put_back_leaves_the_others(monkeypatch: pytest.MonkeyPatch):
+    set_handler = signal.signal
+
+    def interrupted(number: signal.Signals, handler: Any) -> Any:
+        before = set_handler(number, handler)
+        if handler == stop._handle:
+            signal.raise_signal(number)
+        return before
+
+    with StopRequest(at_once=True) as stop:
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt), uninterrupted():
+            patch.setattr(signal, "signal", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)

@@ -233,6 +233,21 @@ def test_a_worker_that_cannot_be_started_is_told_and_those_before_it_end():
     assert set(multiprocessing.active_children()) <= before
 
 
+def test_also_the_first_worker_is_started_without_signals():
+    """Python's resource tracker, which the first spawn of a process starts, would unblock two of them."""
+    code = (
+        "import signal; from multiprocessing import util\n"
+        "from gvz.core.stop import SIGNALS; from gvz.evaluation.workers import worker_processes\n"
+        "spawn, blocked = util.spawnv_passfds, []\n"
+        "def noted(*arguments):\n"
+        "    blocked.append(signal.pthread_sigmask(signal.SIG_BLOCK, ()))\n"
+        "    return spawn(*arguments)\n"
+        "util.spawnv_passfds = noted\n"
+        "with worker_processes(1, 'died'): assert blocked[-1].issuperset(SIGNALS), blocked\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
 def test_a_second_ctrl_c_comes_after_the_clean_up(monkeypatch):
     before, left, kill = set(multiprocessing.active_children()), [], _Processes.kill
 

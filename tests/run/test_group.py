@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from gvz.core import watchdog
 from gvz.core.errors import ConfigError, GroupError, WaitTimeoutError
 from gvz.core.stop import StopRequest
 from gvz.launch import main
@@ -157,12 +158,14 @@ def test_a_silent_process_counts_as_gone(monkeypatch):
 def test_time_in_which_a_process_was_stopped_itself_is_no_silence_of_others(heard_s, slept_s, failed, monkeypatch):
     """Ctrl-Z, or a paused container: it hears of the others when it goes on."""
     now_s, found, watching = [0.0], [], link.Link.__new__(link.Link)
-    watching._closed, watching.failure, watching._values, watching._heard_s = False, None, {}, {1: heard_s}
 
     def sleep(_: float) -> None:
         now_s[0], watching._closed = slept_s, True  # after one look
 
-    monkeypatch.setattr(link, "time", SimpleNamespace(monotonic=lambda: now_s[0], sleep=sleep))
+    for module in (link, watchdog):
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now_s[0], sleep=sleep))
+    watching._clock = watchdog.AwakeClock(2 * link.BEAT_PERIOD_S)
+    watching._closed, watching.failure, watching._values, watching._heard_s = False, None, {}, {1: heard_s}
     monkeypatch.setattr(watching, "send", lambda _: None)
     monkeypatch.setattr(watching, "_fail", lambda process, _: found.append(process))
     watching._watch()
@@ -195,9 +198,7 @@ def test_two_processes_with_one_number_and_strangers_are_turned_away(monkeypatch
     first.start()
     wait_until(lambda: the_relay._connections, "the first one's connection", 30)
     for process in (0, 2):
-        with pytest.raises(
-            ConfigError, match=rf"group\.process_id: process_id {process} is taken, or not one of 2; each"
-        ):
+        with pytest.raises(ConfigError, match=rf"group\.process_id: process_id {process} is taken, or not one of 2; e"):
             link.Link(address, process, 2, {})
     links.append(link.Link(address, 1, 2, {"of": 1}))
     assert set(links[-1].hellos[1]) == {"of"}

@@ -75,6 +75,8 @@ def test_a_directory_that_holds_something_else_is_not_made_a_run(tmp_path, capsy
 
 def test_links_to_another_disk_and_what_an_earlier_start_left_are_no_other_contents(tmp_path):
     (tmp_path / "checkpoints").symlink_to(tmp_path / "another_disk")
+    for log in ("log.txt", "slurm-7.out"):  # gvz train --run-dir here > here/log.txt
+        (tmp_path / log).touch()
     refuse_other_contents(tmp_path)
     RunDir(tmp_path).close()
     (tmp_path / "notes.txt").write_text("of a run that did not fit into the memory")
