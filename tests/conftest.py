@@ -44,8 +44,10 @@ _DIRECTORY, _LOCK = _own_directory()
 _OWNER = os.getpid()
 os.environ["GVZ_RUNTIME_DIR"] = str(_DIRECTORY)
 
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job; programs under test would inherit it
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# Programs under test would inherit what a shell sets for a background job, and nohup for all.
+for _number, _handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, _handler)
 
 # Hypothesis measures time, and the machine may be busy.
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])

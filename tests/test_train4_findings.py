@@ -14,7 +14,9 @@ from tests.score_tables import (
     gain,
     in_words,
     last_updates,
+    mean_score,
     means,
+    results_of,
     score_cells,
     score_row,
     scores_of,
@@ -131,6 +133,25 @@ def test_the_findings_say_what_six_times_the_time_gave_on_four_training_tasks(sc
         assert said in WORDS
     steps = last_updates("general_train4_long/runs/**")
     assert f"in Health Gathering also 2222; {steps[0]:,} to {steps[-1]:,} gradient steps, 50 episodes" in WORDS
+
+
+def test_the_findings_say_what_two_hours_of_two_cores_gave_on_four_training_tasks():
+    name, agent = "defend_the_center", AGENTS["4 tasks"][1]
+    longest, longer = (scores_of(f"general_train4_{folder}", agent, name) for folder in ("two_hours", "long"))
+    for seconds, folder, of_agent in (("5,400 s", "long", longer), ("14,400 s", "two_hours", longest)):
+        (steps,) = last_updates(f"general_train4_{folder}/runs/*/{name}/*/*")
+        assert f"| {seconds} | {steps:,} | {score_cells(of_agent, name, 'train4')} |" in WORDS
+    trained, gate, test, hardest = (gain(longest, longer, tasks) for tasks in task_sets(name, "train4"))
+    assert f"**No difference is shown**: on the training tasks {trained}, on the gate tasks {gate}, on the" in WORDS
+    assert f"on the test tasks {test}, on level 4 {hardest} points." in WORDS
+    moved = []
+    for task in ("mossy_bricks", "flying_enemies"):
+        after, before = (
+            mean_score(results_of(f"general_train4_{folder}").episodes, agent=agent, task=f"{name}/{task}")
+            for folder in ("two_hours", "long")
+        )
+        moved.append(f"{after} instead of {before}")
+    assert "`mossy_bricks` has {}, `flying_enemies` {}.".format(*moved) in WORDS
 
 
 def test_the_findings_say_how_long_agents_of_four_training_tasks_learned():

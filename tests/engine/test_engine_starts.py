@@ -34,8 +34,8 @@ def test_an_engine_that_starts_too_late_is_given_up_and_cleared_away():
 def stopped_start(where: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
     """A process that was interrupted while its engine starts, and this engine's process id, which is stopped."""
     code = (
-        "import time\n"
-        "try:\n    engine = Engine(config); time.sleep(60)\n"
+        "import time; from dataclasses import replace\n"
+        "try:\n    engine = Engine(replace(config, start_timeout_s=600)); time.sleep(60)\n"
         "except KeyboardInterrupt: print('interrupted', flush=True)"
     )
     process = subprocess.Popen(
