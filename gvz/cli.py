@@ -5,6 +5,7 @@ import functools
 import operator
 import os
 import sys
+import tempfile
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -13,7 +14,7 @@ import tyro
 import gvz
 from gvz.core.errors import EXIT_INTERRUPTED, GvzError
 from gvz.core.registry import discover
-from gvz.core.stop import StopRequest, say
+from gvz.core.stop import StopRequest, say, uninterrupted
 
 EXIT_BROKEN_PIPE = 141
 """exit code that a shell shows for a program that SIGPIPE ended"""
@@ -33,6 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     stop = StopRequest(at_once=True)
     try:
         with stop:
+            with uninterrupted():  # Python tries its temporary directory with a file, which would stay
+                tempfile.gettempdir()
             try:
                 return run(list(sys.argv[1:] if arguments is None else arguments))
             finally:  # a help text ends by SystemExit
@@ -56,6 +59,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         where = f"{error.filename}: " if error.filename else ""
         say(f"error: {where}{error.strerror}; make room or give a place that you can write to")
         return 1
+    except ImportError:  # a library gives it when its import is interrupted
+        if stop.signal is None:
+            raise
+        say("interrupted")
+        return stop.exit_code
 
 
 def _directory_is_gone() -> bool:

@@ -149,6 +149,19 @@ def test_a_signal_gives_one_line_and_the_exit_code_that_shells_expect(number, ca
     assert capsys.readouterr() == ("", "interrupted\n")
 
 
+def test_an_interrupted_import_is_an_interruption(capsys, monkeypatch):
+    def run(_: list[str]) -> int:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt:
+            raise ImportError("initialization failed") from None  # as vizdoom's
+        return 0
+
+    monkeypatch.setattr(cli, "run", run)
+    assert cli.main(["gallery"]) == 143
+    assert capsys.readouterr() == ("", "interrupted\n")
+
+
 @pytest.mark.parametrize(
     ("error", "said"),
     [
