@@ -5,7 +5,6 @@ import functools
 import operator
 import os
 import sys
-import tempfile
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -14,7 +13,7 @@ import tyro
 import gvz
 from gvz.core.errors import EXIT_INTERRUPTED, GvzError
 from gvz.core.registry import discover
-from gvz.core.stop import StopRequest, say, uninterrupted
+from gvz.core.stop import StopRequest, say
 
 EXIT_BROKEN_PIPE = 141
 """exit code that a shell shows for a program that SIGPIPE ended"""
@@ -34,8 +33,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     stop = StopRequest(at_once=True)
     try:
         with stop:
-            with uninterrupted():  # Python tries its temporary directory with a file, which would stay
-                tempfile.gettempdir()
             try:
                 return run(list(sys.argv[1:] if arguments is None else arguments))
             finally:  # a help text ends by SystemExit

@@ -62,10 +62,13 @@ def check_agent(agent: Any, *, on_policy: bool) -> None:
     for name, shape in (("q_values", of_actions), ("policy", of_actions), ("value", (_B,))):
         if evaluation[name] is not None:
             _check(agent.evaluate, name, evaluation[name], shape)
-    (_check_rollouts if on_policy else _check_transitions)(agent, params, obs, num_extras)
+    if on_policy:
+        _check_rollouts(agent, params, obs, num_extras)
+    else:
+        _check_transitions(agent, params, obs)
 
 
-def _check_transitions(agent: Any, params: Any, obs: Any, _num_extras: int) -> None:
+def _check_transitions(agent: Any, params: Any, obs: Any) -> None:
     numbers, C = jnp.zeros(_B), agent.spec.num_sights
     batch = Transitions(
         obs_tm1=obs,

@@ -28,6 +28,7 @@ from typing import IO
 
 from gvz.core import records
 from gvz.core.errors import ResourceError, WaitTimeoutError
+from gvz.core.stop import uninterrupted
 
 SHM_DIR = Path("/dev/shm")
 PREFIX = "gvz-engine-"
@@ -61,7 +62,7 @@ def runtime_dir() -> Path:
     Raises:
         ResourceError: the directory exists but is not ours alone, or cannot be made; or $GVZ_RUNTIME_DIR is relative.
     """
-    given = Path(os.environ.get("GVZ_RUNTIME_DIR") or tempfile.gettempdir())
+    given = Path(os.environ.get("GVZ_RUNTIME_DIR") or _temporary_place())
     if not given.is_absolute():
         raise ResourceError(
             f"GVZ_RUNTIME_DIR: got {given}, want an absolute path: all processes of a user have to find it, whatever "
@@ -84,9 +85,14 @@ def runtime_dir() -> Path:
     return path
 
 
+def _temporary_place() -> str:
+    with uninterrupted():  # Python tries the directory with a file of its own, which would stay
+        return tempfile.gettempdir()
+
+
 def make_directory() -> Path:
     """A new private directory of this process; who is done with it calls `clean_engine` and `forget`."""
-    directory = Path(tempfile.gettempdir()) / (PREFIX + secrets.token_hex(8))
+    directory = Path(_temporary_place()) / (PREFIX + secrets.token_hex(8))
     record(directory)
     directory.mkdir(mode=0o700)
     return directory

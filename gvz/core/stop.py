@@ -18,6 +18,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _PATIENCE_S = 1.0
 """a call that lasts longer after a signal is spoken of"""
 _AGAIN_S = 0.05
+"""until what Python dropped is raised again"""
 
 
 class StopRequest:

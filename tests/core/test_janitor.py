@@ -17,6 +17,7 @@ import vizdoom
 
 from gvz.core import janitor
 from gvz.core.errors import ResourceError
+from gvz.core.stop import StopRequest
 from gvz.engine import process
 from tests.waiting import wait_until
 
@@ -65,6 +66,21 @@ def test_records_are_private(registry: Path):
     janitor.forget(directory)
     assert list(registry.iterdir()) == []
     janitor.forget(directory)  # again, and of what was never recorded
+
+
+def test_a_signal_comes_after_python_has_tried_the_temporary_directory(monkeypatch: pytest.MonkeyPatch):
+    """It tries with a file, which an exception would leave there."""
+    tried = list[str]()
+
+    def gettempdir() -> str:
+        signal.raise_signal(signal.SIGTERM)
+        tried.append("/tmp")
+        return "/tmp"
+
+    monkeypatch.setattr(tempfile, "gettempdir", gettempdir)
+    with pytest.raises(KeyboardInterrupt), StopRequest(at_once=True):
+        janitor.make_directory()
+    assert tried == ["/tmp"]
 
 
 def test_a_temporary_directory_goes_with_its_block_or_with_the_next_start(registry: Path):

@@ -61,7 +61,7 @@ def test_no_evaluation_begins_before_later_policies_are_discarded(tmp_path, monk
 
 @pytest.mark.parametrize("flags", [[], ["--fresh"]])
 def test_a_directory_that_holds_something_else_is_not_made_a_run(tmp_path, capsys, flags):
-    """A run makes `segmenters/` anew, and a later `--fresh` would move all that lies beside the run."""
+    """A run replaces `segmenters/`. A later `--fresh` would move the other files, too."""
     (tmp_path / "segmenters").mkdir()
     (tmp_path / "segmenters" / "mine.onnx").write_text("precious")
     assert main(["--config", "rainbow_quick", "--run-dir", str(tmp_path), *flags]) == 2
