@@ -12,6 +12,8 @@ from typing import Literal
 
 import psutil
 
+from gvz.core.control_groups import num_cores
+
 PlacementKind = Literal["auto", "pinned", "free"]
 _SAMPLE_S, _IDLE_PERCENT = 0.25, 30.0
 """seconds that the cores are looked at, and at most how busy one is that counts as idle"""
@@ -26,7 +28,7 @@ def actor_cores(kind: PlacementKind, num_actors: int) -> list[int | None]:
     """
     cores = sorted(os.sched_getaffinity(0))
     if kind == "auto":
-        cores = idle_cores() if num_actors < len(cores) else []
+        cores = idle_cores() if num_actors < num_cores() else []
     if kind == "free" or (kind == "auto" and num_actors >= len(cores)):
         return [None] * num_actors
     return [cores[-1 - actor % len(cores)] for actor in range(num_actors)]

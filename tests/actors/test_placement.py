@@ -16,6 +16,7 @@ from gvz.core.errors import ConfigError
 @pytest.fixture
 def four_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
+    monkeypatch.setattr(placement, "num_cores", lambda: 4)
     monkeypatch.setattr(placement.psutil, "cpu_percent", lambda *_, **__: [5.0, 95.0, 5.0, 5.0])
 
 
@@ -30,6 +31,13 @@ def test_actors_get_cores_of_their_own_where_there_is_room():
     assert cores_left([3, 2]) == {0, 1}
     assert cores_left([3, 2, 1, 0]) == {0, 1, 2, 3}
     assert cores_left([None]) == {0, 1, 2, 3}
+
+
+@pytest.mark.usefixtures("four_cores")
+def test_a_quota_of_processor_time_leaves_no_room_for_own_cores(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(placement, "num_cores", lambda: 2)
+    assert actor_cores("auto", 1) == [3]
+    assert actor_cores("auto", 2) == [None] * 2
 
 
 def test_the_log_says_where_actors_are():
