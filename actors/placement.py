@@ -8,28 +8,57 @@ import contextlib
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal
+from typing import IO, Literal
 
 import psutil
+
+from gvz.core import janitor, records
+from gvz.core.control_groups import num_cores
 
 PlacementKind = Literal["auto", "pinned", "free"]
 _SAMPLE_S, _IDLE_PERCENT = 0.25, 30.0
 """seconds that the cores are looked at, and at most how busy one is that counts as idle"""
+_locks: list[IO[str]] = []
+"""of the cores that `auto` has given to this process's actors and learner"""
 
 
 def actor_cores(kind: PlacementKind, num_actors: int) -> list[int | None]:
     """The core of each actor; None: it may use any.
 
     With `auto` actors have cores of their own if as many are idle now, and one more for the learner: other programs
-    would have to share a core with an actor, while others stand idle. With `pinned` they have one in any case, and
-    share it if there are more actors than cores.
+    would have to share a core with an actor, while others stand idle. Runs of a user that start at once get different
+    ones: a run holds its cores until `give_back`, the next call or its end. With `pinned` actors have a core in any
+    case, and share it if there are more actors than cores.
     """
     cores = sorted(os.sched_getaffinity(0))
     if kind == "auto":
-        cores = idle_cores() if num_actors < len(cores) else []
+        cores = _hold(idle_cores(), num_actors + 1) if num_actors < num_cores() else []
     if kind == "free" or (kind == "auto" and num_actors >= len(cores)):
         return [None] * num_actors
     return [cores[-1 - actor % len(cores)] for actor in range(num_actors)]
+
+
+def _hold(cores: list[int], count: int) -> list[int]:
+    """The last `count` of these cores that no other run holds, now held by this one; none if there are fewer."""
+    give_back()
+    held: list[int] = []
+    for core in reversed(cores):
+        lock = (janitor.runtime_dir() / f"actors-{core}.lock").open("w")
+        if len(held) < count and records.lock(lock):
+            held.append(core)
+            _locks.append(lock)
+        else:
+            lock.close()
+    if len(held) < count:
+        give_back()
+        return []
+    return sorted(held)
+
+
+def give_back() -> None:
+    """Other runs may have the cores that `auto` has given to this one."""
+    while _locks:
+        _locks.pop().close()
 
 
 def idle_cores() -> list[int]:

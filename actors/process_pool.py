@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from actors.inference import InferenceServer
 from actors.loop import derive_seed
-from actors.placement import cores_left, keep_to
+from actors.placement import cores_left, give_back, keep_to
 from actors.policy import Policy
 from actors.pool import STOP_TIMEOUT_S, Pool, PoolConfig, PoolStatistics, lanes_to_begin_with, num_decisions
 from actors.preprocess import ObservationBatch
@@ -163,4 +163,5 @@ class ProcessPool(Pool):
                 if self._params is not None:
                     self._params.close()
                 keep_to(self._own_cores)
+                give_back()
                 janitor.clean_dead_instances()

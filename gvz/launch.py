@@ -5,6 +5,7 @@ and errors are quick.
 """
 
 import dataclasses
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from typing import Annotated
 
 import tyro
 
+from gvz.core.control_groups import num_cores
 from gvz.core.errors import ConfigError, GvzError
 from gvz.core.libraries import require_learner
 from gvz.core.stop import StopRequest, exit_at_once, say, told_of_delay
@@ -104,6 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 config = resumed_config(run, launch.run)
                 for note in run.check_resumable(config):
                     say(note)
+                if (cores := num_cores()) < len(os.sched_getaffinity(0)):
+                    os.environ.setdefault("NPROC", str(cores))  # else XLA has a thread for each core of the machine
                 stop.importing = True
                 from gvz.run.train import train  # imports jax, so only after the input is checked
 

@@ -90,7 +90,8 @@ def _files(directory: Path) -> list[Path]:
 
 def _checkpointer() -> ocp.Checkpointer:
     """Orbax, but for its copy of every array it is given: ours are snapshots."""
-    logging.getLogger("absl").setLevel(logging.ERROR)  # orbax warns, at every save, of what is meant to be so
+    # orbax warns, at every save, of what is meant to be so, and logs the traceback of each error that it raises
+    logging.getLogger("absl").setLevel(logging.CRITICAL)
     handler = ocp.type_handlers.NumpyHandler(deepcopy_host_arrays=False)
     registry = ocp.type_handlers.create_type_handler_registry((np.ndarray, handler))
     alone = ocp.options.MultiprocessingOptions()

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from gvz.core.errors import ConfigError
 from learner.agents.base import AgentLoss, Evaluation, RolloutSteps, SampleLosses, Samples, Targets
+from learner.networks import Params
 from learner.replay import Transitions
 from learner.rollout_step import MetricSums
 
@@ -20,12 +21,15 @@ _B, _T = 3, 2
 """samples of a batch, or games of a rollout, and its steps: two numbers, so that exchanged axes are seen"""
 
 
-def check_agent(agent: Any, *, on_policy: bool) -> None:
+def check_agent(agent: Any, *, on_policy: bool) -> tuple[Params, int]:
     """Checks the functions of an agent, and that it can be hashed.
 
     Args:
         agent: what a file's `AGENT` has made.
         on_policy: whether its configuration says that it learns from rollouts.
+
+    Returns:
+        The shapes of its parameters, and how many numbers it wants to be recorded with an action.
 
     Raises:
         ConfigError: a function is missing, or gives something of another kind, shape or dtype.
@@ -66,6 +70,7 @@ def check_agent(agent: Any, *, on_policy: bool) -> None:
         _check_rollouts(agent, params, obs, num_extras)
     else:
         _check_transitions(agent, params, obs)
+    return params, num_extras
 
 
 def _check_transitions(agent: Any, params: Any, obs: Any) -> None:

@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -14,6 +13,7 @@ import psutil
 import pytest
 
 from benchmarks import plots, record, remote, report, rounds, runner
+from gvz.core.control_groups import num_cores
 from gvz.core.errors import ConfigError
 from tests.processes import arguments
 from tests.waiting import wait_until
@@ -78,7 +78,7 @@ def test_the_command_writes_a_record_that_the_page_refuses(tmp_path):
     assert "sum tree, batch 32" in done.stdout
     written = json.loads((tmp_path / "sum_tree.json").read_text())  # whatever the engine: it plays no game
     assert written["command"] == "python -m benchmarks sum_tree --quick"
-    assert written["machine"]["cores"] == len(os.sched_getaffinity(0))
+    assert written["machine"]["cores"] == num_cores()
     assert written["commit"] != "unknown"
     with pytest.raises(ConfigError, match="made by --quick, its figures mean nothing"):
         record.read_all(tmp_path)

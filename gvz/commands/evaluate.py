@@ -1,7 +1,6 @@
 """`gvz evaluate`: plays evaluation episodes and prints the scores."""
 
 import json
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from gvz.core.control_groups import num_cores
 from gvz.core.env_config import EnvConfig, Profile
 from gvz.core.errors import EXIT_INTERRUPTED, ConfigError
 from gvz.core.registry import OwnFiles
@@ -65,7 +65,7 @@ class Evaluate:
 
     def run(self) -> int:
         """Plays what the record files do not hold yet, with a progress bar, and prints the scores."""
-        workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
+        workers = num_cores() if self.workers is None else self.workers
         self._check(workers)
         from gvz.evaluation.episode_log import RecordFile, missing_jobs, play_and_record, wanted_episodes
 

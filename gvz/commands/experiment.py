@@ -3,7 +3,6 @@
 import dataclasses
 import heapq
 import json
-import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from gvz.core.control_groups import some_cores
 from gvz.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class PlanFlags:
         """The machine's shares."""
         from gvz.experiments.places import gpus, make_slots
 
-        return make_slots(self.jobs, sorted(os.sched_getaffinity(0)), gpus())
+        return make_slots(self.jobs, some_cores(), gpus())
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -90,18 +90,20 @@ def _temporary_place() -> str:
         return tempfile.gettempdir()
 
 
-def make_directory() -> Path:
-    """A new private directory of this process; who is done with it calls `clean_engine` and `forget`."""
-    directory = Path(_temporary_place()) / (PREFIX + secrets.token_hex(8))
+def make_directory(place: Path | None = None) -> Path:
+    """A new private directory of this process, by default in the temporary directory; who is done with it calls
+    `clean_engine` and `forget`.
+    """
+    directory = (place or Path(_temporary_place())) / (PREFIX + secrets.token_hex(8))
     record(directory)
     directory.mkdir(mode=0o700)
     return directory
 
 
 @contextlib.contextmanager
-def temporary_directory() -> Generator[Path, None, None]:
-    """A private directory that goes with the block; if this process is killed in it, with the next start."""
-    directory = make_directory()
+def temporary_directory(place: Path | None = None) -> Generator[Path, None, None]:
+    """A `make_directory` that goes with the block; if this process is killed in it, with the next start."""
+    directory = make_directory(place)
     try:
         yield directory
     finally:
@@ -180,7 +182,7 @@ def _read(file: IO[str]) -> Path | None:
 
 def _checked(directory: Path) -> Path:
     """A damaged or forged record must not make us delete anything but what we could have made."""
-    if not directory.is_absolute() or not directory.name.startswith(PREFIX) or ".." in str(directory):
+    if not directory.is_absolute() or not directory.name.startswith(PREFIX) or ".." in directory.parts:
         raise ValueError(f"record of {str(directory)!r}: want an absolute path that ends in {PREFIX}...")
     return directory
 

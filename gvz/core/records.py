@@ -4,6 +4,7 @@ A row begins with the number of its schema. A file that ends in `.gz` is compres
 never written to.
 """
 
+import errno
 import fcntl
 import gzip
 import io
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from gvz.core.durable import fsync
-from gvz.core.errors import GvzError
+from gvz.core.errors import GvzError, ResourceError
 
 SCHEMA = 1
 """Stands in every row as `schema`; raised by one when a row's meaning changes."""
@@ -27,6 +28,9 @@ MAX_LINES = 2**22
 MAX_WAITING_BYTES = 64 * 2**20
 """rows kept in memory while the disk is full: hours of a run"""
 TAIL_BYTES = 2**14
+MOUNT = "mount it so that flock reaches the server: NFS 4 without `local_lock`, Lustre with `-o flock`"
+"""what to do about a file system without locks"""
+_NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS}
 
 
 class Writer:
@@ -105,11 +109,26 @@ def lock(file: IO[Any], *, wait: bool = False) -> bool:
     Args:
         file: an open file.
         wait: until the other process has given it back, instead of returning False.
+
+    Raises:
+        ResourceError: the file system has no locks.
     """
+    return _flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+
+
+def _flock(file: IO[Any], how: int) -> bool:
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        fcntl.flock(file, how)
     except BlockingIOError:
         return False
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
+        path = Path(f"/proc/self/fd/{file.fileno()}").readlink()
+        raise ResourceError(
+            f"{path} cannot be locked: {error.strerror}; want a file system with locks, so that one process at a time "
+            f"has the file: choose another place ($GVZ_RUNTIME_DIR for the locks of engines), or {MOUNT}"
+        ) from error
     return True
 
 
@@ -131,11 +150,7 @@ def is_locked(path: Path) -> bool:
     if not path.exists():
         return False
     with path.open("rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # NFS gives a reader no other lock
-        except BlockingIOError:
-            return True
-    return False
+        return not _flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # NFS gives a reader no other lock
 
 
 def stored(path: Path) -> Path | None:

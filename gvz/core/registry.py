@@ -1,5 +1,6 @@
 """Discovery by file name: the modules of a package are its registry."""
 
+import inspect
 import pkgutil
 import re
 import sys
@@ -47,7 +48,7 @@ def discover(package: str, constant: str | None = None) -> dict[str, ModuleType]
     return {name: import_module(f"{package}.{name}") for name in names}
 
 
-def find(package: str, constant: str, name: str, field: str) -> Any:
+def find(package: str, constant: str, name: str, field: str, *arguments: str) -> Any:
     """What `name` names: the constant of a module of `package`, or of a Python file anywhere.
 
     A file is executed once in a process: whoever asks again gets the same object.
@@ -57,9 +58,11 @@ def find(package: str, constant: str, name: str, field: str) -> Any:
         constant: what such a module sets, for example "ENCODER".
         name: a module's file name without suffix, or a path that ends in .py.
         field: the field of the configuration that `name` was read from; errors begin with it.
+        *arguments: names of the arguments that the constant is called with, if it is.
 
     Raises:
-        ConfigError: no such module or file, the file cannot be executed, or it does not set the constant.
+        ConfigError: no such module or file, the file cannot be executed, it does not set the constant, or sets it to
+            something that does not take the arguments.
     """
     if name.endswith(".py"):
         file = Path(name).resolve()
@@ -68,7 +71,18 @@ def find(package: str, constant: str, name: str, field: str) -> Any:
         module = _module_in_file(file)
         if not hasattr(module, constant):
             raise ConfigError(f"{field}: {file} does not set {constant}, want a line `{constant} = ...` at its end")
-        return getattr(module, constant)
+        found = getattr(module, constant)
+        try:
+            if arguments:
+                inspect.signature(found).bind(*arguments)
+        except TypeError as error:
+            raise ConfigError(
+                f"{field}: {file} sets {constant} to {found!r}, want something to call as "
+                f"{constant}({', '.join(arguments)}) ({error})"
+            ) from error
+        except ValueError:  # C code, which does not say what it takes
+            pass
+        return found
     found = {n: getattr(m, constant) for n, m in discover(package, constant).items()}
     if name not in found:
         raise ConfigError(

@@ -22,7 +22,8 @@ _AGAIN_S = 0.05
 
 
 class StopRequest:
-    """Catches SIGNALS while it is entered; SIGHUP only where it is not ignored, as by `nohup`.
+    """Catches SIGNALS while it is entered; SIGHUP only where it is not ignored, as by `nohup`. In another thread than
+    the main one it catches none: Python lets only that one handle signals.
 
     A SIGHUP after another signal is no second one: a closed terminal sends two, and systemd sends it with SIGTERM.
     Python drops an exception that is raised inside a destructor or a callback of the garbage collector; it is raised
@@ -42,7 +43,7 @@ class StopRequest:
         self._before: dict[int, object] = {}
 
     def __enter__(self) -> "StopRequest":
-        for number in SIGNALS:
+        for number in SIGNALS if _may_handle() else ():
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 self._before[number] = signal.signal(number, self._handle)
         self._hook_before, sys.unraisablehook = sys.unraisablehook, self._handle_dropped
@@ -83,6 +84,10 @@ class StopRequest:
         return 0 if self.signal is None else 128 + self.signal
 
 
+def _may_handle() -> bool:
+    return threading.current_thread() is threading.main_thread()
+
+
 def _interrupt_again() -> None:
     main = threading.main_thread().ident
     if main is not None and callable(signal.getsignal(signal.SIGTERM)):  # else the command has ended
@@ -94,6 +99,9 @@ def told_of_delay(stop: StopRequest) -> Generator[None]:
     """Within it a line is said if a signal comes while the main thread is in a long call, such as a compilation. Python
     runs handlers after the call, and who sees no sign of the first Ctrl-C presses it again.
     """
+    if not _may_handle():
+        yield
+        return
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
 
@@ -139,7 +147,7 @@ def uninterrupted() -> Generator[None]:
         else:  # another one came while handlers were put back, and this one stayed
             before[number](number, frame)
 
-    if threading.current_thread() is threading.main_thread():
+    if _may_handle():
         before = {number: handler for number in SIGNALS if callable(handler := signal.getsignal(number))}
     try:
         for number in before:

@@ -11,13 +11,13 @@ import hashlib
 import json
 import math
 import shutil
-import tempfile
 import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gvz.core import janitor, records
 from gvz.core.cache import cache_directory
 from gvz.core.errors import ConfigError, ResourceError, nearest
 from gvz.core.libraries import require_learner
@@ -75,8 +75,8 @@ def _unpack(file: Path, directory: Path) -> None:
         if not lost:
             return
         directory.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=directory.parent) as temporary:
-            fresh = Path(temporary) / directory.name
+        with janitor.temporary_directory(directory.parent.resolve()) as temporary:
+            fresh = temporary / directory.name
             archive.extractall(fresh, lost)  # zipfile keeps every name inside
             if not directory.exists():
                 # another process may have been first; then its directory stays
@@ -126,7 +126,6 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", own_files: OwnFil
         CheckpointError: the policy is damaged.
     """
     require_learner("adding a policy to the zoo")
-    from gvz.core import records
     from gvz.evaluation.trained import find_checkpoint, read_params, read_run_config, trained_player
     from gvz.run.config_files import config_to_dict
     from gvz.segmentation import KEPT_SEGMENTERS, keep_segmenters
@@ -137,8 +136,8 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", own_files: OwnFil
     config = read_run_config(run_dir, own_files)
     num_updates = find_checkpoint(run_dir, checkpoint)
     _, params = read_params(run_dir, config, num_updates)
-    with tempfile.TemporaryDirectory() as temporary:
-        packed = Path(temporary) / name
+    with janitor.temporary_directory() as temporary:
+        packed = temporary / name
         packed.mkdir()
         for record in RECORDS[1:-1]:
             if (run_dir / record).exists():

@@ -104,10 +104,9 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
         for scenario in table.scenarios:
             segmenter_of(scenario.id, config.env)  # its errors are the run's, not an actor's
     agent = run_agent(config)
-    check_agent(agent, on_policy=config.agent.on_policy)
-    spec, params = agent.spec, jax.eval_shape(agent.init, jax.random.key(0))
+    params, num_extras = check_agent(agent, on_policy=config.agent.on_policy)
+    spec = agent.spec
     num_params = sum(leaf.size for leaf in jax.tree.leaves(params))
-    _, extras = jax.eval_shape(agent.act, params, jax.random.key(0), spec.zeros(), jnp.float32(0))
     plays_here = config.mode == "async" and not config.cluster.hosts
     cores = tuple(actor_cores(config.actors.placement, config.num_actors)) if plays_here else ()
     pool_config = PoolConfig(
@@ -124,7 +123,7 @@ def assemble(config: RunConfig, work_dir: Path) -> RunParts:
         stack_size=config.agent.stack_size,
         past_actions=spec.num_past_actions,
         variables=table.variables if config.agent.game_variables else (),
-        num_extras=extras.shape[1],
+        num_extras=num_extras,
         num_sights=spec.num_sights,
         action_masks=table.action_masks,
         num_actions=spec.num_actions,

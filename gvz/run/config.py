@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Literal
 
 from actors.config import MAX_LANES, ActorsConfig
 from gvz.cluster.config import ClusterConfig
+from gvz.core.control_groups import num_cores
 from gvz.core.env_config import EnvConfig, leaves
 from gvz.core.errors import ConfigError
 from gvz.core.registry import OwnFiles
@@ -269,7 +269,7 @@ class RunConfig:
         if self.mode == "sync":  # it must not depend on the machine it is on
             return 1
         num_tasks, hosts, most_lanes = len(self.table), max(1, self.cluster.hosts), self._most_lanes
-        counts = range(len(os.sched_getaffinity(0)), 1, -1)
+        counts = range(num_cores(), 1, -1)
         fitting = (n for n in counts if n * hosts * self._games_of_each(n * hosts, num_tasks) <= most_lanes)
         fewest = math.ceil(num_tasks / (hosts * (self.actors.games_per_actor or num_tasks)))
         return max(next(fitting, 1), fewest if self.curriculum.kind == "fixed" else 1)

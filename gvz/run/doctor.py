@@ -20,6 +20,7 @@ from typing import Literal
 
 from gvz.core import janitor
 from gvz.core.cache import cache_directory
+from gvz.core.control_groups import num_cores
 from gvz.engine.tuned import TUNED, describe_engine
 from gvz.engine.tuned.build_vizdoom import TUNED_VERSION
 from gvz.run.footprint import ACTOR_MEMORY_BYTES, ENGINE_SHM_BYTES, LEARNER_MEMORY_BYTES, format_bytes
@@ -96,13 +97,13 @@ def check_packages() -> Finding:
 
 
 def check_cores() -> Finding:
-    """Cores this process may use."""
-    cores = len(os.sched_getaffinity(0))
+    """Cores that this process can keep busy."""
+    cores = num_cores()
     load = os.getloadavg()[0]
     found = f"{cores} of {os.cpu_count()}, load {load:.1f}"
     if cores < 2:
         return Finding("cores", "note", found, "learner and actors will share one core; give the process more")
-    if load > cores:
+    if load > len(os.sched_getaffinity(0)):
         return Finding("cores", "note", found, "other work is running; rates will be lower")
     return Finding("cores", "ok", found)
 
@@ -110,7 +111,7 @@ def check_cores() -> Finding:
 def check_memory() -> Finding:
     """Free memory, against the smallest run with one actor a core."""
     free = available_memory()
-    need = LEARNER_MEMORY_BYTES + len(os.sched_getaffinity(0)) * ACTOR_MEMORY_BYTES
+    need = LEARNER_MEMORY_BYTES + num_cores() * ACTOR_MEMORY_BYTES
     found = f"{format_bytes(free)} available; a small run takes {format_bytes(need)}"
     if free < need:
         remedy = "end other programs, or train with --actors.num-actors 1 and a smaller --replay.capacity"
@@ -121,7 +122,7 @@ def check_memory() -> Finding:
 def check_shared_memory() -> Finding:
     """Free space in /dev/shm, against four games a core."""
     free = shutil.disk_usage(janitor.SHM_DIR).free
-    games = 4 * len(os.sched_getaffinity(0))
+    games = 4 * num_cores()
     taken = games * ENGINE_SHM_BYTES
     need = taken + 64 * 2**20
     found = f"{format_bytes(free)} free, want {format_bytes(need)}: {games} games take {format_bytes(taken)}"

@@ -11,6 +11,8 @@ from typing import Any
 
 import psutil
 
+from gvz.core.control_groups import MOUNTED, num_cores, own_groups
+
 ROOT = Path(__file__).parents[2]
 """of a checkout, or where the packages are installed"""
 PACKAGES = (
@@ -64,37 +66,28 @@ def describe() -> dict[str, Any]:
 
 
 def hardware() -> dict[str, Any]:
-    """JSON types: cpu, cores (that this process may use), memory_bytes (of the machine), system, devices (JAX's)."""
+    """JSON types: cpu, cores (`num_cores`), memory_bytes (of the machine), system, devices (JAX's)."""
     import jax
 
     return {
         "cpu": cpu_model(),
-        "cores": len(os.sched_getaffinity(0)),
+        "cores": num_cores(),
         "memory_bytes": psutil.virtual_memory().total,
         "system": f"{platform.system()} {platform.machine()}",
         "devices": [f"{device.platform}: {device.device_kind}" for device in jax.devices()],
     }
 
 
-def available_memory(control_groups: Path = Path("/sys/fs/cgroup"), own_groups: str | None = None) -> int:
+def available_memory(mounted: Path = MOUNTED, listed: str | None = None) -> int:
     """Bytes that this process can still take: of the machine's memory, within the limits of a container or batch job.
 
     Args:
-        control_groups: where the control groups of Linux are mounted, version 1 or 2 (cgroups(7)).
-        own_groups: the text of /proc/self/cgroup; by default it is read.
+        mounted, listed: as for `own_groups`.
     """
-    if own_groups is None:
-        file = Path("/proc/self/cgroup")
-        own_groups = file.read_text() if file.exists() else ""
     free = [int(psutil.virtual_memory().available)]
-    for line in own_groups.splitlines():
-        _, controllers, path = line.split(":", 2)
-        if not controllers or "memory" in controllers.split(","):
-            top = control_groups / controllers  # in a container, it is that of the container
-            own = Path(path.strip("/"))
-            for directory in (top / own, *(top / parent for parent in own.parents)):
-                with contextlib.suppress(OSError, ValueError):  # it has no limit, or another container has it
-                    free.append(_room_in(directory))
+    for group in own_groups("memory", mounted, listed):
+        with contextlib.suppress(OSError, ValueError):  # it has no limit, or another container has it
+            free.append(_room_in(group))
     return max(0, min(free))
 
 

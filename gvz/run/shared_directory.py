@@ -23,7 +23,6 @@ from gvz.run.doctor import Finding
 LOCK_FILE = ".gvz-doctor-lock"
 NUM_RENAMES = 300
 _TIMEOUT_S = 60.0
-_MOUNT = "mount it so that flock reaches the server: NFS 4 without `local_lock`, Lustre with `-o flock`"
 _HOLDER = """
 import sys
 from pathlib import Path
@@ -70,9 +69,9 @@ def problem(path: str, text: str) -> str:
             f"does not see the files of {file.parent} ({error.strerror}); mount it on all machines, at the same place"
         )
     if seen != text:
-        return f"reads old contents in {file.parent}; {_MOUNT}"
+        return f"reads old contents in {file.parent}; {records.MOUNT}"
     if not records.is_locked(file):
-        return f"does not see locks of others in {file.parent}; {_MOUNT}"
+        return f"does not see locks of others in {file.parent}; {records.MOUNT}"
     try:
         beside = file.with_name(f"{file.name}-{secrets.token_hex(4)}")
         beside.touch()
@@ -92,21 +91,25 @@ def check_locks(directory: Path) -> Finding:
     """A lock that one process holds is refused to another, and free when the holder is killed."""
     file = directory / f".gvz-lock-{secrets.token_hex(8)}"
     holder = subprocess.Popen(
-        [sys.executable, "-c", _HOLDER, str(file)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", _HOLDER, str(file)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
     )
     try:
         assert holder.stdout is not None
         if holder.stdout.readline() != "True\n":
-            return Finding("locks", "bad", f"{directory}: no lock can be had", _MOUNT)
+            return Finding("locks", "bad", f"{directory}: no lock can be had", records.MOUNT)
         if not records.is_locked(file):
-            return Finding("locks", "bad", f"{directory}: two processes got one lock", _MOUNT)
+            return Finding("locks", "bad", f"{directory}: two processes got one lock", records.MOUNT)
         holder.kill()
         holder.wait(_TIMEOUT_S)
         deadline_s = time.monotonic() + _TIMEOUT_S
         while records.is_locked(file):
             if time.monotonic() > deadline_s:
                 return Finding(
-                    "locks", "bad", f"{directory}: a killed process kept its lock {_TIMEOUT_S:.0f} s", _MOUNT
+                    "locks", "bad", f"{directory}: a killed process kept its lock {_TIMEOUT_S:.0f} s", records.MOUNT
                 )
             time.sleep(0.05)
     finally:
@@ -184,7 +187,7 @@ def check_other_machine(directory: Path) -> Finding:
             name, "ok", f"{host or 'somebody'} holds a lock in it, which is refused on {socket.gethostname()}"
         )
     if time.time() < until_s:
-        return Finding(name, "bad", f"{host} holds a lock in it, which {socket.gethostname()} got, too", _MOUNT)
+        return Finding(name, "bad", f"{host} holds a lock in it, which {socket.gethostname()} got, too", records.MOUNT)
     return Finding(name, "note", "locks between machines are not tested by one alone", how)
 
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import os
 import weakref
 from collections.abc import Generator, Sequence
 from typing import Any, Literal
@@ -14,6 +13,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from gvz.core.control_groups import num_cores
 from gvz.core.env_config import EPISODE_SEEDS, EnvConfig
 from gvz.core.errors import ConfigError
 from gvz.env import DoomEnv
@@ -89,7 +89,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         ids = arguments.task_ids(tasks)
         self.num_envs = arguments.number("num_envs", num_envs, default=len(ids))
         self.batch_size = arguments.number("batch_size", batch_size, default=self.num_envs, most=self.num_envs)
-        cores = min(self.num_envs, len(os.sched_getaffinity(0)))
+        cores = min(self.num_envs, num_cores())
         num_workers = arguments.number("num_workers", num_workers, default=cores, most=self.num_envs)
         self._mode = arguments.autoreset_mode(autoreset_mode)
         if not copy and self.batch_size < self.num_envs:

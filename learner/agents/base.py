@@ -224,7 +224,7 @@ def make_agent(config: AgentConfig, spec: AgentSpec) -> Agent:
             f"agent.name: got {config.name!r} in a {type(config).__name__}, want a {kind.__name__}; to change the "
             "agent of a configuration, use learner.config.change_agent"
         )
-    return find("learner.agents", "AGENT", config.name, "agent.name")(config, spec)
+    return find("learner.agents", "AGENT", config.name, "agent.name", "config", "spec")(config, spec)
 
 
 def allowed_values(q_values: Float[Array, "B A"], mask: Bool[Array, "B A"] | None) -> Float[Array, "B A"]:

@@ -30,4 +30,4 @@ def make_encoder(name: str) -> Encoder:
     Raises:
         ConfigError: there is none; names those there are, and the nearest.
     """
-    return find("learner.encoders", "ENCODER", name, "agent.encoder")
+    return find("learner.encoders", "ENCODER", name, "agent.encoder", "x", "config")

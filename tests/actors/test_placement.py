@@ -1,6 +1,8 @@
 """Actors and their engines on one core: which, and that the processes really are kept to it."""
 
 import os
+from collections.abc import Iterator
+from pathlib import Path
 
 import msgspec
 import psutil
@@ -8,14 +10,23 @@ import pytest
 from test_doom import config
 
 from actors import placement
-from actors.placement import actor_cores, cores_left, in_words
+from actors.placement import actor_cores, cores_left, give_back, in_words
 from actors.process_pool import ProcessPool
 from gvz.core.errors import ConfigError
+
+
+@pytest.fixture(autouse=True)
+def no_cores_held(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    tmp_path.chmod(0o700)
+    monkeypatch.setenv("GVZ_RUNTIME_DIR", str(tmp_path))
+    yield
+    give_back()
 
 
 @pytest.fixture
 def four_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
+    monkeypatch.setattr(placement, "num_cores", lambda: 4)
     monkeypatch.setattr(placement.psutil, "cpu_percent", lambda *_, **__: [5.0, 95.0, 5.0, 5.0])
 
 
@@ -30,6 +41,30 @@ def test_actors_get_cores_of_their_own_where_there_is_room():
     assert cores_left([3, 2]) == {0, 1}
     assert cores_left([3, 2, 1, 0]) == {0, 1, 2, 3}
     assert cores_left([None]) == {0, 1, 2, 3}
+
+
+@pytest.mark.usefixtures("four_cores")
+def test_a_quota_of_processor_time_leaves_no_room_for_own_cores(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(placement, "num_cores", lambda: 2)
+    assert actor_cores("auto", 1) == [3]
+    assert actor_cores("auto", 2) == [None] * 2
+
+
+@pytest.mark.usefixtures("four_cores")
+def test_runs_that_start_at_once_have_different_cores(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
+    monkeypatch.setattr(placement, "num_cores", lambda: 8)
+    monkeypatch.setattr(placement.psutil, "cpu_percent", lambda *_, **__: [5.0] * 8)
+    assert actor_cores("auto", 2) == [7, 6], "core 5 is the learner's"
+    assert actor_cores("auto", 2) == [7, 6], "the next pool of the same process"
+    first = list(placement._locks)
+    monkeypatch.setattr(placement, "_locks", [])  # as in another process
+    assert actor_cores("auto", 5) == [None] * 5
+    assert actor_cores("auto", 4) == [4, 3, 2, 1]
+    give_back()
+    for lock in first:  # the first run ends
+        lock.close()
+    assert actor_cores("auto", 5) == [7, 6, 5, 4, 3]
 
 
 def test_the_log_says_where_actors_are():

@@ -1,12 +1,12 @@
 """`gvz experiment`: list, plan by earlier records, status; what is bad input. Running is tests/e2e's."""
 
 import json
-import os
 
 import pytest
 
 from gvz.cli import main
 from gvz.commands.experiment import _side_by_side
+from gvz.core.control_groups import num_cores
 from gvz.experiments import inventory
 from gvz.experiments.base import experiments
 from gvz.experiments.costs import Rates, read_rates
@@ -15,7 +15,7 @@ from gvz.run.machine import cpu_model
 from tests.reports.conftest import write_rows
 
 RUN = "rainbow_4task/defend_the_center/train4/seed_1111"
-CORES = len(os.sched_getaffinity(0))
+CORES = num_cores()
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from gvz.core import janitor
 from gvz.core.errors import ResourceError
 from gvz.core.stop import StopRequest
 from gvz.engine import process
+from tests.processes import run_until_killed
 from tests.waiting import wait_until
 
 WRAPPER = Path(process.__file__).with_name("wrapper.py")
@@ -39,17 +40,6 @@ def directory(tmp_path: Path) -> Path:
     path = tmp_path / "gvz-engine-0123456789abcdef"
     path.mkdir()
     return path
-
-
-def run_until_killed(code: str) -> str:
-    """Runs code in a process of its own, kills it with SIGKILL at its first line of output, returns that line."""
-    with subprocess.Popen(
-        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        line = process.stdout.readline().strip()
-        process.kill()
-    return line
 
 
 def give_up(directory: Path) -> None:

@@ -100,3 +100,19 @@ def test_what_a_file_raises_is_told_in_one_line_and_the_file_can_be_mended(tmp_p
         find("zoo", "NAME", str(file), "zoo.animal")
     file.write_text("NAME = 1")
     assert find("zoo", "NAME", str(file), "zoo.animal") == 1
+
+
+@pytest.mark.parametrize("value", ["3", "'text'", "lambda x: x", "lambda x, config, more: x"])
+def test_a_constant_that_cannot_be_called_with_its_arguments_is_refused(tmp_path: Path, value: str):
+    file = tmp_path / "mine.py"
+    file.write_text(f"NAME = {value}\n")
+    said = r"agent\.encoder: .*mine\.py sets NAME to .*, want something to call as NAME\(x, config\)"
+    with pytest.raises(ConfigError, match=said):
+        find("zoo", "NAME", str(file), "agent.encoder", "x", "config")
+
+
+@pytest.mark.parametrize("value", ["lambda *any: any", "lambda x, config, more=0: x", "divmod", "dict"])
+def test_one_that_can_is_taken_also_if_it_does_not_say_its_arguments(tmp_path: Path, value: str):
+    file = tmp_path / "mine.py"
+    file.write_text(f"NAME = {value}\n")
+    assert callable(find("zoo", "NAME", str(file), "agent.encoder", "x", "config"))

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from gvz import cli
 from gvz.core import stop as stops
 from gvz.core.stop import SIGNALS, StopRequest, blocked_signals, told_of_delay, uninterrupted
 from tests.waiting import wait_until
@@ -55,6 +56,18 @@ def test_what_a_signal_raises_inside_a_destructor_is_raised_again(number: signal
     with pytest.raises(KeyboardInterrupt), StopRequest(at_once=True) as stop:
         play()
     assert stop.signal == number
+
+
+def test_in_another_thread_than_the_main_one_a_command_runs_and_catches_no_signals():
+    codes = [1, 1]
+
+    def run() -> None:
+        codes[:] = cli.main(["tasks", "--scenario", "rockets"]), cli.main(["train", "--config", "no-such"])
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert codes == [0, 2]
 
 
 def test_under_nohup_a_hangup_stays_ignored():

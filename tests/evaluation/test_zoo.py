@@ -12,6 +12,7 @@ import pytest
 
 from gvz import cli
 from gvz.commands import zoo as zoo_command
+from gvz.core import janitor
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError, ResourceError
 from gvz.core.registry import OwnFiles
@@ -23,6 +24,7 @@ from gvz.run.config_files import config_to_dict
 from gvz.run.rundir import RunDir
 from gvz.segmentation import segmenter_file
 from tests.evaluation.policies import CONFIG, write_policy
+from tests.processes import run_until_killed
 from tests.test_segmentation import write_network
 
 SHIPPED = zoo.ZOO_DIRECTORY
@@ -95,6 +97,24 @@ def test_files_that_the_cache_lost_are_unpacked_again(run):
     assert (directory / "episode.gif").exists()
     assert find_checkpoints(directory, ["newest"]) == [100]
     assert [path.name for path in directory.parent.iterdir()] == ["one"]
+
+
+def test_what_a_process_that_was_killed_had_unpacked_goes_with_the_next_start(tmp_path, monkeypatch):
+    tmp_path.chmod(0o700)
+    monkeypatch.setenv("GVZ_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "here").mkdir()
+    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path / "here" / ".." / "cache"))
+    code = (
+        "import zipfile\nfrom gvz.evaluation.zoo import run_directory, zoo_names\n"
+        "extract = zipfile.ZipFile.extractall\n"
+        "zipfile.ZipFile.extractall = lambda *given: extract(*given) or print('half', flush=True) or input()\n"
+        "run_directory(f'zoo:{zoo_names()[0]}')\n"
+    )
+    assert run_until_killed(code) == "half"
+    assert len(list((tmp_path / "cache").rglob("config.json"))) == 1
+    (done,) = janitor.clean_dead_instances()
+    assert done.startswith(f"directory {tmp_path / 'cache' / 'zoo'}")
+    assert [path for path in (tmp_path / "cache").rglob("*") if path.is_file() or janitor.PREFIX in path.name] == []
 
 
 @pytest.mark.parametrize(("record", "most"), [("metrics.jsonl", 100), ("episodes.jsonl", 4_000)])

@@ -122,6 +122,19 @@ def test_a_run_of_a_wrong_agent_is_refused_before_it_plays(tmp_path: Path):
         assemble(config, tmp_path)
 
 
+def test_a_run_traces_how_an_agent_acts_once_to_check_it_and_once_for_its_actors(tmp_path: Path, monkeypatch: Any):
+    act, batch_sizes = DQN.act, list[int]()
+
+    def counted(self: Any, params: Any, key: Any, obs: Any, epsilon: Any) -> Any:
+        batch_sizes.append(len(obs.task))
+        return act(self, params, key, obs, epsilon)
+
+    monkeypatch.setattr(DQN, "act", counted)
+    config = load_config("dqn_quick")
+    assemble(config, tmp_path)
+    assert batch_sizes == [3, config.games_per_actor]
+
+
 @pytest.mark.parametrize(
     ("features", "shape"), [("x", "[3, 8, 8, 2]"), ("x.mean((1, 2, 3))", "[3]"), ("x.reshape(1, -1)", "[1, 384]")]
 )

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import re
 import subprocess
 import sys
@@ -53,7 +52,7 @@ def test_every_config_loads_in_every_scenario_and_every_committed_run_can_still_
 @pytest.mark.parametrize("cores", [1, 3, 96, 512])
 def test_every_config_fits_any_number_of_cores(name, cores, monkeypatch):
     """By default there is an actor for each core, unless the replay or the warm-up has no room for their games."""
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+    monkeypatch.setattr("gvz.run.config.num_cores", lambda: cores)
     config = load_config(name)
     assert len(config.table) <= config.num_lanes
     if config.actors.num_actors is None and cores < 16:
@@ -63,11 +62,11 @@ def test_every_config_fits_any_number_of_cores(name, cores, monkeypatch):
 def test_a_saved_run_has_its_actors_and_games_on_any_machine(tmp_path, monkeypatch):
     """More tasks than one actor of its two has games for; and more games than its replay has room for on 96 cores."""
     for name, flags in (("rainbow_4task", ["--actors.games-per-actor", "2"]), ("rainbow_segmented", [])):
-        monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+        monkeypatch.setattr("gvz.run.config.num_cores", lambda: 2)
         config = parse(["--config", name, *flags]).run
         saved, numbers = config_to_dict(config), (config.num_actors, config.games_per_actor)
         for cores in (1, 96):
-            monkeypatch.setattr(os, "sched_getaffinity", lambda _, cores=cores: set(range(cores)))
+            monkeypatch.setattr("gvz.run.config.num_cores", lambda cores=cores: cores)
             read = config_from_dict(saved)
             assert (read.num_actors, read.games_per_actor) == numbers
             again = parse(["--config", name, *flags]).run

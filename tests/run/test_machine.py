@@ -10,6 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from gvz.core.control_groups import num_cores
 from gvz.run import machine
 
 PIPES = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
@@ -61,7 +62,7 @@ def test_all_of_it_is_json_and_of_this_machine():
     found = json.loads(json.dumps(machine.describe()))
     assert set(found) == {"cpu", "cores", "memory_bytes", "system", "devices", "versions", "commit"}
     assert found["cpu"] in Path("/proc/cpuinfo").read_text()
-    assert found["cores"] == len(os.sched_getaffinity(0))
+    assert found["cores"] == num_cores()
     assert found["versions"]["jax"] == version("jax")
     assert found["devices"]
 

@@ -47,7 +47,7 @@ def test_a_lock_that_another_process_holds_is_seen(tmp_path):
         holder.kill()
         holder.communicate(timeout=30)
     finding = shared_directory.check_other_machine(tmp_path)  # a lock that does not reach this machine looks like that
-    assert (finding.state, finding.remedy) == ("bad", shared_directory._MOUNT)
+    assert (finding.state, finding.remedy) == ("bad", records.MOUNT)
 
 
 def test_where_locks_do_nothing_they_are_found_bad(tmp_path, monkeypatch):

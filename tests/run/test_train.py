@@ -3,6 +3,7 @@
 import hashlib
 import itertools
 import json
+import os
 import re
 import signal
 from dataclasses import dataclass, replace
@@ -17,6 +18,7 @@ import pytest
 
 from actors.config import ActorsConfig
 from benchmarks.last_parameters import main, write_last_parameters
+from gvz import launch
 from gvz.cluster.config import ClusterConfig
 from gvz.core import records
 from gvz.core.durable import saved_steps
@@ -340,3 +342,15 @@ def test_an_on_policy_run_learns_from_what_was_chosen_on_the_learners_device(tmp
         assert np.isfinite(row["learner/loss"])
         assert row["rollout/age_max_versions"] <= 12
     assert abs(rows[0]["learner/kl"]) < 1e-6
+
+
+@pytest.mark.parametrize(("cores", "size"), [(1, "1"), (2, None)])
+def test_under_a_quota_xla_has_no_thread_for_each_core_of_the_machine(tmp_path, monkeypatch, cores, size):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    monkeypatch.setattr(launch, "num_cores", lambda: cores)
+    monkeypatch.setenv("NPROC", "")
+    monkeypatch.delenv("NPROC")
+    found = []
+    monkeypatch.setattr("gvz.run.train.train", lambda *_: found.append(os.environ.get("NPROC")) or 0)
+    assert launch.main(["--config", "rainbow_quick", "--run-dir", str(tmp_path / "run")]) == 0
+    assert found == [size]
