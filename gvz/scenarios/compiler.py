@@ -111,7 +111,10 @@ def _sometimes(task: Task, profile: Profile) -> list[str]:
 def _one_way(task: Task, profile: Profile, idle: Iterable[str]) -> Task:
     """The task with these attributes left out, and others that are sometimes in force in force."""
     fixed = dict.fromkeys(_sometimes(task, profile), 1.0) | dict.fromkeys(idle, 0.0)
-    return dataclasses.replace(task, severities=tuple({**dict(task.severities), **fixed}.items())) if fixed else task
+    if not fixed:
+        return task
+    scenario = dataclasses.replace(task.scenario, levdoom_tasks={})  # also if what is left has a whole task's name
+    return dataclasses.replace(task, scenario=scenario, severities=tuple({**dict(task.severities), **fixed}.items()))
 
 
 def _all_ways(task: Task, profile: Profile) -> Content:

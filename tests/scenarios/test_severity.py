@@ -98,6 +98,26 @@ def test_a_graded_name_has_no_exception_of_profile_levdoom(scenario):
             assert is_plain == bool(task.severities), task.id
 
 
+@pytest.mark.parametrize(
+    ("text", "whole"),
+    [
+        ("health_gathering/stimpacks=0.5", "health_gathering/stimpacks"),
+        ("dodge_projectiles/arachnotron=0.5+city", "dodge_projectiles/arachnotron+city"),
+        ("health_gathering/poison+stimpacks+supreme=0.5", "health_gathering/poison+stimpacks"),
+    ],
+)
+def test_no_episode_of_a_graded_name_has_an_exception_of_profile_levdoom(text, whole):
+    """In each of these some episodes play no attribute but those of a name with an exception."""
+    graded = compile_task(parse_task(text), "levdoom")
+    without = dataclasses.replace(graded.task, scenario=dataclasses.replace(graded.task.scenario, levdoom_tasks={}))
+    plain = compile_task(without, "levdoom")
+    assert [graded.map_of(seed)[1] for seed in range(12)] == [plain.map_of(seed)[1] for seed in range(12)]
+    assert graded.map_magic == plain.map_magic
+    assert task_content(parse_task(whole), "levdoom") != task_content(
+        dataclasses.replace(parse_task(whole), scenario=without.scenario), "levdoom"
+    )
+
+
 def test_a_blend_lies_where_both_textures_lie():
     """A wall of 64x128 and a flat of 64x64: the wall once, made of its own patches, and the flat twice."""
     patches = {"WALL": [("TOP", 0, 0), ("BOTTOM", 0, 64)]}
