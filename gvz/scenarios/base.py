@@ -15,6 +15,7 @@ from gvz.core.env_config import EnvConfig, Profile
 from gvz.core.errors import TaskError, nearest
 from gvz.scenarios.layout import Layout
 from gvz.scenarios.map_set import PROCEDURAL, VARIED, MapSet
+from gvz.scenarios.names import check_names, graded_name
 from gvz.scenarios.rewards import Reward, Rewarder, check_weights, return_range
 from gvz.wad.udmf import UdmfMap
 
@@ -177,7 +178,8 @@ class Attribute:
 class Scenario:
     """A map, an objective, a reward and buttons; the first extension point of the benchmark.
 
-    Scenarios can be pickled. Two scenarios are equal if all their fields are equal, also across processes.
+    Scenarios can be pickled. Two scenarios are equal if all their fields are equal, also across processes. A TaskError
+    says if its names do not fit together (gvz.scenarios.names).
     """
 
     id: str
@@ -217,6 +219,9 @@ class Scenario:
     upper_bounds: Mapping[Profile, float]
     """best possible score"""
     rewards: Mapping[str, Reward]
+
+    def __post_init__(self) -> None:
+        check_names(self)
 
     def __hash__(self) -> int:
         return hash(self.id)  # the other fields hold mappings
@@ -386,11 +391,6 @@ class Task:
 
     def __str__(self) -> str:
         return self.id
-
-
-def graded_name(severity: float) -> str:
-    """What an attribute's name in a task's id ends with: "=0.5", or nothing if it is whole."""
-    return "" if severity == 1 else f"={severity:g}"
 
 
 def words(text: str) -> tuple[str, ...]:
