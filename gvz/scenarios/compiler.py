@@ -205,10 +205,17 @@ def map_source(task: Task, profile: Profile, number: int | None = None) -> MapSo
     drawn.things += [make_thing(t.type, t.x, t.y, tid=t.tid) for t in _checked_things(task, content, drawn, decorate)]
     try:
         check_textures(drawn, {*stock_textures(), *content.blends})
+        textures = "".join(
+            blended(name, blend.under, blend.over, blend.opacity, stock_textures(), stock_patches())
+            for name, blend in every.blends.items()
+        )
     except WadError as error:
         raise WadError(f"task {task.id}: {error}") from error
     textmap = write_textmap(drawn)
     template = Template(task.scenario.script)
+    if not template.is_valid():
+        raise TaskError(f"task {task.id}: the script has a '$' that begins no name; write '$$' for a '$' of its own")
+    _check_kinds(task, content)
     names = _script_names(content)
     if (given := {*names, "map_magic"}) != (used := set(template.get_identifiers())):
         raise TaskError(
@@ -219,10 +226,6 @@ def map_source(task: Task, profile: Profile, number: int | None = None) -> MapSo
     digest = hashlib.sha256(everything.encode()).digest()
     magic = int.from_bytes(digest[:4], "little") % (2**31 - 1) + 1
     script = template.substitute(names, map_magic=magic)
-    textures = "".join(
-        blended(name, blend.under, blend.over, blend.opacity, stock_textures(), stock_patches())
-        for name, blend in every.blends.items()
-    )
     return MapSource(textmap=textmap, script=script, decorate=decorate, textures=textures, map_magic=magic)
 
 
@@ -254,6 +257,22 @@ def acs_value(value: Value) -> str:
             return "{" + ", ".join(f'"{v}"' if isinstance(v, str) else acs_value(v) for v in value) + "}"
         case _:
             return str(value)
+
+
+def _check_kinds(task: Task, content: Content) -> None:
+    """Refuses an integer where the scenario has a fixed-point number, and the reverse: 1.0 is 65536 to the engine."""
+    for name, own in task.scenario.content.parameters.items():
+        if len(_kinds(own) | _kinds(value := content.parameters[name])) > 1:
+            raise TaskError(
+                f"task {task.id}: got {name}={value!r}, and {own!r} in the scenario; want both with a point, or neither"
+            )
+
+
+def _kinds(value: Value) -> set[type]:
+    """int or float, or both, of a parameter's numbers; 0 may be either."""
+    numbers = dataclasses.astuple(value) if isinstance(value, Uniform) else value
+    numbers = numbers if isinstance(numbers, tuple) else (numbers,)
+    return {float if isinstance(one, float) else int for one in numbers if isinstance(one, int | float) and one}
 
 
 def _script_names(content: Content) -> dict[str, str]:

@@ -41,7 +41,7 @@ def graded(before: Content, change: Content, severity: float) -> Content:
         pairs = zip(dataclasses.astuple(before.textures), dataclasses.astuple(change.textures), strict=True)
         names, blends = [], {}
         for one, other in pairs:
-            blend = Blend(one, other, severity)
+            blend = Blend(one.upper(), other.upper(), severity)
             name = f"X{hashlib.sha256(repr(blend).encode()).hexdigest()[:7].upper()}"
             names.append(name)
             blends[name] = blend
