@@ -26,6 +26,7 @@ from gvz.observation import (
 )
 from gvz.one_thread import one_thread
 from gvz.scenarios.base import BOOKKEEPING, Task
+from gvz.scenarios.checks import ALWAYS_READ
 from gvz.scenarios.compiler import compile_task, task_content
 from gvz.segmentation import segmented_frame, segmenter_of
 from gvz.tasks import parse_task
@@ -118,7 +119,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         self.action_meanings = action_buttons(scenario, config.action_set)
         self._actions = [[button in held for button in scenario.buttons] for held in self.action_meanings]
         bookkeeping = {name: user for name, user in BOOKKEEPING.items() if name != "MAP_MAGIC"}
-        own = tuple(dict.fromkeys((*scenario.game_variables, "KILLCOUNT", "POSITION_X", "POSITION_Y")))
+        own = tuple(dict.fromkeys((*scenario.game_variables, *ALWAYS_READ)))
         self._names = (*own, *bookkeeping)
         self._engine_config = EngineConfig(
             wad=self._compiled.wad_path,

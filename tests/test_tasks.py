@@ -20,6 +20,7 @@ from gvz.core.errors import TaskError
 from gvz.scenarios.base import Attribute, Content, Task, Textures
 from gvz.scenarios.compiler import task_content
 from gvz.scenarios.map_set import PARTS, MapSet
+from gvz.scenarios.rewards import Fell, Pace, Reward, living
 from gvz.tasks import all_scenarios, named_tasks, parse_task, scenario_named, scenarios
 
 LEVELS = {  # tasks of level 0, 1, 2, 3, 4
@@ -324,9 +325,24 @@ def test_an_attribute_whose_name_or_groups_would_make_another_task_is_refused(ch
         ({"complete": ("gore", "fast")}, "complete: got 'fast', want the attribute's name, 'fast_enemies'"),
         ({"content": Content(base_wad="basic.wad")}, "got a content without base_wad or textures"),
         ({"content": Content(textures=ICE.content.textures)}, "got a content without base_wad or textures"),
+        ({"metric": "kill"}, "got the metric 'kill', want one of frames_alive, kills, goals"),
+        (
+            {"timeouts": {"thesis": 1100}},
+            r"got timeouts {'thesis': 1100}, want a positive one of \('thesis', 'levdoom'\)",
+        ),
+        ({"upper_bounds": {"thesis": 0, "levdoom": 1}}, "got upper_bounds .*, want a positive one"),
+        ({"combination_buttons": ("ATTACK", "SPEED")}, "combination_buttons: got {'SPEED'}, want some of ATTACK, TURN"),
+        (
+            {"rewards": {"shells": Reward(event=Fell("AMMO3"), weight=-1.0, levdoom=-1.0)}},
+            r"reward 'shells': got the variable 'AMMO3' \(did you mean 'AMMO2'\?\), which is not read; want one of",
+        ),
+        (
+            {"rewards": {"alive": Reward(event=living, weight=1.0, levdoom=1.0, paces=(Pace(needs="ammo"),))}},
+            "reward 'alive': got a pace that needs 'ammo', want one of alive",
+        ),
     ],
 )
-def test_a_scenario_whose_names_do_not_fit_together_is_refused(changes: dict[str, Any], message: str):
+def test_a_scenario_whose_parts_do_not_fit_together_is_refused(changes: dict[str, Any], message: str):
     with pytest.raises(TaskError, match=f"scenario defend_the_center.*{message}"):
         dataclasses.replace(scenario_named("defend_the_center"), **changes)
 

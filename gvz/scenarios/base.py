@@ -13,9 +13,9 @@ from typing import Any, Literal
 
 from gvz.core.env_config import EnvConfig, Profile
 from gvz.core.errors import TaskError, nearest
+from gvz.scenarios.checks import check_scenario, graded_name
 from gvz.scenarios.layout import Layout
 from gvz.scenarios.map_set import PROCEDURAL, VARIED, MapSet
-from gvz.scenarios.names import check_names, graded_name
 from gvz.scenarios.rewards import Reward, Rewarder, check_weights, return_range
 from gvz.wad.udmf import UdmfMap
 
@@ -179,7 +179,7 @@ class Scenario:
     """A map, an objective, a reward and buttons; the first extension point of the benchmark.
 
     Scenarios can be pickled. Two scenarios are equal if all their fields are equal, also across processes. A TaskError
-    says if its names do not fit together (gvz.scenarios.names).
+    says what does not fit together (gvz.scenarios.checks).
     """
 
     id: str
@@ -221,7 +221,7 @@ class Scenario:
     rewards: Mapping[str, Reward]
 
     def __post_init__(self) -> None:
-        check_names(self)
+        check_scenario(self)
 
     def __hash__(self) -> int:
         return hash(self.id)  # the other fields hold mappings
