@@ -1,5 +1,6 @@
 """What a scenario must have so that ids of tasks, rewards and scores mean what they say."""
 
+import dataclasses
 import re
 from typing import TYPE_CHECKING, get_args
 
@@ -9,7 +10,7 @@ from gvz.scenarios.map_set import PROCEDURAL, VARIED
 from gvz.scenarios.rewards import Fell, Gained, Rose
 
 if TYPE_CHECKING:
-    from gvz.scenarios.base import Scenario
+    from gvz.scenarios.base import Content, Scenario, Task, Value
 
 ALWAYS_READ = ("KILLCOUNT", "POSITION_X", "POSITION_Y")
 """game variables that rewards and infos know in every scenario, beside the scenario's own"""
@@ -87,6 +88,22 @@ def _check_score(scenario: "Scenario") -> None:
                     f"{where}, reward {name!r}: got a pace that needs {pace.needs!r}, "
                     f"want one of {', '.join(scenario.rewards)}"
                 )
+
+
+def check_kinds(task: "Task", content: "Content") -> None:
+    """Refuses an integer where the scenario has a fixed-point number, and the reverse: 1.0 is 65536 to the engine."""
+    for name, own in task.scenario.content.parameters.items():
+        if len(_kinds(own) | _kinds(value := content.parameters[name])) > 1:
+            raise TaskError(
+                f"task {task.id}: got {name}={value!r}, and {own!r} in the scenario; want both with a point, or neither"
+            )
+
+
+def _kinds(value: "Value") -> set[type]:
+    """int or float, or both, of a parameter's numbers; 0 may be either."""
+    numbers = dataclasses.astuple(value) if dataclasses.is_dataclass(value) else value
+    numbers = numbers if isinstance(numbers, tuple) else (numbers,)
+    return {float if isinstance(one, float) else int for one in numbers if isinstance(one, int | float) and one}
 
 
 def graded_name(severity: float) -> str:

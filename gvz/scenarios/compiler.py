@@ -23,6 +23,7 @@ from gvz.core.env_config import Profile
 from gvz.core.errors import ResourceError, TaskError, WadError, nearest
 from gvz.scenarios import looks
 from gvz.scenarios.base import Attribute, Chance, Content, Task, Thing, Toward, Uniform, Value
+from gvz.scenarios.checks import check_kinds
 from gvz.scenarios.floor import Floor
 from gvz.scenarios.layout import Layout
 from gvz.scenarios.map_set import MapSet
@@ -215,7 +216,7 @@ def map_source(task: Task, profile: Profile, number: int | None = None) -> MapSo
     template = Template(task.scenario.script)
     if not template.is_valid():
         raise TaskError(f"task {task.id}: the script has a '$' that begins no name; write '$$' for a '$' of its own")
-    _check_kinds(task, content)
+    check_kinds(task, content)
     names = _script_names(content)
     if (given := {*names, "map_magic"}) != (used := set(template.get_identifiers())):
         raise TaskError(
@@ -257,22 +258,6 @@ def acs_value(value: Value) -> str:
             return "{" + ", ".join(f'"{v}"' if isinstance(v, str) else acs_value(v) for v in value) + "}"
         case _:
             return str(value)
-
-
-def _check_kinds(task: Task, content: Content) -> None:
-    """Refuses an integer where the scenario has a fixed-point number, and the reverse: 1.0 is 65536 to the engine."""
-    for name, own in task.scenario.content.parameters.items():
-        if len(_kinds(own) | _kinds(value := content.parameters[name])) > 1:
-            raise TaskError(
-                f"task {task.id}: got {name}={value!r}, and {own!r} in the scenario; want both with a point, or neither"
-            )
-
-
-def _kinds(value: Value) -> set[type]:
-    """int or float, or both, of a parameter's numbers; 0 may be either."""
-    numbers = dataclasses.astuple(value) if isinstance(value, Uniform) else value
-    numbers = numbers if isinstance(numbers, tuple) else (numbers,)
-    return {float if isinstance(one, float) else int for one in numbers if isinstance(one, int | float) and one}
 
 
 def _script_names(content: Content) -> dict[str, str]:
@@ -358,6 +343,12 @@ def _checked_things(task: Task, content: Content, drawn: UdmfMap, decorate: str)
             f"want a base map of the scenario: {', '.join(base_maps)}"
         )
     assert content.base_wad is not None
+    for attribute in map(scenario.attribute, task.attributes):
+        if (own := {**attribute.content.things, **attribute.levdoom.things}) and content.base_wad not in own:
+            raise TaskError(
+                f"task {task.id}: {attribute.name} has things on {', '.join(own)} alone, want places on "
+                f"{content.base_wad}, too, or () for none there"
+            )
     things = content.things.get(content.base_wad, ())
     numbers = stock_editor_numbers() | declared_numbers(decorate)
     for thing in things:

@@ -284,6 +284,20 @@ def test_a_number_of_a_drawn_map_that_is_too_large_is_refused():
         _compiled_by_form("script 1 OPEN { Delay(40000.0); }", "")
 
 
+def test_things_of_another_map_alone_are_refused():
+    """The map of `supreme` would have none of them, and the task would be the level of two attributes."""
+    hall = scenario_named("health_gathering")
+    places: dict[str, tuple[Thing, ...]] = {"health_gathering.wad": (Thing(35, 300, 300),)}
+    for extra in ({}, {"health_gathering_supreme.wad": ()}):
+        candle = Attribute(name="candle", groups=("candles",), content=Content(things={**places, **extra}))
+        task = Task(dataclasses.replace(hall, attributes=(*hall.attributes, candle)), ("candle", "supreme"))
+        if extra:
+            compile_task(task)
+            continue
+        with pytest.raises(TaskError, match=r"task .*/candle\+supreme: candle has things on .* want places on health_"):
+            compile_task(task)
+
+
 def test_an_integer_radius_is_refused():
     centre = scenario_named("defend_the_center")
     content = centre.content.overlaid(Content(parameters={"radius": 735}))
