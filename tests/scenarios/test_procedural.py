@@ -130,6 +130,11 @@ def score_bound_can_be_reached(scenario: Scenario, one: Layout, room: UdmfMap) -
             assert min(b[1] - a[1] for a, b in itertools.pairwise(one.places)) >= 40  # imps do not overlap
         case "find_ammunition" | "find_the_key" | "guarded_goal" | "rockets":  # as many places as `default` has
             assert len(set(one.starts)) == 25
+            floor, scatter = Floor(room), one.parameters["scatter"]
+            assert isinstance(scatter, float)
+            for x, y in one.starts:  # what is put near a place can be reached from there
+                for dx, dy in itertools.product((-scatter, scatter), repeat=2):
+                    assert floor.to_wall[floor.pixel(x + dx, y + dy)] > 0
         case other:
             raise AssertionError(f"what bounds the score of {other}?")
 
