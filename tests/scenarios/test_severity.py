@@ -11,9 +11,11 @@ from gvz.evaluation.gallery import task_frame
 from gvz.evaluation.play import episode_seed
 from gvz.scenarios.base import Content, Period, Task, Toward, Uniform
 from gvz.scenarios.compiler import compile_task, map_source, task_content
-from gvz.scenarios.severity import graded, in_force
+from gvz.scenarios.severity import graded, in_force, is_whole
 from gvz.tasks import all_scenarios, parse_task, scenarios
-from gvz.wad.textures import blended
+from gvz.wad.lumps import read_maps, read_wad
+from gvz.wad.textures import blended, used_textures
+from gvz.wad.udmf import parse_textmap
 from tests.scenarios.conftest import bad_lines
 
 GRADED = tuple((f"{name}/complete=0.5", "thesis") for name in ("defend_the_center", "dodge_projectiles"))
@@ -137,6 +139,42 @@ def test_a_blend_lies_where_both_textures_lie():
     ]
 
 
+def test_a_texture_of_a_blend_is_repeated_over_its_width_too():
+    entries = blended("XWALL", "FLAT", "WIDE", 0.5, {"FLAT": (64, 64), "WIDE": (256, 128)}, {}).splitlines()
+    assert entries[0] == 'Texture "XWALL", 256, 128'
+    places = {(x, y) for x in (0, 64, 128, 192) for y in (0, 64)}
+    assert {line for line in entries if "FLAT" in line} == {f'Patch "FLAT", {x}, {y} ' for x, y in places}
+
+
+def test_a_file_has_the_blends_of_all_maps_that_its_episodes_play():
+    """The engine would show a checkerboard and go on."""
+    compiled = compile_task(parse_task("health_gathering/supreme=0.5+slime=0.5"))
+    lumps = {lump.name: lump.data.decode("latin-1") for lump in read_wad(compiled.wad_path.read_bytes())}
+    walls = set[str]()
+    for seed in range(12):
+        wad, _ = compiled.map_of(seed)
+        assert wad is not None
+        room = parse_textmap(read_maps(read_wad(wad))["MAP01"]["TEXTMAP"].decode("latin-1"))
+        used = used_textures(room).keys()
+        assert all(f'Texture "{name}"' in lumps["TEXTURES"] for name in used)
+        walls |= {str(side["texturemiddle"]) for side in room.sidedefs if "texturemiddle" in side}
+    assert len(walls) == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "whole"),
+    [
+        (Content(parameters={"delay": 3}, entity={"RenderStyle": "STYLE_Add"}), False),
+        (Content(parameters={"classes": ("Demon",)}), True),
+        (Content(parameters={"kit": '"Stimpack"'}), True),
+        (Content(base_wad="basic.wad"), True),
+        (Content(actors={"Big": "ACTOR Big : Demon\n{\n}\n"}), True),
+    ],
+)
+def test_another_map_or_other_classes_have_nothing_in_between(change: Content, whole: bool):
+    assert is_whole(change) == whole
+
+
 def test_things_are_spread_and_numbers_go_part_of_the_way():
     def content(text):
         return task_content(parse_task(f"health_gathering/{text}"), "thesis")
@@ -155,6 +193,7 @@ def test_things_are_spread_and_numbers_go_part_of_the_way():
     assert quarter.parameters == {
         "enemies": 15, "radius": Uniform(90.0, 110.0), "angle": Uniform(0.25, 0.625), "delay": 25
     }  # fmt: skip
+    assert [type(value) for value in quarter.parameters.values()] == [int, Uniform, Uniform, int], "as ACS has them"
     assert quarter.entity == {"Speed": Toward(20.0, 0.25)}
 
 
@@ -175,6 +214,8 @@ def test_a_whole_attribute_is_in_force_in_its_share_of_the_episodes():
     assert low < high
     assert len(low) / 4000 == pytest.approx(0.3, abs=0.03)
     assert len(high) / 4000 == pytest.approx(0.6, abs=0.03)
+    other = {s for s in seeds if in_force(0.6, "supreme", s)}
+    assert len(low & other) / 4000 == pytest.approx(0.3 * 0.6, abs=0.03), "of two attributes, each for itself"
     compiled = compile_task(parse_task("seek_and_kill/mixed=0.3"))
     magic = {name: map_source(parse_task(f"seek_and_kill/{name}"), "thesis").map_magic for name in ("default", "mixed")}
     for seed in seeds[:20]:
