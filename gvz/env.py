@@ -142,7 +142,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             self.action_space = Discrete(len(self.action_meanings))
         self.observation_space = observation_space(config)
         looks = task_content(self.task, config.profile).entity.values()
-        fuzzy = any("STYLE_Fuzzy" in (look, getattr(look, "value", None)) for look in looks)  # of all, or of a share
+        fuzzy = any("STYLE_Fuzzy" in repr(look) for look in looks)  # of all, or of a share
         if recycle_episodes is None or (fuzzy and recycle_episodes > 0):
             recycle_episodes = int(fuzzy)
         self._recycle_episodes = recycle_episodes

@@ -38,10 +38,11 @@ class Toward:
 
 @dataclass(frozen=True, slots=True)
 class Chance:
-    """A property that this share of the things get; drawn for each."""
+    """A property that this share of the things get, drawn for each; the others have `otherwise`, or their own."""
 
     value: str
     share: float
+    otherwise: str | None = None
 
 
 class Period(int):

@@ -279,7 +279,9 @@ def _set_properties(tid: str, properties: Mapping[str, Value]) -> str:
         match value:
             case Toward(end, share):
                 text = f"{now} + FixedMul({acs_value(share)}, {acs_value(end)} - {now})"
-            case Chance(whole, share):
+            case Chance(whole, share, otherwise):
+                if otherwise is not None:
+                    lines.append(f"SetActorProperty({tid}, APROP_{name}, {otherwise});")
                 text, condition = whole, f"if (Random(0.0, 1.0) < {acs_value(share)}) "
             case _:
                 text = acs_value(value)

@@ -68,8 +68,8 @@ def _part_way(before: Mapping[str, Value], change: Mapping[str, Value], share: f
 
 
 def _between(before: Value | None, value: Value, share: float) -> Value:
-    if isinstance(value, str):
-        return Chance(value, share)
+    if isinstance(value, str | bool):
+        return Chance(str(value), share, before if isinstance(before, str) else None)
     assert isinstance(value, int | float | Uniform), "change is not whole"
     if not isinstance(before, int | float | Uniform):
         return Toward(value, share)

@@ -166,6 +166,8 @@ def test_the_check_finds_what_cannot_be_played():
     far = ring([(512, 0), (512, 256), (768, 256), (768, 0)])
     good = Layout(walls=hall, starts=((64, 64),), places=((192, 192),), height=128)
     assert problem(good) is None
+    columns = Floor(good.build(base_map()), [((128, y), 32) for y in range(0, 257, 64)])
+    assert good.problem(columns) == "the place (192, 192) is out of reach of the start (64, 64)"
     apart = Layout(walls=hall + far, starts=((64, 64),), places=((640, 128),), height=128)
     assert problem(apart) == "the place (640, 128) is out of reach of the start (64, 64)"
     inside = Layout(walls=hall, starts=((64, 64), (8, 64)), height=128)

@@ -9,7 +9,7 @@ import gvz
 from gvz.core.errors import TaskError
 from gvz.evaluation.gallery import task_frame
 from gvz.evaluation.play import episode_seed
-from gvz.scenarios.base import Content, Period, Task, Toward, Uniform
+from gvz.scenarios.base import Attribute, Content, Period, Task, Toward, Uniform
 from gvz.scenarios.compiler import compile_task, map_source, task_content
 from gvz.scenarios.severity import graded, in_force, is_whole
 from gvz.tasks import all_scenarios, parse_task, scenarios
@@ -195,6 +195,21 @@ def test_things_are_spread_and_numbers_go_part_of_the_way():
     }  # fmt: skip
     assert [type(value) for value in quarter.parameters.values()] == [int, Uniform, Uniform, int], "as ACS has them"
     assert quarter.entity == {"Speed": Toward(20.0, 0.25)}
+
+
+def test_a_share_of_the_things_has_a_style_or_flag_and_the_others_keep_the_scenarios():
+    centre = scenarios()["defend_the_center"]
+    ghosts = dataclasses.replace(centre, content=centre.content.overlaid(Content(entity={"RenderStyle": "STYLE_Add"})))
+    script = map_source(Task(ghosts, ("fuzzy",), severities=(("fuzzy", 0.5),)), "thesis").script
+    assert (
+        "SetActorProperty(tid, APROP_RenderStyle, STYLE_Add); "
+        "if (Random(0.0, 1.0) < 0.5) SetActorProperty(tid, APROP_RenderStyle, STYLE_Fuzzy);"
+    ) in script
+    safe = Attribute(name="safe", groups=("safety",), content=Content(agent={"Invulnerable": True}))
+    task = Task(dataclasses.replace(centre, attributes=(safe,), complete=("safe",), levdoom_tasks={}), ("safe",))
+    assert "SetActorProperty(0, APROP_Invulnerable, True);" in map_source(task, "thesis").script
+    half = map_source(dataclasses.replace(task, severities=(("safe", 0.5),)), "thesis").script
+    assert "if (Random(0.0, 1.0) < 0.5) SetActorProperty(0, APROP_Invulnerable, True);" in half
 
 
 @pytest.mark.parametrize(("profile", "whole", "first"), [("thesis", 30, 1), ("levdoom", 60, 0)])
