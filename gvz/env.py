@@ -1,6 +1,7 @@
 """A task as a Gymnasium environment: observation, actions, reward, time-out, seeds, crashes of the engine."""
 
 import dataclasses
+import re
 import time
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -43,6 +44,8 @@ _WEAPON_UP_TIC = 10
 _COUNTED = {"kills": "KILLCOUNT", "goals": "GOALS"}
 """metric -> the variable that counts it"""
 _MAX_CRASHES = 3
+_FUZZY = re.compile("fuzzy|spectre|blursphere|type=58,", re.IGNORECASE)
+"""what draws something with the fuzz effect: a render style, Doom's spectre (thing 58), what hides the agent"""
 """crashes in a row, without a complete episode in between, after which the environment raises an error"""
 
 
@@ -141,8 +144,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         else:
             self.action_space = Discrete(len(self.action_meanings))
         self.observation_space = observation_space(config)
-        looks = task_content(self.task, config.profile).entity.values()
-        fuzzy = any("STYLE_Fuzzy" in repr(look) for look in looks)  # of all, or of a share
+        fuzzy = _FUZZY.search(f"{task_content(self.task, config.profile)} {scenario.script}") is not None
         if recycle_episodes is None or (fuzzy and recycle_episodes > 0):
             recycle_episodes = int(fuzzy)
         self._recycle_episodes = recycle_episodes

@@ -1,5 +1,6 @@
 """Named tasks play the games that the committed scores are of, and later scenarios' attributes change running games."""
 
+import dataclasses
 import hashlib
 from collections.abc import Iterable
 from contextlib import closing
@@ -7,10 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from gvz.scenarios.base import Scenario
+from gvz.env import DoomEnv
+from gvz.scenarios.base import Attribute, Content, Scenario, Task, Thing
 from gvz.scenarios.compiler import map_source
 from gvz.tasks import all_scenarios, named_tasks
 from gvz.wad.acs.lexer import tokenize
+from tests.episodes import fingerprint
 from tests.scenarios.measure import Player
 
 PROFILES = ("thesis", "levdoom")
@@ -84,3 +87,22 @@ def test_complete_changes_the_first_thing_and_the_agent_as_its_page_says(
     assert scales[0] - 1e-4 <= min(sizes) < max(sizes) <= scales[1]
     assert heights == {41.0} if scenario == "find_ammunition" else len(heights) == 4
     assert 0 <= min(heights) <= max(heights) <= 100
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize(
+    "content",
+    [
+        Content(parameters={"classes": ("Spectre",)}),
+        Content(entity={"RenderStyle": "STYLE_OptFuzzy"}),
+        Content(parameters={"classes": ("Ghost",)}, actors={"Ghost": "ACTOR Ghost : Demon { RenderStyle Fuzzy }"}),
+        Content(things={"defend_the_center.wad": (Thing(58, 300, 300),)}),
+    ],
+)
+def test_an_attribute_of_ones_own_with_spectres_replays_its_episodes(content: Content):
+    """The engine's fuzz effect continues from episode to episode, so each needs a fresh engine."""
+    centre = all_scenarios()["defend_the_center"]
+    ghosts = Attribute(name="ghosts", groups=("ghosts",), content=content)
+    task = Task(dataclasses.replace(centre, attributes=(*centre.attributes, ghosts)), ("ghosts",))
+    with closing(DoomEnv(task)) as env:
+        assert fingerprint(env, 7) == fingerprint(env, 7)
