@@ -1,6 +1,7 @@
 """A task as a Gymnasium environment: observation, actions, reward, time-out, seeds, crashes of the engine."""
 
 import dataclasses
+import re
 import time
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -26,6 +27,7 @@ from gvz.observation import (
 )
 from gvz.one_thread import one_thread
 from gvz.scenarios.base import BOOKKEEPING, Task
+from gvz.scenarios.checks import ALWAYS_READ
 from gvz.scenarios.compiler import compile_task, task_content
 from gvz.segmentation import segmented_frame, segmenter_of
 from gvz.tasks import parse_task
@@ -42,6 +44,8 @@ _WEAPON_UP_TIC = 10
 _COUNTED = {"kills": "KILLCOUNT", "goals": "GOALS"}
 """metric -> the variable that counts it"""
 _MAX_CRASHES = 3
+_FUZZY = re.compile("fuzzy|spectre|blursphere|type=58,", re.IGNORECASE)
+"""what draws something with the fuzz effect: a render style, Doom's spectre (thing 58), what hides the agent"""
 """crashes in a row, without a complete episode in between, after which the environment raises an error"""
 
 
@@ -118,7 +122,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         self.action_meanings = action_buttons(scenario, config.action_set)
         self._actions = [[button in held for button in scenario.buttons] for held in self.action_meanings]
         bookkeeping = {name: user for name, user in BOOKKEEPING.items() if name != "MAP_MAGIC"}
-        own = tuple(dict.fromkeys((*scenario.game_variables, "KILLCOUNT", "POSITION_X", "POSITION_Y")))
+        own = tuple(dict.fromkeys((*scenario.game_variables, *ALWAYS_READ)))
         self._names = (*own, *bookkeeping)
         self._engine_config = EngineConfig(
             wad=self._compiled.wad_path,
@@ -140,8 +144,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         else:
             self.action_space = Discrete(len(self.action_meanings))
         self.observation_space = observation_space(config)
-        looks = task_content(self.task, config.profile).entity.values()
-        fuzzy = any("STYLE_Fuzzy" in (look, getattr(look, "value", None)) for look in looks)  # of all, or of a share
+        fuzzy = _FUZZY.search(f"{task_content(self.task, config.profile)} {scenario.script}") is not None
         if recycle_episodes is None or (fuzzy and recycle_episodes > 0):
             recycle_episodes = int(fuzzy)
         self._recycle_episodes = recycle_episodes

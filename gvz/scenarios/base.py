@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from gvz.core.env_config import EnvConfig, Profile
 from gvz.core.errors import TaskError, nearest
+from gvz.scenarios.checks import check_scenario, graded_name
 from gvz.scenarios.layout import Layout
 from gvz.scenarios.map_set import PROCEDURAL, VARIED, MapSet
 from gvz.scenarios.rewards import Reward, Rewarder, check_weights, return_range
@@ -37,10 +38,11 @@ class Toward:
 
 @dataclass(frozen=True, slots=True)
 class Chance:
-    """A property that this share of the things get; drawn for each."""
+    """A property that this share of the things get, drawn for each; the others have `otherwise`, or their own."""
 
     value: str
     share: float
+    otherwise: str | None = None
 
 
 class Period(int):
@@ -177,7 +179,8 @@ class Attribute:
 class Scenario:
     """A map, an objective, a reward and buttons; the first extension point of the benchmark.
 
-    Scenarios can be pickled. Two scenarios are equal if all their fields are equal, also across processes.
+    Scenarios can be pickled. Two scenarios are equal if all their fields are equal, also across processes. A TaskError
+    says what does not fit together (gvz.scenarios.checks).
     """
 
     id: str
@@ -217,6 +220,9 @@ class Scenario:
     upper_bounds: Mapping[Profile, float]
     """best possible score"""
     rewards: Mapping[str, Reward]
+
+    def __post_init__(self) -> None:
+        check_scenario(self)
 
     def __hash__(self) -> int:
         return hash(self.id)  # the other fields hold mappings
@@ -386,11 +392,6 @@ class Task:
 
     def __str__(self) -> str:
         return self.id
-
-
-def graded_name(severity: float) -> str:
-    """What an attribute's name in a task's id ends with: "=0.5", or nothing if it is whole."""
-    return "" if severity == 1 else f"={severity:g}"
 
 
 def words(text: str) -> tuple[str, ...]:

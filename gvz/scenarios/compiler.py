@@ -23,6 +23,7 @@ from gvz.core.env_config import Profile
 from gvz.core.errors import ResourceError, TaskError, WadError, nearest
 from gvz.scenarios import looks
 from gvz.scenarios.base import Attribute, Chance, Content, Task, Thing, Toward, Uniform, Value
+from gvz.scenarios.checks import check_kinds
 from gvz.scenarios.floor import Floor
 from gvz.scenarios.layout import Layout
 from gvz.scenarios.map_set import MapSet
@@ -111,7 +112,10 @@ def _sometimes(task: Task, profile: Profile) -> list[str]:
 def _one_way(task: Task, profile: Profile, idle: Iterable[str]) -> Task:
     """The task with these attributes left out, and others that are sometimes in force in force."""
     fixed = dict.fromkeys(_sometimes(task, profile), 1.0) | dict.fromkeys(idle, 0.0)
-    return dataclasses.replace(task, severities=tuple({**dict(task.severities), **fixed}.items())) if fixed else task
+    if not fixed:
+        return task
+    scenario = dataclasses.replace(task.scenario, levdoom_tasks={})  # also if what is left has a whole task's name
+    return dataclasses.replace(task, scenario=scenario, severities=tuple({**dict(task.severities), **fixed}.items()))
 
 
 def _all_ways(task: Task, profile: Profile) -> Content:
@@ -202,10 +206,17 @@ def map_source(task: Task, profile: Profile, number: int | None = None) -> MapSo
     drawn.things += [make_thing(t.type, t.x, t.y, tid=t.tid) for t in _checked_things(task, content, drawn, decorate)]
     try:
         check_textures(drawn, {*stock_textures(), *content.blends})
+        textures = "".join(
+            blended(name, blend.under, blend.over, blend.opacity, stock_textures(), stock_patches())
+            for name, blend in every.blends.items()
+        )
     except WadError as error:
         raise WadError(f"task {task.id}: {error}") from error
     textmap = write_textmap(drawn)
     template = Template(task.scenario.script)
+    if not template.is_valid():
+        raise TaskError(f"task {task.id}: the script has a '$' that begins no name; write '$$' for a '$' of its own")
+    check_kinds(task, content)
     names = _script_names(content)
     if (given := {*names, "map_magic"}) != (used := set(template.get_identifiers())):
         raise TaskError(
@@ -216,10 +227,6 @@ def map_source(task: Task, profile: Profile, number: int | None = None) -> MapSo
     digest = hashlib.sha256(everything.encode()).digest()
     magic = int.from_bytes(digest[:4], "little") % (2**31 - 1) + 1
     script = template.substitute(names, map_magic=magic)
-    textures = "".join(
-        blended(name, blend.under, blend.over, blend.opacity, stock_textures(), stock_patches())
-        for name, blend in every.blends.items()
-    )
     return MapSource(textmap=textmap, script=script, decorate=decorate, textures=textures, map_magic=magic)
 
 
@@ -272,7 +279,9 @@ def _set_properties(tid: str, properties: Mapping[str, Value]) -> str:
         match value:
             case Toward(end, share):
                 text = f"{now} + FixedMul({acs_value(share)}, {acs_value(end)} - {now})"
-            case Chance(whole, share):
+            case Chance(whole, share, otherwise):
+                if otherwise is not None:
+                    lines.append(f"SetActorProperty({tid}, APROP_{name}, {otherwise});")
                 text, condition = whole, f"if (Random(0.0, 1.0) < {acs_value(share)}) "
             case _:
                 text = acs_value(value)
@@ -336,6 +345,12 @@ def _checked_things(task: Task, content: Content, drawn: UdmfMap, decorate: str)
             f"want a base map of the scenario: {', '.join(base_maps)}"
         )
     assert content.base_wad is not None
+    for attribute in map(scenario.attribute, task.attributes):
+        if (own := {**attribute.content.things, **attribute.levdoom.things}) and content.base_wad not in own:
+            raise TaskError(
+                f"task {task.id}: {attribute.name} has things on {', '.join(own)} alone, want places on "
+                f"{content.base_wad}, too, or () for none there"
+            )
     things = content.things.get(content.base_wad, ())
     numbers = stock_editor_numbers() | declared_numbers(decorate)
     for thing in things:

@@ -41,7 +41,7 @@ def graded(before: Content, change: Content, severity: float) -> Content:
         pairs = zip(dataclasses.astuple(before.textures), dataclasses.astuple(change.textures), strict=True)
         names, blends = [], {}
         for one, other in pairs:
-            blend = Blend(one, other, severity)
+            blend = Blend(one.upper(), other.upper(), severity)
             name = f"X{hashlib.sha256(repr(blend).encode()).hexdigest()[:7].upper()}"
             names.append(name)
             blends[name] = blend
@@ -68,8 +68,8 @@ def _part_way(before: Mapping[str, Value], change: Mapping[str, Value], share: f
 
 
 def _between(before: Value | None, value: Value, share: float) -> Value:
-    if isinstance(value, str):
-        return Chance(value, share)
+    if isinstance(value, str | bool):
+        return Chance(str(value), share, before if isinstance(before, str) else None)
     assert isinstance(value, int | float | Uniform), "change is not whole"
     if not isinstance(before, int | float | Uniform):
         return Toward(value, share)

@@ -13,7 +13,7 @@ _NUMBERED_ACTOR = re.compile(
     re.IGNORECASE | re.MULTILINE,
 )
 _STATE = re.compile(
-    r"^[^\S\n]*(?P<sprite>[A-Z0-9_]{4})[^\S\n]+(?P<frames>[A-Z\[\]\\]+)[^\S\n]+(?:-?[0-9]|random)",
+    r"(?:^|[:{])[^\S\n]*(?P<sprite>[A-Z0-9_]{4})[^\S\n]+(?P<frames>[A-Z\[\]\\]+)[^\S\n]+(?:-?[0-9]|random)",
     re.IGNORECASE | re.MULTILINE,
 )
 _NO_SPRITE = "TNT1"

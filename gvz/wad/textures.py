@@ -117,9 +117,13 @@ def check_textures(udmf_map: UdmfMap, textures: Collection[str]) -> None:
         WadError: an unknown texture; the message names it, its place, and the nearest known name.
     """
     for texture, place in used_textures(udmf_map).items():
-        if texture not in textures:
-            hint = nearest(texture, textures)
-            raise WadError(f"{place}: got the unknown texture {texture!r}{hint}, want a wall texture or flat")
+        _check_texture(place, texture, textures)
+
+
+def _check_texture(place: str, texture: str, textures: Collection[str]) -> None:
+    if texture not in textures:
+        hint = nearest(texture, textures)
+        raise WadError(f"{place}: got the unknown texture {texture!r}{hint}, want a wall texture or flat")
 
 
 def blended(
@@ -143,7 +147,12 @@ def blended(
         opacity: of `over`, 0 to 1.
         sizes: of all textures.
         patches: of all wall textures.
+
+    Raises:
+        WadError: an unknown texture.
     """
+    for texture in (under, over):
+        _check_texture(f"texture {name}", texture, sizes)
     width, height = (math.lcm(*pair) for pair in zip(sizes[under], sizes[over], strict=True))
     text, parts = "", []
     for texture, letter, style in ((under, "U", ""), (over, "O", f"{{ Style Translucent Alpha {opacity:g} }}")):

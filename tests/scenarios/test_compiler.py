@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import os
+import re
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
@@ -14,7 +15,7 @@ import pytest
 
 from gvz.core.errors import AcsError, ResourceError, TaskError, WadError
 from gvz.scenarios import compiler
-from gvz.scenarios.base import Attribute, Content, Task, Textures, Thing, Uniform
+from gvz.scenarios.base import Attribute, Content, Task, Textures, Thing, Uniform, Value
 from gvz.scenarios.compiler import (
     _compiled_by_form,
     acs_value,
@@ -240,6 +241,10 @@ WAD = "defend_the_center.wad"
             Content(actors={"Foo": "ACTOR Foo\n{\n States\n {\n Spawn:\n  BOM1 A -1\n }\n}"}),
             "unknown sprite BOM1, frame A",
         ),
+        (
+            Content(actors={"Foo": "ACTOR Foo\n{\n States {\n Spawn: Idle: BOM1 A -1\n Stop\n }\n}"}),
+            "unknown sprite BOM1, frame A",
+        ),
     ],
 )
 def test_things_and_sprites_that_are_not_there_are_refused(content: Content, message: str):
@@ -279,21 +284,86 @@ def test_a_number_of_a_drawn_map_that_is_too_large_is_refused():
         _compiled_by_form("script 1 OPEN { Delay(40000.0); }", "")
 
 
+def test_things_of_another_map_alone_are_refused():
+    """The map of `supreme` would have none of them, and the task would be the level of two attributes."""
+    hall = scenario_named("health_gathering")
+    places: dict[str, tuple[Thing, ...]] = {"health_gathering.wad": (Thing(35, 300, 300),)}
+    for extra in ({}, {"health_gathering_supreme.wad": ()}):
+        candle = Attribute(name="candle", groups=("candles",), content=Content(things={**places, **extra}))
+        task = Task(dataclasses.replace(hall, attributes=(*hall.attributes, candle)), ("candle", "supreme"))
+        if extra:
+            compile_task(task)
+            continue
+        with pytest.raises(TaskError, match=r"task .*/candle\+supreme: candle has things on .* want places on health_"):
+            compile_task(task)
+
+
 def test_an_integer_radius_is_refused():
-    task = with_attribute(Content(parameters={"radius": 735}))
+    centre = scenario_named("defend_the_center")
+    content = centre.content.overlaid(Content(parameters={"radius": 735}))
     with pytest.raises(AcsError, match=r"argument 2 of FixedMul: got the integer 735, want .* such as 735\.0"):
-        compile_task(task)
+        compile_task(Task(dataclasses.replace(centre, content=content)))
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"radius": 735},  # a hundredth of a unit
+        {"radius": Uniform(700, 735)},
+        {"radius": Uniform(700, 735.0)},
+        {"respawn_delay": 45.0},  # a day
+        {"respawn_delay": Uniform(45.0, 90.0)},
+        {"num_enemies": 5.0},  # 327,680 enemies
+    ],
+)
+def test_a_number_of_another_kind_than_the_scenarios_own_is_refused(parameters: dict[str, Value]):
+    ((name, value),) = parameters.items()
+    message = re.escape(f"task defend_the_center/new: got {name}={value!r}, and ")
+    with pytest.raises(TaskError, match=f"{message}.* in the scenario; want both with a point, or neither"):
+        compile_task(with_attribute(Content(parameters=parameters)))
+
+
+@pytest.mark.parametrize(
+    "parameters", [{"radius": Uniform(0, 735.0)}, {"respawn_delay": 0}, {"respawn_delay": "9 * 5"}]
+)
+def test_zero_and_text_are_of_either_kind(parameters: dict[str, Value]):
+    compile_task(with_attribute(Content(parameters=parameters)))
+
+
+def test_a_size_between_integers_is_refused():
+    """They are no fixed-point numbers: enemies would be drawn a 65,536th as large."""
+    with pytest.raises(AcsError, match=r"argument 3 of SetActorProperty: got the integer 1, want .* such as 1\.0"):
+        compile_task(with_attribute(Content(entity={"ScaleX": Uniform(1, 3)})))
 
 
 def test_an_unknown_texture_is_refused():
     task = with_attribute(Content(textures=Textures("TANROCK2", "LAVVA1", "CEIL4_1")))
     with pytest.raises(WadError, match=r"task defend_the_center/new: sector 0 texturefloor: .*'LAVVA1'.*'LAVA1'"):
         compile_task(task)
+    half = dataclasses.replace(task, severities=(("new", 0.5),))
+    with pytest.raises(WadError, match=r"task defend_the_center/new=0\.5: texture X\w+: .*'LAVVA1'.*'LAVA1'"):
+        compile_task(half)
+
+
+def test_case_does_not_matter_in_names_of_textures():
+    lower, upper = (
+        map_source(dataclasses.replace(with_attribute(Content(textures=names)), severities=(("new", 0.5),)), "thesis")
+        for names in (Textures("firewall", "lava1", "ceil4_1"), Textures("FIREWALL", "LAVA1", "CEIL4_1"))
+    )
+    assert lower == upper
 
 
 def test_a_parameter_that_the_script_does_not_name_is_refused():
     with pytest.raises(TaskError, match=r"task defend_the_center/new: .*set but not used: \['respwan_delay'\]"):
         compile_task(with_attribute(Content(parameters={"respwan_delay": 3})))
+
+
+def test_a_dollar_that_begins_no_name_is_refused():
+    centre = scenario_named("defend_the_center")
+    task = Task(dataclasses.replace(centre, script=f"{centre.script}// 5$ a shot\n"))
+    with pytest.raises(TaskError, match=r"task defend_the_center/default: the script has a '\$' .*; write '\$\$' for"):
+        compile_task(task)
+    compile_task(Task(dataclasses.replace(centre, script=f"{centre.script}// 5$$ a shot\n")))
 
 
 def test_an_unknown_class_is_refused():

@@ -130,6 +130,11 @@ def score_bound_can_be_reached(scenario: Scenario, one: Layout, room: UdmfMap) -
             assert min(b[1] - a[1] for a, b in itertools.pairwise(one.places)) >= 40  # imps do not overlap
         case "find_ammunition" | "find_the_key" | "guarded_goal" | "rockets":  # as many places as `default` has
             assert len(set(one.starts)) == 25
+            floor, scatter = Floor(room), one.parameters["scatter"]
+            assert isinstance(scatter, float)
+            for x, y in one.starts:  # what is put near a place can be reached from there
+                for dx, dy in itertools.product((-scatter, scatter), repeat=2):
+                    assert floor.to_wall[floor.pixel(x + dx, y + dy)] > 0
         case other:
             raise AssertionError(f"what bounds the score of {other}?")
 
@@ -161,6 +166,8 @@ def test_the_check_finds_what_cannot_be_played():
     far = ring([(512, 0), (512, 256), (768, 256), (768, 0)])
     good = Layout(walls=hall, starts=((64, 64),), places=((192, 192),), height=128)
     assert problem(good) is None
+    columns = Floor(good.build(base_map()), [((128, y), 32) for y in range(0, 257, 64)])
+    assert good.problem(columns) == "the place (192, 192) is out of reach of the start (64, 64)"
     apart = Layout(walls=hall + far, starts=((64, 64),), places=((640, 128),), height=128)
     assert problem(apart) == "the place (640, 128) is out of reach of the start (64, 64)"
     inside = Layout(walls=hall, starts=((64, 64), (8, 64)), height=128)

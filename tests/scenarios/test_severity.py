@@ -9,11 +9,13 @@ import gvz
 from gvz.core.errors import TaskError
 from gvz.evaluation.gallery import task_frame
 from gvz.evaluation.play import episode_seed
-from gvz.scenarios.base import Content, Period, Task, Toward, Uniform
+from gvz.scenarios.base import Attribute, Content, Period, Task, Toward, Uniform
 from gvz.scenarios.compiler import compile_task, map_source, task_content
-from gvz.scenarios.severity import graded, in_force
+from gvz.scenarios.severity import graded, in_force, is_whole
 from gvz.tasks import all_scenarios, parse_task, scenarios
-from gvz.wad.textures import blended
+from gvz.wad.lumps import read_maps, read_wad
+from gvz.wad.textures import blended, used_textures
+from gvz.wad.udmf import parse_textmap
 from tests.scenarios.conftest import bad_lines
 
 GRADED = tuple((f"{name}/complete=0.5", "thesis") for name in ("defend_the_center", "dodge_projectiles"))
@@ -98,6 +100,26 @@ def test_a_graded_name_has_no_exception_of_profile_levdoom(scenario):
             assert is_plain == bool(task.severities), task.id
 
 
+@pytest.mark.parametrize(
+    ("text", "whole"),
+    [
+        ("health_gathering/stimpacks=0.5", "health_gathering/stimpacks"),
+        ("dodge_projectiles/arachnotron=0.5+city", "dodge_projectiles/arachnotron+city"),
+        ("health_gathering/poison+stimpacks+supreme=0.5", "health_gathering/poison+stimpacks"),
+    ],
+)
+def test_no_episode_of_a_graded_name_has_an_exception_of_profile_levdoom(text, whole):
+    """In each of these some episodes play no attribute but those of a name with an exception."""
+    graded = compile_task(parse_task(text), "levdoom")
+    without = dataclasses.replace(graded.task, scenario=dataclasses.replace(graded.task.scenario, levdoom_tasks={}))
+    plain = compile_task(without, "levdoom")
+    assert [graded.map_of(seed)[1] for seed in range(12)] == [plain.map_of(seed)[1] for seed in range(12)]
+    assert graded.map_magic == plain.map_magic
+    assert task_content(parse_task(whole), "levdoom") != task_content(
+        dataclasses.replace(parse_task(whole), scenario=without.scenario), "levdoom"
+    )
+
+
 def test_a_blend_lies_where_both_textures_lie():
     """A wall of 64x128 and a flat of 64x64: the wall once, made of its own patches, and the flat twice."""
     patches = {"WALL": [("TOP", 0, 0), ("BOTTOM", 0, 64)]}
@@ -115,6 +137,42 @@ def test_a_blend_lies_where_both_textures_lie():
         'Patch "FLAT", 0, 64 { Style Translucent Alpha 0.25 }',
         "}",
     ]
+
+
+def test_a_texture_of_a_blend_is_repeated_over_its_width_too():
+    entries = blended("XWALL", "FLAT", "WIDE", 0.5, {"FLAT": (64, 64), "WIDE": (256, 128)}, {}).splitlines()
+    assert entries[0] == 'Texture "XWALL", 256, 128'
+    places = {(x, y) for x in (0, 64, 128, 192) for y in (0, 64)}
+    assert {line for line in entries if "FLAT" in line} == {f'Patch "FLAT", {x}, {y} ' for x, y in places}
+
+
+def test_a_file_has_the_blends_of_all_maps_that_its_episodes_play():
+    """The engine would show a checkerboard and go on."""
+    compiled = compile_task(parse_task("health_gathering/supreme=0.5+slime=0.5"))
+    lumps = {lump.name: lump.data.decode("latin-1") for lump in read_wad(compiled.wad_path.read_bytes())}
+    walls = set[str]()
+    for seed in range(12):
+        wad, _ = compiled.map_of(seed)
+        assert wad is not None
+        room = parse_textmap(read_maps(read_wad(wad))["MAP01"]["TEXTMAP"].decode("latin-1"))
+        used = used_textures(room).keys()
+        assert all(f'Texture "{name}"' in lumps["TEXTURES"] for name in used)
+        walls |= {str(side["texturemiddle"]) for side in room.sidedefs if "texturemiddle" in side}
+    assert len(walls) == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "whole"),
+    [
+        (Content(parameters={"delay": 3}, entity={"RenderStyle": "STYLE_Add"}), False),
+        (Content(parameters={"classes": ("Demon",)}), True),
+        (Content(parameters={"kit": '"Stimpack"'}), True),
+        (Content(base_wad="basic.wad"), True),
+        (Content(actors={"Big": "ACTOR Big : Demon\n{\n}\n"}), True),
+    ],
+)
+def test_another_map_or_other_classes_have_nothing_in_between(change: Content, whole: bool):
+    assert is_whole(change) == whole
 
 
 def test_things_are_spread_and_numbers_go_part_of_the_way():
@@ -135,7 +193,23 @@ def test_things_are_spread_and_numbers_go_part_of_the_way():
     assert quarter.parameters == {
         "enemies": 15, "radius": Uniform(90.0, 110.0), "angle": Uniform(0.25, 0.625), "delay": 25
     }  # fmt: skip
+    assert [type(value) for value in quarter.parameters.values()] == [int, Uniform, Uniform, int], "as ACS has them"
     assert quarter.entity == {"Speed": Toward(20.0, 0.25)}
+
+
+def test_a_share_of_the_things_has_a_style_or_flag_and_the_others_keep_the_scenarios():
+    centre = scenarios()["defend_the_center"]
+    ghosts = dataclasses.replace(centre, content=centre.content.overlaid(Content(entity={"RenderStyle": "STYLE_Add"})))
+    script = map_source(Task(ghosts, ("fuzzy",), severities=(("fuzzy", 0.5),)), "thesis").script
+    assert (
+        "SetActorProperty(tid, APROP_RenderStyle, STYLE_Add); "
+        "if (Random(0.0, 1.0) < 0.5) SetActorProperty(tid, APROP_RenderStyle, STYLE_Fuzzy);"
+    ) in script
+    safe = Attribute(name="safe", groups=("safety",), content=Content(agent={"Invulnerable": True}))
+    task = Task(dataclasses.replace(centre, attributes=(safe,), complete=("safe",), levdoom_tasks={}), ("safe",))
+    assert "SetActorProperty(0, APROP_Invulnerable, True);" in map_source(task, "thesis").script
+    half = map_source(dataclasses.replace(task, severities=(("safe", 0.5),)), "thesis").script
+    assert "if (Random(0.0, 1.0) < 0.5) SetActorProperty(0, APROP_Invulnerable, True);" in half
 
 
 @pytest.mark.parametrize(("profile", "whole", "first"), [("thesis", 30, 1), ("levdoom", 60, 0)])
@@ -155,6 +229,8 @@ def test_a_whole_attribute_is_in_force_in_its_share_of_the_episodes():
     assert low < high
     assert len(low) / 4000 == pytest.approx(0.3, abs=0.03)
     assert len(high) / 4000 == pytest.approx(0.6, abs=0.03)
+    other = {s for s in seeds if in_force(0.6, "supreme", s)}
+    assert len(low & other) / 4000 == pytest.approx(0.3 * 0.6, abs=0.03), "of two attributes, each for itself"
     compiled = compile_task(parse_task("seek_and_kill/mixed=0.3"))
     magic = {name: map_source(parse_task(f"seek_and_kill/{name}"), "thesis").map_magic for name in ("default", "mixed")}
     for seed in seeds[:20]:

@@ -19,7 +19,7 @@ def test_dooms_actors_are_known_and_other_games_are_not():
 def test_dooms_editor_numbers_and_sprites_are_known():
     assert {1, 26, 42, 2012, 3001, 9001} <= stock_editor_numbers()
     assert not {5555, 31999} & stock_editor_numbers()
-    assert {"BON1D", "MEDIA", "SKULF", "DOGSA"} <= stock_sprites()
+    assert {"BON1D", "MEDIA", "SKULF", "DOGSA", "VILED"} <= stock_sprites(), "VILED is a mirrored picture alone"
     assert not {"BON1E", "MEDI", "S_EN", "MUMMA"} & stock_sprites()
 
 

@@ -46,7 +46,14 @@ def emit_value(unit: Unit, node: Expression, kind: Kind, what: str) -> None:
 
 
 def _refuse_integer(unit: Unit, node: Expression, what: str) -> None:
-    """Refuses an integer literal, or a constant defined by one, for a fixed-point number; 0 is valid for both."""
+    """Refuses an integer literal, or a constant defined by one, for a fixed-point number; 0 is valid for both.
+
+    Likewise for a random number between such ones.
+    """
+    if isinstance(node, Call) and node.name == "random":
+        for end in node.arguments:
+            _refuse_integer(unit, end, what)
+        return
     literal = node.operand if isinstance(node, Unary) else node
     if isinstance(literal, Number):
         value = 0 if literal.is_fixed else literal.value

@@ -1,0 +1,111 @@
+"""What a scenario must have so that ids of tasks, rewards and scores mean what they say."""
+
+import dataclasses
+import re
+from typing import TYPE_CHECKING, get_args
+
+from gvz.core.env_config import Profile
+from gvz.core.errors import TaskError, nearest
+from gvz.scenarios.map_set import PROCEDURAL, VARIED
+from gvz.scenarios.rewards import Fell, Gained, Rose
+
+if TYPE_CHECKING:
+    from gvz.scenarios.base import Content, Scenario, Task, Value
+
+ALWAYS_READ = ("KILLCOUNT", "POSITION_X", "POSITION_Y")
+"""game variables that rewards and infos know in every scenario, beside the scenario's own"""
+_NAME = re.compile("[a-z][a-z0-9_]*")
+_TAKEN = ("default", "complete", VARIED, PROCEDURAL)
+"""names of tasks and of sets of drawn maps"""
+
+
+def check_scenario(scenario: "Scenario") -> None:
+    """Refuses a scenario that would play another task than an id says, or whose rewards or scores would be wrong.
+
+    Raises:
+        TaskError: a name of an attribute that ids cannot have or that another attribute has; groups or aliases that are
+            no tuple; no group; an attribute in `complete` or an exception in `levdoom_tasks` under another name than
+            its own; no base map or textures; an unknown metric; a reward of a variable that is not read; a pace that
+            needs an unknown reward; no time-out or bound of a profile; a combined button that the scenario lacks.
+    """
+    if not _NAME.fullmatch(scenario.id):
+        raise TaskError(f"scenario: got the id {scenario.id!r}, want lower-case letters, digits and '_'")
+    if scenario.content.base_wad is None or scenario.content.textures is None:
+        raise TaskError(f"scenario {scenario.id}: got a content without base_wad or textures, want both")
+    _check_attributes(scenario)
+    for name in scenario.complete:
+        if name != (wanted := scenario.attribute(name).name):
+            raise TaskError(f"scenario {scenario.id}, complete: got {name!r}, want the attribute's name, {wanted!r}")
+    for task in set(scenario.levdoom_tasks) - {"default", "complete"}:
+        names = sorted(scenario.attribute(word).name for word in task.split("+"))
+        wanted = "complete" if set(names) == set(scenario.complete) else "+".join(names)
+        if task != wanted:
+            raise TaskError(f"scenario {scenario.id}, levdoom_tasks: got {task!r}, want the task's name, {wanted!r}")
+    _check_score(scenario)
+
+
+def _check_attributes(scenario: "Scenario") -> None:
+    owners: dict[str, str] = {}
+    for attribute in scenario.attributes:
+        where = f"scenario {scenario.id}, attribute {attribute.name!r}"
+        for field in ("groups", "aliases"):
+            if isinstance(text := getattr(attribute, field), str):
+                raise TaskError(f"{where}: got the text {text!r} for its {field}, want a tuple, such as ({text!r},)")
+        if not attribute.groups:
+            raise TaskError(f"{where}: got no group, want one or more")
+        for name in (attribute.name, *attribute.aliases):
+            if not _NAME.fullmatch(name) or name in _TAKEN:
+                raise TaskError(
+                    f"{where}: got the name {name!r}, want lower-case letters, digits and '_', "
+                    f"and none of {', '.join(_TAKEN)}"
+                )
+            if name in owners:
+                raise TaskError(f"{where}: got the name {name!r}, which {owners[name]!r} has; want another one")
+            owners[name] = attribute.name
+
+
+def _check_score(scenario: "Scenario") -> None:
+    from gvz.scenarios.base import BOOKKEEPING, Metric  # which imports this module
+
+    where, profiles = f"scenario {scenario.id}", get_args(Profile)
+    if scenario.metric not in get_args(Metric):
+        raise TaskError(f"{where}: got the metric {scenario.metric!r}, want one of {', '.join(get_args(Metric))}")
+    for field in ("timeouts", "upper_bounds"):
+        if not all(getattr(scenario, field).get(profile, 0) > 0 for profile in profiles):
+            raise TaskError(f"{where}: got {field} {getattr(scenario, field)}, want a positive one of {profiles}")
+    if strange := set(scenario.combination_buttons or ()) - set(scenario.buttons):
+        raise TaskError(f"{where}, combination_buttons: got {strange}, want some of {', '.join(scenario.buttons)}")
+    variables = (*scenario.game_variables, *ALWAYS_READ, *BOOKKEEPING)
+    for name, reward in scenario.rewards.items():
+        if isinstance(reward.event, Rose | Fell | Gained) and (read := reward.event.name) not in variables:
+            raise TaskError(
+                f"{where}, reward {name!r}: got the variable {read!r}{nearest(read, variables)}, which is not read; "
+                f"want one of {', '.join(variables)}, or add it to game_variables"
+            )
+        for pace in (*reward.paces, *(reward.levdoom_paces or ())):
+            if pace.needs is not None and pace.needs not in scenario.rewards:
+                raise TaskError(
+                    f"{where}, reward {name!r}: got a pace that needs {pace.needs!r}, "
+                    f"want one of {', '.join(scenario.rewards)}"
+                )
+
+
+def check_kinds(task: "Task", content: "Content") -> None:
+    """Refuses an integer where the scenario has a fixed-point number, and the reverse: 1.0 is 65536 to the engine."""
+    for name, own in task.scenario.content.parameters.items():
+        if len(_kinds(own) | _kinds(value := content.parameters[name])) > 1:
+            raise TaskError(
+                f"task {task.id}: got {name}={value!r}, and {own!r} in the scenario; want both with a point, or neither"
+            )
+
+
+def _kinds(value: "Value") -> set[type]:
+    """int or float, or both, of a parameter's numbers; 0 may be either."""
+    numbers = dataclasses.astuple(value) if dataclasses.is_dataclass(value) else value
+    numbers = numbers if isinstance(numbers, tuple) else (numbers,)
+    return {float if isinstance(one, float) else int for one in numbers if isinstance(one, int | float) and one}
+
+
+def graded_name(severity: float) -> str:
+    """What an attribute's name in a task's id ends with: "=0.5", or nothing if it is whole."""
+    return "" if severity == 1 else f"={severity:g}"
