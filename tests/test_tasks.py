@@ -288,6 +288,14 @@ def test_an_added_attribute_obeys_its_group():
         Task(with_ice, ("ice", "stone_wall"))
 
 
+def test_two_attributes_of_one_name_are_refused():
+    scenario = scenario_named("defend_the_center")
+    other_gore = Attribute(name="gore", groups=("decorations",), content=Content())
+    with_both = dataclasses.replace(scenario, attributes=(*scenario.attributes, other_gore))
+    with pytest.raises(TaskError, match="defend_the_center: got 2 attributes 'gore', want another name for each"):
+        Task(with_both, ("gore",))
+
+
 TABLE_3_1 = {
     "defend_the_center": (
         ("ATTACK", "TURN_LEFT", "TURN_RIGHT"),

@@ -281,11 +281,12 @@ class Scenario:
         """The attribute with this name or alias.
 
         Raises:
-            TaskError: there is none; the message lists all attributes and names the nearest.
+            TaskError: there is none, and the message lists all attributes and names the nearest; or there are several.
         """
-        for attribute in self.attributes:
-            if name == attribute.name or name in attribute.aliases:
-                return attribute
+        if len(found := [one for one in self.attributes if name in (one.name, *one.aliases)]) == 1:
+            return found[0]
+        if found:
+            raise TaskError(f"scenario {self.id}: got {len(found)} attributes {name!r}, want another name for each")
         raise TaskError(
             f"scenario {self.id}: unknown attribute {name!r}"
             f"{nearest(name, [*(a.name for a in self.attributes), VARIED, PROCEDURAL])}; want {self.choices()}"
