@@ -55,6 +55,8 @@ def parse(arguments: Sequence[str]) -> Launch:
     Raises:
         ConfigError, TaskError: an invalid value. SystemExit(2): flags that do not parse.
     """
+    if arguments and not arguments[0].startswith("-"):
+        raise ConfigError(f"got {arguments[0]!r} without a flag; to choose a config, give --config {arguments[0]}")
     name = argument(arguments, "--config") or DEFAULT_CONFIG
     agent = argument(arguments, "--agent.name")
 

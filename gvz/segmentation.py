@@ -120,9 +120,10 @@ def segmenter_file(scenario: str, config: EnvConfig) -> Path:
                 f"env.segmenter: {config.segmenter or 'GViZDoom'} has no network for {scenario}; "
                 f"`gvz segmenter --scenario {scenario}` trains one, and a directory takes it as {scenario}.onnx"
             )
+        gone = f": no file {file.resolve()}" if name.endswith(".onnx") else nearest(name, known)
         raise ConfigError(
-            f"env.segmenter: got {name!r}{nearest(name, known)}, want one of {', '.join(known) or 'none'}, the path of "
-            "an .onnx file, or a directory of them"
+            f"env.segmenter: got {name!r}{gone}; want one of {', '.join(known) or 'none'}, the path of an .onnx file, "
+            "or a directory of them"
         )
     return file
 

@@ -7,7 +7,7 @@ from functools import cache
 from typing import Literal, get_args
 
 from gvz.core.errors import TaskError, nearest
-from gvz.core.registry import discover
+from gvz.core.registry import named
 from gvz.scenarios.base import MAX_LEVEL, Scenario, Suite, Task
 from gvz.scenarios.map_set import VARIED, names_map_set, parse_map_set
 
@@ -24,10 +24,12 @@ GATE_LEVEL = 2
 
 @cache
 def all_scenarios() -> dict[str, Scenario]:
-    """The scenarios of every suite by id: the modules of gvz.scenarios that have a SCENARIO."""
-    found = {name: module.SCENARIO for name, module in discover("gvz.scenarios", "SCENARIO").items()}
-    assert all(name == scenario.id for name, scenario in found.items()), "a scenario's id is its file name"
-    return found
+    """The scenarios of every suite by id: the modules of gvz.scenarios that have a SCENARIO.
+
+    Raises:
+        ConfigError: the id of one is not its file's name.
+    """
+    return named("gvz.scenarios", "SCENARIO", "id")
 
 
 @cache

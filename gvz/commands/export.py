@@ -13,7 +13,7 @@ import tyro
 from gvz.core import records
 from gvz.core.errors import ConfigError
 from gvz.core.files import written_whole
-from gvz.run.rundir import RECORD_FILES, START_RECORDS
+from gvz.run.rundir import RECORD_FILES, START_RECORDS, no_run
 
 if TYPE_CHECKING:
     import polars as pl
@@ -94,7 +94,7 @@ def run_table(run_dirs: Sequence[Path], name: str, problems: list[str]) -> "pl.D
             config = json.loads((run_dir / "config.json").read_text())["config"]
             whose = {"run_dir": str(run_dir), "run": config["name"], "run_seed": config["seed"]}
         except OSError as error:
-            raise ConfigError(f"{run_dir} is not a run directory (config.json: {error.strerror})") from error
+            raise no_run(run_dir, error) from error
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise ConfigError(f"{run_dir / 'config.json'} cannot be read: {error!r}") from error
         found, damaged = records.read_stored(run_dir / name)

@@ -33,10 +33,13 @@ class TaskError(GvzError, ValueError):
 class AcsError(GvzError, ValueError):
     """ACS source text that cannot be compiled. Carries the 1-based `line` and `column`."""
 
-    def __init__(self, message: str, *, line: int, column: int):
-        super().__init__(f"line {line}, column {column}: {message}")
+    def __init__(self, message: str, line: int, column: int):
+        super().__init__(message, line, column)  # all of them: a worker process sends the error as these
         self.line = line
         self.column = column
+
+    def __str__(self) -> str:
+        return f"ACS script, line {self.line}, column {self.column}: {self.args[0]}"
 
 
 class WadError(GvzError, ValueError):

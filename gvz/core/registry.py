@@ -4,6 +4,7 @@ import inspect
 import pkgutil
 import re
 import sys
+import traceback
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
@@ -46,6 +47,21 @@ def discover(package: str, constant: str | None = None) -> dict[str, ModuleType]
     if constant is not None:
         names = [name for name in names if _sets(f"{package}.{name}", constant)]
     return {name: import_module(f"{package}.{name}") for name in names}
+
+
+def named(package: str, constant: str, attribute: str) -> dict[str, Any]:
+    """The constants of a package's modules by file name, where each has its file's name as an attribute, too.
+
+    Raises:
+        ConfigError: one has another name.
+    """
+    found = {name: getattr(module, constant) for name, module in discover(package, constant).items()}
+    for name, one in found.items():
+        if (got := getattr(one, attribute)) != name:
+            raise ConfigError(
+                f"{package}: {name}.py: got {constant} with {attribute} {got!r}, want {name!r}, the name of its file"
+            )
+    return found
 
 
 def find(package: str, constant: str, name: str, field: str, *arguments: str) -> Any:
@@ -110,5 +126,11 @@ def _module_in_file(file: Path) -> ModuleType:
         spec.loader.exec_module(module)
     except Exception as error:  # the file is the user's own program: anything may come out of it
         del sys.modules[name]
-        raise ConfigError(f"{file}: {type(error).__name__}: {error}") from error
+        raise ConfigError(f"{place(error, file)}: {type(error).__name__}: {error}") from error
     return module
+
+
+def place(error: Exception, file: Path) -> str:
+    """The file that was executed, with the number of its line that `error` came from if there is one."""
+    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(file)]
+    return f"{file}, line {lines[-1]}" if lines else str(file)

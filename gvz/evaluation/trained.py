@@ -28,6 +28,7 @@ from gvz.evaluation.play import PlayerSpec
 from gvz.evaluation.zoo import run_directory
 from gvz.run.config import RunConfig
 from gvz.run.config_files import config_from_dict
+from gvz.run.rundir import no_run
 from gvz.segmentation import KEPT_SEGMENTERS, segmenter_file, with_kept_segmenters
 from gvz.tasks import Task
 
@@ -68,9 +69,7 @@ def read_run_config(run_dir: Path, own_files: OwnFiles = NO_OWN_FILES) -> RunCon
     try:
         config = config_from_dict(json.loads(file.read_text()), own_files)
     except OSError as error:
-        inside = sorted(run_dir.glob("*/config.json"))
-        hint = f"; did you mean {inside[0].parent}?" if inside else ""
-        raise ConfigError(f"{run_dir} is not a run directory ({file.name}: {error.strerror}){hint}") from error
+        raise no_run(run_dir, error) from error
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{file} cannot be read: {error}") from error
     return dataclasses.replace(config, env=with_kept_segmenters(config.env, run_dir / KEPT_SEGMENTERS))

@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any, Literal, get_args
 
 from gvz.core.errors import ConfigError, nearest
-from gvz.core.registry import discover
+from gvz.core.registry import named
 from gvz.evaluation.simple import SIMPLE_PLAYERS
 from gvz.run.config import RunConfig
 from gvz.run.config_files import load_config, with_settings
@@ -158,11 +158,16 @@ class Experiment:
         """Why the experiment cannot be; each reason may depend on the absence of those before it."""
         for name in ("configs", "scenarios", "trainings", "seeds"):
             values = getattr(self, name)
+            if isinstance(values, str):
+                yield f"{name}: got the text {values!r}, want a tuple: ({values!r},)"
             if not values or len(set(values)) < len(values):
                 yield f"{name}: got {values}, want at least one, each once"
         for name in ("total_updates", "num_checkpoints", "episodes", "table_checkpoints"):
             if getattr(self, name) < 1:
                 yield f"{name}: got {getattr(self, name)}, want at least 1"
+        for name, choices in (("evaluate_on", get_args(EvaluateOn)), ("columns", get_args(Columns))):
+            if getattr(self, name) not in choices:
+                yield f"{name}: got {getattr(self, name)!r}, want one of {', '.join(choices)}"
         if not self.table_checkpoints <= self.num_checkpoints <= self.total_updates:
             yield (
                 f"got table_checkpoints {self.table_checkpoints}, num_checkpoints {self.num_checkpoints}, "
@@ -325,10 +330,10 @@ def experiments() -> dict[str, Experiment]:
     """Every experiment there is, by name: the modules of gvz.experiments that have an EXPERIMENT.
 
     Raises:
-        ConfigError: one names a config that is not there, or has a variant that its config refuses.
+        ConfigError: one names a config that is not there, has a variant that its config refuses, or has not the name
+            of its file.
     """
-    found = {name: module.EXPERIMENT for name, module in discover("gvz.experiments", "EXPERIMENT").items()}
-    assert all(name == experiment.name for name, experiment in found.items()), "an experiment's name is its file's"
+    found: dict[str, Experiment] = named("gvz.experiments", "EXPERIMENT", "name")
     for experiment in found.values():
         for config, scenario in itertools.product(experiment.configs, experiment.scenarios):
             defaults = load_config(config, scenario)

@@ -12,7 +12,7 @@ from typing import Any, get_args, get_type_hints
 
 from gvz.core.env_config import typed
 from gvz.core.errors import ConfigError, TaskError, nearest
-from gvz.core.registry import NO_OWN_FILES, OwnFiles
+from gvz.core.registry import NO_OWN_FILES, OwnFiles, place
 from gvz.run.config import RunConfig, with_agent
 from gvz.tasks import scenario_named
 from learner.config import AgentConfig, LearnerConfig, OnPolicyConfig, agent_config_class
@@ -79,9 +79,9 @@ def load_config(text: str, scenario: str | None = None) -> RunConfig:
             scenario_named(name)  # or an error that names it
         return with_settings(config, settings.get(scenario, {}))
     except (ConfigError, TaskError) as error:
-        raise ConfigError(f"{path}: {error}") from error
+        raise ConfigError(f"{place(error, path)}: {error}") from error
     except Exception as error:  # a config file is the user's own program: anything may come out of it
-        raise ConfigError(f"{path}: {type(error).__name__}: {error}") from error
+        raise ConfigError(f"{place(error, path)}: {type(error).__name__}: {error}") from error
 
 
 @lru_cache(maxsize=1)

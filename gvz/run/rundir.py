@@ -260,6 +260,13 @@ def refuse_other_contents(path: Path) -> None:
         )
 
 
+def no_run(path: Path, error: OSError) -> ConfigError:
+    """The error about a directory whose config.json cannot be opened; it names the first run inside, if any."""
+    inside = sorted(path.glob("*/config.json"))
+    hint = f"; did you mean {inside[0].parent}?" if inside else ""
+    return ConfigError(f"{path} is not a run directory (config.json: {error.strerror}){hint}")
+
+
 def move_aside(path: Path) -> Path | None:
     """Moves an old run out of the way for `--fresh`: never overwrites, never deletes.
 

@@ -100,6 +100,8 @@ def test_bad_input_is_named(run_dirs, tmp_path, capsys):
     assert "got no run directory, want at least one" in capsys.readouterr().err
     assert cli.main(["export", str(tmp_path)]) == 2
     assert f"{tmp_path} is not a run directory (config.json: No such file or directory)" in capsys.readouterr().err
+    assert cli.main(["export", str(run_dirs[0].parent)]) == 2
+    assert f"; did you mean {run_dirs[0]}?" in capsys.readouterr().err
     (tmp_path / "file").touch()
     assert cli.main(["export", str(run_dirs[0]), "--out", str(tmp_path / "file")]) == 2
     assert "--out: " in capsys.readouterr().err

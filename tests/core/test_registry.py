@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from gvz.core.errors import ConfigError
-from gvz.core.registry import discover, find
+from gvz.core.registry import discover, find, named
 
 
 @pytest.fixture
@@ -63,6 +63,16 @@ def test_a_name_that_no_module_has_is_refused_with_the_nearest():
         find("found_by_name", "NAME", "zebar", "zoo.animal")
 
 
+def test_what_a_module_sets_has_the_name_of_its_file(package: Path):
+    (package / "fox.py").write_text("from types import SimpleNamespace\n\nKIND = SimpleNamespace(id='fox')\n")
+    assert list(named("found_by_name", "KIND", "id")) == ["fox"]
+    (package / "hen.py").write_text((package / "fox.py").read_text())
+    with pytest.raises(
+        ConfigError, match=r"found_by_name: hen\.py: got KIND with id 'fox', want 'hen', the name of its"
+    ):
+        named("found_by_name", "KIND", "id")
+
+
 def test_a_module_without_the_constant_is_not_offered(package: Path):
     (package / "helper.py").write_text("")
     with pytest.raises(ConfigError, match=r"got 'helper', want one of ant, zebra, or the path of a file"):
@@ -89,8 +99,12 @@ def test_a_file_that_is_missing_or_does_not_set_the_constant_is_refused(tmp_path
     ("text", "message"),
     [
         ("NAME = (", r"mine\.py: SyntaxError: '\(' was never closed"),
-        ("raise ValueError('so')", r"mine\.py: ValueError: so$"),
-        ("import no_such_module_anywhere", r"mine\.py: ModuleNotFoundError: No module named 'no_such_module_anywhere'"),
+        ("raise ValueError('so')", r"mine\.py, line 1: ValueError: so$"),
+        (
+            "import no_such_module_anywhere",
+            r"mine\.py, line 1: ModuleNotFoundError: No module named 'no_such_module_an",
+        ),
+        ("import json\n\njson.loads('')", r"mine\.py, line 3: JSONDecodeError: Expecting value: line 1 column 1"),
     ],
 )
 def test_what_a_file_raises_is_told_in_one_line_and_the_file_can_be_mended(tmp_path: Path, text: str, message: str):

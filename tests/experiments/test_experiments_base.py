@@ -173,6 +173,12 @@ def test_settings_change_their_fields_alone_and_another_agent_comes_first():
     [
         ({"seeds": ()}, r"experiment quick_comparison: seeds: got \(\), want at least one, each once"),
         ({"seeds": (1, 1)}, "want at least one, each once"),
+        ({"configs": "dqn_quick"}, r"configs: got the text 'dqn_quick', want a tuple: \('dqn_quick',\)"),
+        (
+            {"evaluate_on": "everything"},
+            "evaluate_on: got 'everything', want one of own, test, all, gate, procedural, at",
+        ),
+        ({"columns": "configs"}, "columns: got 'configs', want one of level, training, config"),
         ({"episodes": 0}, "episodes: got 0, want at least 1"),
         ({"num_checkpoints": 4, "total_updates": 3}, "num_checkpoints 4, total_updates 3, want each at most the next"),
         (

@@ -221,6 +221,7 @@ BAD = {
     "--env.reward-weights kill 1 kill 2": "env.reward_weights: got kill kill, want each component once",
     "--env.reward-weights kill": "Error parsing --env.reward-weights",
     "--env.reward-weights kill 0 death 0 ammo_spent 0 health_lost 0": "env.reward_weights: got 0 for each of kill,",
+    "rainbow_quick": "got 'rainbow_quick' without a flag; to choose a config, give --config rainbow_quick",
     "--name a/b": "name: got 'a/b'",
 }
 

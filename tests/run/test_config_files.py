@@ -23,9 +23,9 @@ def test_a_path_is_taken_as_a_path(tmp_path):
     ("text", "message"),
     [
         ("x = 1", "got NoneType for CONFIG, want `CONFIG = RunConfig"),
-        ("1 / 0", "ZeroDivisionError: division by zero"),
+        ("x = 1\n1 / 0", ", line 2: ZeroDivisionError: division by zero"),
         ("def (", "SyntaxError"),
-        ("from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='a b')", "name: got 'a b'"),
+        ("from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='a b')", ", line 2: name: got 'a b'"),
         (
             "from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='a', mode='asynch')",
             "CONFIG.mode: got 'asynch'",

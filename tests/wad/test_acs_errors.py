@@ -1,5 +1,6 @@
 """What the ACS compiler refuses: every error by its place and its text."""
 
+import pickle
 import sys
 
 import pytest
@@ -146,7 +147,9 @@ def test_an_error_says_where_and_what_was_found_and_expected(source: str, line: 
     error = error_of(source)
     assert text in str(error)
     assert (error.line, error.column) == (line, column)
-    assert str(error).startswith(f"line {line}, column {column}: ")
+    assert str(error).startswith(f"ACS script, line {line}, column {column}: ")
+    sent = pickle.loads(pickle.dumps(error))  # as a worker process sends it
+    assert (str(sent), sent.line, sent.column) == (str(error), line, column)
 
 
 @pytest.mark.parametrize(
