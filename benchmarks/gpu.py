@@ -78,8 +78,7 @@ def _calls(budget: Budget) -> list[Row]:
     from gvz.run.assemble import assemble
 
     config = workload.run_config(budget)
-    with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
-        learner = workload.Learner(config, assemble(config, workload.work_directory(directory)))
+    learner = workload.Learner(config, assemble(config, Path()))
     agent, act = learner.sizes.agent, jax.jit(learner.sizes.agent.act)
 
     def decide(observation: Any) -> None:

@@ -117,18 +117,17 @@ def updates_by_size(
     from learner.config import ReplayConfig
 
     bodies = {}
-    with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
-        for size in sizes:
-            config = workload.run_config(budget)
-            config = dataclasses.replace(
-                config,
-                replay=ReplayConfig(capacity=4_000),
-                learner=dataclasses.replace(config.learner, warmup_steps=2_000),
-            )
-            config = change(config, size)
-            learner = workload.Learner(config, assemble(config, Path(directory)))
-            bodies[size] = lambda learner=learner: 1 / learner.updates_per_s(1, budget.body_s)
-        return _alternate(budget, bodies)
+    for size in sizes:
+        config = workload.run_config(budget)
+        config = dataclasses.replace(
+            config,
+            replay=ReplayConfig(capacity=4_000),
+            learner=dataclasses.replace(config.learner, warmup_steps=2_000),
+        )
+        config = change(config, size)
+        learner = workload.Learner(config, assemble(config, Path()))
+        bodies[size] = lambda learner=learner: 1 / learner.updates_per_s(1, budget.body_s)
+    return _alternate(budget, bodies)
 
 
 def _batch(budget: Budget) -> list[Row]:
@@ -185,13 +184,10 @@ def _play(budget: Budget, config: Any) -> list[float]:
 
 def _actors(budget: Budget) -> list[Row]:
     """A pool's rate by its number of actors, each with four games; the pools run one after the other."""
-    from gvz.run.assemble import assemble
-
     cores = len(os.sched_getaffinity(0))
     counts = (1, 2) if budget.quick else sorted({1, cores, cores + cores // 2, 2 * cores})
-    with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
-        config = workload.run_config(budget)
-        base = workload.random_players(assemble(config, Path(directory)).pool_config)
+    with workload.assembled(workload.run_config(budget)) as parts:
+        base = workload.random_players(parts.pool_config)
         pools = {n: msgspec.structs.replace(base, num_actors=n, cores=()) for n in counts}
         values: dict[float, list[float]] = {n: _play(budget, pool) for n, pool in pools.items()}
     return [

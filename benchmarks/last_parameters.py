@@ -10,7 +10,6 @@ import dataclasses
 import json
 import shutil
 import sys
-import tempfile
 from pathlib import Path
 
 import tyro
@@ -45,8 +44,7 @@ def write_last_parameters(run_dir: Path, out: Path, own_files: OwnFiles = NO_OWN
         )
     if out.exists():
         raise ConfigError(f"{out} is already there; name a new directory")
-    with tempfile.TemporaryDirectory() as work:
-        template = assemble(config, Path(work)).array_shapes()
+    template = assemble(config, Path()).array_shapes()
     num_updates = find_checkpoint(run_dir, "newest")
     arrays, _ = checkpoint.read(run_dir / "checkpoints" / str(num_updates), template)
     try:
