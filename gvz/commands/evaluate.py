@@ -80,7 +80,7 @@ class Evaluate:
                     if out not in files:
                         files[out] = RecordFile(out)
                     held[player_spec] = files[out]
-                    jobs += missing_jobs({player_spec: files[out]}, wanted_episodes(tasks, self.episodes, self.seeds))
+                    jobs += missing_jobs(player_spec, files[out], wanted_episodes(tasks, self.episodes, self.seeds))
                 _show_progress(play_and_record(held, jobs, num_workers=workers, stop=stop), len(jobs))
             for player_spec, (tasks, _) in player_specs.items():
                 self._print_scores(player_spec, tasks, held[player_spec].rows)
@@ -136,12 +136,13 @@ class Evaluate:
         return found
 
     def _print_scores(self, player_spec: "PlayerSpec", tasks: Sequence[Task], rows: "Sequence[Row]") -> None:
+        from gvz.evaluation.episode_log import rows_of
         from gvz.evaluation.table import score_lines, score_rows
 
-        player = player_spec.identity["player"]
+        player, mine = player_spec.identity["player"], rows_of(player_spec, rows)
         for base_seed in self.seeds:
-            chosen = [row for row in rows if row.get("base_seed", 0) == base_seed]
-            found = score_rows(chosen, player_spec.identity, tasks, self.episodes)
+            chosen = [row for one, row in mine.items() if one.base_seed == base_seed and one.episode < self.episodes]
+            found = score_rows(chosen, tasks)
             if self.json:
                 for one in found:
                     print(json.dumps({"player": player, "base_seed": base_seed, **one}))

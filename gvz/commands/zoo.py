@@ -106,7 +106,7 @@ def _read(name: str, own_files: OwnFiles) -> _Policy:
     rows = score_card(records.read_stored(directory / EVALUATION_RECORDS)[0])
     metrics, _ = records.read_stored(directory / "metrics.jsonl")
     tasks = TaskSelection(split="test").of_run([scenario.id for scenario in config.table.scenarios])
-    scores = score_rows(rows, {}, tasks, episodes=10**9)
+    scores = score_rows(rows, tasks)
     spent_s = metrics[-1].get("run/processor_s") if metrics else None
     return _Policy(name, config, num_updates, spent_s, len(tasks), scores)
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from gvz.core.cache import cache_directory
 from gvz.core.errors import ConfigError, ResourceError, nearest
+from gvz.core.files import written_whole
 from gvz.core.libraries import require_learner
 from gvz.core.registry import NO_OWN_FILES, OwnFiles
 from gvz.run.rundir import EVALUATION_RECORDS, START_RECORDS
@@ -162,14 +163,9 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", own_files: OwnFil
             raise ConfigError(
                 f"zoo: {name} would have {size:,} bytes, want at most {MAX_BYTES:,}; train a smaller network"
             )
-        ZOO_DIRECTORY.mkdir(exist_ok=True)
         added = ZOO_DIRECTORY / file.name
-        unfinished = added.with_suffix(".unfinished")
-        try:
-            shutil.copy(file, unfinished)
-            unfinished.replace(added)
-        finally:
-            unfinished.unlink(missing_ok=True)
+        with written_whole(added) as writing:
+            shutil.copy(file, writing)
     return Packed(file=added, num_updates=num_updates, num_bytes=size, num_episodes=len(rows))
 
 

@@ -56,7 +56,7 @@ def read_results(paths: Sequence[Path]) -> Results:
     runs: dict[Path, Run] = {}
     asked = []
     for path in from_outside:
-        for config in files_below(path, "config.json") if path.is_dir() else []:
+        for config in files_below(path, "config.json"):
             of_group = (config.resolve().parents[1] / "config.json").exists()  # a further learner process of that run
             discarded = is_in_folder_of_run(config, path, ("discarded",))
             if config.parent.resolve() not in runs and not discarded and not of_group:
@@ -64,7 +64,7 @@ def read_results(paths: Sequence[Path]) -> Results:
                 problems += found
                 if run is not None:
                     runs[config.parent.resolve()] = run
-        for file in files_below(path, "plan.json") if path.is_dir() else []:
+        for file in files_below(path, "plan.json"):
             try:
                 plan = read_plan(file.parent)
             except ConfigError as error:
