@@ -16,7 +16,7 @@ import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gvz.core.cache import cache_directory
 from gvz.core.errors import ConfigError, ResourceError, nearest
@@ -24,9 +24,6 @@ from gvz.core.files import written_whole
 from gvz.core.libraries import require_learner
 from gvz.core.registry import NO_OWN_FILES, OwnFiles
 from gvz.run.rundir import EVALUATION_RECORDS, START_RECORDS
-
-if TYPE_CHECKING:
-    import numpy as np
 
 ZOO_DIRECTORY = Path(__file__).parent.parent / "zoo"
 PREFIX = "zoo:"
@@ -179,10 +176,9 @@ def _rounded(params: object) -> object:
     import jax.numpy as jnp
     import numpy as np
 
-    def rounded(leaf: "np.ndarray") -> "np.ndarray":
-        return leaf.astype(jnp.bfloat16).astype(np.float32) if leaf.dtype == np.float32 else leaf
-
-    return jax.tree.map(rounded, params)
+    return jax.tree.map(
+        lambda leaf: leaf.astype(jnp.bfloat16).astype(np.float32) if leaf.dtype == np.float32 else leaf, params
+    )
 
 
 def _keep_some_rows(record: Path, most: int) -> None:

@@ -238,9 +238,10 @@ def test_a_compressed_file_is_not_written_to(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_player_is_not_evaluated_on_an_unknown_task(tmp_path):
+@pytest.mark.parametrize("tasks", [["nowhere/default"], "nowhere/default"])
+def test_a_player_is_not_evaluated_on_an_unknown_task_also_if_it_is_named_alone(tmp_path, tasks):
     with pytest.raises(TaskError, match="unknown scenario 'nowhere'"):
-        evaluate_player(RandomPlayer, ["nowhere/default"], tmp_path / "rows.jsonl", name="mine")
+        evaluate_player(RandomPlayer, tasks, tmp_path / "rows.jsonl", name="mine")
 
 
 @pytest.mark.parametrize(
@@ -258,8 +259,3 @@ def test_an_evaluation_that_gives_no_rows_of_a_player_is_refused(tmp_path, tasks
     with pytest.raises(ConfigError, match=message):
         evaluate_player(RandomPlayer, tasks, tmp_path / "rows.jsonl", **options)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_one_task_may_be_named_alone(tmp_path):
-    with pytest.raises(TaskError, match="unknown scenario 'nowhere'"):
-        evaluate_player(RandomPlayer, "nowhere/default", tmp_path / "rows.jsonl", name="mine")

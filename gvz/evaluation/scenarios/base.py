@@ -30,10 +30,6 @@ STUCK_UNITS = 4.0
 NEAR = 14.0
 """nearness, pixels (some 270 map units), of an enemy worth a bullet, and of a vial worth a detour"""
 
-Sweep = Sequence[tuple[str, int]]
-"""(button, decisions it is held), again and again: how to play a scenario without looking. Each scored most of 8 to 25
-such sequences, on 8 to 12 episodes of base seed 1: `default`, in Dodge Projectiles five of the test tasks."""
-
 
 class Sight:
     """What a script goes by. Places are in pixels of the rendered screen.
@@ -138,7 +134,10 @@ class Moving:
 
 
 def sweep(scenario: str) -> Iterator[str]:
-    """The buttons of the scenario's sweep, without end.
+    """The buttons of the scenario's sweep, without end: how to play it without looking.
+
+    `SWEEP` is (button, decisions it is held), again and again. Each scored most of 8 to 25 such sequences, on 8 to 12
+    episodes of base seed 1: `default`, in Dodge Projectiles five of the test tasks.
 
     Raises:
         ConfigError: nobody has written one.
