@@ -7,7 +7,7 @@ nothing of what is out of sight.
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -73,6 +73,15 @@ class Sight:
     def turn_anywhere(self) -> str:
         """A button that turns, by chance."""
         return ("TURN_LEFT", "TURN_RIGHT")[self.rng.integers(2)]
+
+    def turn_round(self, wanted: "Sequence[Label]", found: Callable[[], bool]) -> Generator[str, None, bool]:
+        """Turns towards the first label, without one somewhere, at most once round; returns whether it `found` it."""
+        turn = self.turn_to(wanted[0]) if wanted else self.turn_anywhere()
+        for _ in range(FULL_TURN):
+            yield turn
+            if found():
+                return True
+        return False
 
     @property
     def place(self) -> tuple[float, float]:
