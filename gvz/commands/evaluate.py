@@ -11,7 +11,7 @@ import tyro
 
 from gvz.core.env_config import EnvConfig, Profile
 from gvz.core.errors import EXIT_INTERRUPTED, ConfigError
-from gvz.core.registry import OwnFiles
+from gvz.core.registry import NO_OWN_FILES, OwnFiles
 from gvz.core.stop import StopRequest, say
 from gvz.evaluation.selection import ALL_TASKS, TaskSelection
 from gvz.evaluation.simple import SimplePlayerName
@@ -43,10 +43,7 @@ class Evaluate:
     player: SimplePlayerName | None = None
     """random: uniformly random buttons; idle: presses nothing; sweep: a fixed sequence of buttons; scripted: the
     scenario's simple script, which gets names and places of what is in sight"""
-    agent: Path | None = None
-    """the Python file of the run's agent, if it is in a file of its own: playing executes it"""
-    encoder: Path | None = None
-    """likewise, of its encoder"""
+    own_files: Annotated[OwnFiles, tyro.conf.arg(name="")] = NO_OWN_FILES
     checkpoints: tuple[str, ...] = ("newest",)
     """which of a run's policies: newest, all, last5 (or another number), or numbers of gradient steps"""
     select: Annotated[TaskSelection, tyro.conf.arg(name="")] = ALL_TASKS
@@ -97,7 +94,8 @@ class Evaluate:
             raise ConfigError(f"evaluate: got --player {self.player} and also {self.run_dirs[0]}, want one of them")
         if self.player is None and not self.run_dirs:
             raise ConfigError("evaluate: want --player or run directories (before --tasks, which takes what follows)")
-        of_runs = {"--agent": self.agent, "--encoder": self.encoder, "--checkpoints": self.checkpoints != ("newest",)}
+        agent, encoder = self.own_files
+        of_runs = {"--agent": agent, "--encoder": encoder, "--checkpoints": self.checkpoints != ("newest",)}
         if self.player is not None and (given := [flag for flag, value in of_runs.items() if value]):
             raise ConfigError(f"{given[0]}: got it beside --player {self.player}, want it with run directories alone")
         if not self.checkpoints:
@@ -126,7 +124,7 @@ class Evaluate:
             return {simple_player(self.player, env): (self.select.resolve(), out)}
         found = {}
         for run_dir in dict.fromkeys(map(run_directory, self.run_dirs)):
-            config = read_run_config(run_dir, OwnFiles(self.agent, self.encoder))
+            config = read_run_config(run_dir, self.own_files)
             tasks = self.select.of_run([scenario.id for scenario in config.table.scenarios])
             check_tasks(config, tasks)
             check_profile(config, self.profile)
