@@ -63,7 +63,7 @@ def test_a_network_that_was_not_scored_has_no_record_of_the_one_before_it(capsys
         return Labelled(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8), np.zeros(shape, np.uint8))
 
     monkeypatch.setattr("gvz.evaluation.segmentation.labelled_frames", frames)
-    monkeypatch.setattr("learner.segmentation.train_segmentation", lambda *given: given[-1](1, 0.5))
+    monkeypatch.setattr("learner.segmentation.train_segmentation", lambda *_: (None, 1, 0.5))
     shipped = SEGMENTERS / "seek_and_kill.onnx"
     monkeypatch.setattr("learner.segmentation.write_onnx", lambda *given: shutil.copy(shipped, given[1]))
     file = tmp_path / "mine.onnx"
