@@ -10,7 +10,6 @@ each round counts, as for the peers of `actors`. Goal: 0.6 of the limit.
 import contextlib
 import dataclasses
 import os
-import tempfile
 from functools import partial
 
 import numpy as np
@@ -29,7 +28,6 @@ def measure(budget: Budget) -> list[Row]:
     import jax
     import jax.numpy as jnp
 
-    from gvz.run.assemble import assemble
     from gvz.transport.child import one_core
     from learner.agents.rainbow import Rainbow
     from learner.export import flatten_params
@@ -37,18 +35,12 @@ def measure(budget: Budget) -> list[Row]:
     cores, config = len(os.sched_getaffinity(0)), workload.run_config(budget)
     num_engines = 1 if budget.quick else 2 * cores
     with contextlib.ExitStack() as stack:
-        directory = stack.enter_context(tempfile.TemporaryDirectory(prefix="gvz-benchmark-"))
-        parts = {
-            (games, steps): assemble(
-                dataclasses.replace(
-                    config,
-                    actors=dataclasses.replace(config.actors, games_per_actor=games),
-                    agent=dataclasses.replace(config.agent, noisy_period_steps=steps),
-                ),
-                workload.work_directory(directory) / f"{games}-{steps}",
-            )
-            for games, steps in (((4, 1),) if budget.quick else _POOLS)
-        }
+        parts = {}
+        for games, steps in ((4, 1),) if budget.quick else _POOLS:
+            actors = dataclasses.replace(config.actors, games_per_actor=games)
+            agent = dataclasses.replace(config.agent, noisy_period_steps=steps)
+            changed = dataclasses.replace(config, actors=actors, agent=agent)
+            parts[games, steps] = stack.enter_context(workload.assembled(changed))
         agent = workload.direct(next(iter(parts.values())).learner.agent)
         assert isinstance(agent, Rainbow)
         params = agent.init(jax.random.key(0))

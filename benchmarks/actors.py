@@ -10,9 +10,7 @@ times EnvPool (6 times with the tuned engine), 8 times LevDoom at its default of
 import contextlib
 import dataclasses
 import os
-import tempfile
 from functools import partial
-from pathlib import Path
 
 from benchmarks import workload
 from benchmarks.candidates import Candidates, engine_is_tuned
@@ -21,19 +19,14 @@ from benchmarks.rounds import Budget, Row, alternate, rates
 
 def measure(budget: Budget) -> list[Row]:
     """Rates of all candidates in alternating rounds, and the ratios of the goals."""
-    from gvz.run.assemble import assemble
-
     cores = len(os.sched_getaffinity(0))
     config = workload.run_config(budget)
     with contextlib.ExitStack() as stack:
         candidates = Candidates(budget, stack)
         candidates.add_limit((1,) if budget.quick else (cores, 2 * cores))
-        directory = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gvz-benchmark-")))
         for games in (4,) if budget.quick else (1, 2, 4):
             actors = dataclasses.replace(config.actors, games_per_actor=games)
-            parts = assemble(
-                dataclasses.replace(config, actors=actors), workload.work_directory(str(directory / str(games)))
-            )
+            parts = stack.enter_context(workload.assembled(dataclasses.replace(config, actors=actors)))
             pool = stack.enter_context(workload.playing(workload.random_players(parts.pool_config)))
             name = f"actor pool, random play, {games} games an actor"
             candidates.add("actor pool", name, partial(workload.decisions_per_s, pool, budget.body_s))

@@ -6,9 +6,9 @@ writes priorities; a decision is the network's part of it, for eight games in on
 """
 
 import dataclasses
-import tempfile
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 from benchmarks import workload
 from benchmarks.rounds import Budget, Row, alternate, rates, seconds_per_call
@@ -26,19 +26,18 @@ def measure(budget: Budget) -> list[Row]:
     names = [name for name, module in discover("learner.encoders").items() if hasattr(module, "ENCODER")]
     learners: dict[str, Callable[[], float]] = {}
     players: dict[str, Callable[[], float]] = {}
-    with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
-        for name in QUICK_NAMES if budget.quick else names:
-            learner = _learner(name, directory)
-            learners[name] = partial(learner.updates_per_s, 1, budget.body_s)
-            players[name] = partial(seconds_per_call, _decide(learner), budget.body_s)
-        updates = alternate(budget.rounds, learners)
-        seconds = alternate(budget.rounds, players)
+    for name in QUICK_NAMES if budget.quick else names:
+        learner = _learner(name)
+        learners[name] = partial(learner.updates_per_s, 1, budget.body_s)
+        players[name] = partial(seconds_per_call, _decide(learner), budget.body_s)
+    updates = alternate(budget.rounds, learners)
+    seconds = alternate(budget.rounds, players)
     return [
         rates(name, decisions_per_s=[GAMES / s for s in seconds[name]], updates_per_s=updates[name]) for name in updates
     ]
 
 
-def _learner(encoder: str, directory: str) -> workload.Learner:
+def _learner(encoder: str) -> workload.Learner:
     from gvz.run.assemble import assemble
     from gvz.run.config_files import load_config
     from learner.agents.configs.rainbow import RainbowConfig
@@ -50,7 +49,7 @@ def _learner(encoder: str, directory: str) -> workload.Learner:
         agent=RainbowConfig(encoder=encoder, hidden_units=config.agent.hidden_units),
         replay=dataclasses.replace(config.replay, capacity=CAPACITY),
     )
-    return workload.Learner(config, assemble(config, workload.work_directory(directory)))
+    return workload.Learner(config, assemble(config, Path()))
 
 
 def _decide(learner: workload.Learner) -> Callable[[], None]:

@@ -17,6 +17,7 @@ import time
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -131,16 +132,9 @@ def speed(options: Speed) -> int:
         with ExitStack() as stack:
             players = [stack.enter_context(p) for p in _start(options, "engine_speed", body, _TASK, str(options.core))]
             packages = [player.about["versions"]["vizdoom"] for player in players]
-            answers: dict[str, list[dict[str, float]]] = {"stock": [], "tuned": []}
-
-            def measure(name: str, player: Remote, answers: dict[str, list[dict[str, float]]] = answers) -> float:
-                answers[name].append(player(decisions=_BODY_DECISIONS))
-                return 0.0
-
-            named = dict(zip(answers, players, strict=True))
-            bodies = {name: (lambda n=name, p=player: measure(n, p)) for name, player in named.items()}
-            alternate(options.rounds, bodies)
-        rows = {name: values[1:] for name, values in answers.items()}  # without the warm-up round
+            named = zip(("stock", "tuned"), players, strict=True)
+            bodies = {name: partial(player, decisions=_BODY_DECISIONS) for name, player in named}
+            rows = alternate(options.rounds, bodies)
         units = ("decisions_per_s", "engine_us", "python_us", "decisions_per_core_s")
         values = {name: {unit: [row[unit] for row in rows[name]] for unit in units} for name in rows}
         found[body] = {name: {unit: spread(v) for unit, v in units.items()} for name, units in values.items()}

@@ -78,8 +78,7 @@ def _calls(budget: Budget) -> list[Row]:
     from gvz.run.assemble import assemble
 
     config = workload.run_config(budget)
-    with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
-        learner = workload.Learner(config, assemble(config, workload.work_directory(directory)))
+    learner = workload.Learner(config, assemble(config, Path()))
     agent, act = learner.sizes.agent, jax.jit(learner.sizes.agent.act)
 
     def decide(observation: Any) -> None:
@@ -90,8 +89,8 @@ def _calls(budget: Budget) -> list[Row]:
         for scan in (SCANS[:1] if budget.quick else SCANS)
     }
     updates = alternate(budget.rounds, learners)
-    players: dict[str, Callable[[], float]] = {
-        str(games): partial(seconds_per_call, partial(decide, agent.spec.zeros(games)), budget.body_s)
+    players: dict[int, Callable[[], float]] = {
+        games: partial(seconds_per_call, partial(decide, agent.spec.zeros(games)), budget.body_s)
         for games in _few(ACTED, budget)
     }
     seconds = alternate(budget.rounds, players)
@@ -99,7 +98,7 @@ def _calls(budget: Budget) -> list[Row]:
     bill = learner.parts.footprint.replay_bytes + 4 * learner.parts.footprint.params_bytes
     rows = [rates(name, updates_per_s=found, batch_size=learner.sizes.batch_size) for name, found in updates.items()]
     rows += [
-        rates(f"network on the device, {games} games a call", decisions_per_s=[int(games) / s for s in found])
+        rates(f"network on the device, {games} games a call", decisions_per_s=[games / s for s in found])
         for games, found in seconds.items()
     ]
     if "peak_bytes_in_use" in statistics:

@@ -45,11 +45,6 @@ def exponent(values: Mapping[float, Sequence[float]]) -> list[float]:
     return [math.log(grown, high / low) for grown in ratios(values[high], values[low])]
 
 
-def _alternate(budget: Budget, bodies: Mapping[float, Callable[[], float]]) -> dict[float, list[float]]:
-    found = alternate(budget.rounds, {str(x): body for x, body in bodies.items()})
-    return {x: found[str(x)] for x in bodies}
-
-
 def replay_rows(budget: Budget, capacities: Sequence[int]) -> list[Row]:
     """Insertion of a block of 64 records and draw of a batch of 32, over the replay's size."""
     import jax
@@ -100,7 +95,7 @@ def replay_rows(budget: Budget, capacities: Sequence[int]) -> list[Row]:
         draws[capacity] = partial(seconds_per_call, draw, budget.body_s)
     rows = []
     for name, bodies in (("insertion of 64 records", inserts), ("draw of a batch of 32", draws)):
-        values = _alternate(budget, bodies)
+        values = alternate(budget.rounds, bodies)
         low, high = min(values), max(values)
         grown = ratios(values[high], values[low])
         allowed = math.log(high) / math.log(low)
@@ -117,18 +112,17 @@ def updates_by_size(
     from learner.config import ReplayConfig
 
     bodies = {}
-    with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
-        for size in sizes:
-            config = workload.run_config(budget)
-            config = dataclasses.replace(
-                config,
-                replay=ReplayConfig(capacity=4_000),
-                learner=dataclasses.replace(config.learner, warmup_steps=2_000),
-            )
-            config = change(config, size)
-            learner = workload.Learner(config, assemble(config, Path(directory)))
-            bodies[size] = lambda learner=learner: 1 / learner.updates_per_s(1, budget.body_s)
-        return _alternate(budget, bodies)
+    for size in sizes:
+        config = workload.run_config(budget)
+        config = dataclasses.replace(
+            config,
+            replay=ReplayConfig(capacity=4_000),
+            learner=dataclasses.replace(config.learner, warmup_steps=2_000),
+        )
+        config = change(config, size)
+        learner = workload.Learner(config, assemble(config, Path()))
+        bodies[size] = lambda learner=learner: 1 / learner.updates_per_s(1, budget.body_s)
+    return alternate(budget.rounds, bodies)
 
 
 def _batch(budget: Budget) -> list[Row]:
@@ -166,7 +160,7 @@ def _parameters(budget: Budget) -> list[Row]:
         for n, writer in writers.items():
             publish = partial(writer.publish, np.ones(n, np.float32), ParamsHeader(version=1, num_updates=0))
             bodies[n] = partial(seconds_per_call, publish, budget.body_s)
-        publications = _alternate(budget, bodies)
+        publications = alternate(budget.rounds, bodies)
     finally:
         for writer in writers.values():
             writer.close()
@@ -185,13 +179,10 @@ def _play(budget: Budget, config: Any) -> list[float]:
 
 def _actors(budget: Budget) -> list[Row]:
     """A pool's rate by its number of actors, each with four games; the pools run one after the other."""
-    from gvz.run.assemble import assemble
-
     cores = len(os.sched_getaffinity(0))
     counts = (1, 2) if budget.quick else sorted({1, cores, cores + cores // 2, 2 * cores})
-    with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
-        config = workload.run_config(budget)
-        base = workload.random_players(assemble(config, Path(directory)).pool_config)
+    with workload.assembled(workload.run_config(budget)) as parts:
+        base = workload.random_players(parts.pool_config)
         pools = {n: msgspec.structs.replace(base, num_actors=n, cores=()) for n in counts}
         values: dict[float, list[float]] = {n: _play(budget, pool) for n, pool in pools.items()}
     return [

@@ -9,13 +9,12 @@ run and the cluster have left behind is counted: processes, files in /dev/shm, p
 """
 
 import json
-import shlex
 import signal
 import sys
 import tempfile
 import time
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,8 +22,7 @@ import psutil
 import tyro
 from rich.console import Console
 
-from benchmarks import record
-from benchmarks.soak import DIRECTORY, SCHEMA, Watched, growth, ticks, words_of
+from benchmarks.soak import DIRECTORY, Watched, about, growth, ticks
 from gvz.core import janitor, records
 from gvz.run import machine
 
@@ -56,8 +54,7 @@ class HostsSoak:
 
 def soak(options: HostsSoak, cluster: "RayCluster", console: Console) -> dict[str, Any]:
     """Runs the whole soak on a cluster of this process with enough nodes; returns the record."""
-    started = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
-    hardware, commit = machine.hardware(), record.describe_commit()
+    head = about("hosts_soak", options, (*machine.PACKAGES, "ray", "zstandard"))
     hosts = f"--actors.num-actors 1 --actors.games-per-actor 4 --cluster.hosts {options.hosts}".split()
     words = [*hosts, "--cluster.address", cluster.address, *options.flags]
     with tempfile.TemporaryDirectory(prefix="gvz-soak-") as directory:
@@ -91,13 +88,7 @@ def soak(options: HostsSoak, cluster: "RayCluster", console: Console) -> dict[st
         repeated = sum(count - 1 for count in Counter((row["lane"], row["episode"]) for row in episodes).values())
         last = rows[-1]
         return {
-            "schema": SCHEMA,
-            "date": started,
-            "commit": commit,
-            "command": shlex.join(["python", "-m", "benchmarks.hosts_soak", *words_of(options)]),
-            "machine": hardware,
-            "versions": machine.versions((*machine.PACKAGES, "ray", "zstandard")),
-            "settings": {**asdict(options), "out": None, "flags": list(options.flags)},
+            **head,
             "kills": kills,
             "samples": {name: [sample[name] for sample in samples] for name in samples[0]},
             "faults": dict(Counter(fault["kind"] for fault in faults)),

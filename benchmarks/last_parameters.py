@@ -10,8 +10,8 @@ import dataclasses
 import json
 import shutil
 import sys
-import tempfile
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -45,8 +45,7 @@ def write_last_parameters(run_dir: Path, out: Path, own_files: OwnFiles = NO_OWN
         )
     if out.exists():
         raise ConfigError(f"{out} is already there; name a new directory")
-    with tempfile.TemporaryDirectory() as work:
-        template = assemble(config, Path(work)).array_shapes()
+    template = assemble(config, Path()).array_shapes()
     num_updates = find_checkpoint(run_dir, "newest")
     arrays, _ = checkpoint.read(run_dir / "checkpoints" / str(num_updates), template)
     try:
@@ -66,19 +65,17 @@ def write_last_parameters(run_dir: Path, out: Path, own_files: OwnFiles = NO_OWN
 def main(
     run_dir: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
-    agent: Path | None = None,
-    encoder: Path | None = None,
+    own_files: Annotated[OwnFiles, tyro.conf.arg(name="")] = NO_OWN_FILES,
 ) -> int:
     """Write a run directory whose policy has the parameters of the run's last gradient step.
 
     Args:
         run_dir: directory of a run with learner.average_ema.
         out: the new directory.
-        agent: the Python file of the run's agent, if it is in a file of its own: this executes it.
-        encoder: likewise, of its encoder.
+        own_files: as for `gvz evaluate`.
     """
     try:
-        num_updates = write_last_parameters(run_dir, out, OwnFiles(agent, encoder))
+        num_updates = write_last_parameters(run_dir, out, own_files)
     except GvzError as error:
         print(f"last_parameters: {error}", file=sys.stderr)
         return 2

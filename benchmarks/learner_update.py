@@ -8,7 +8,6 @@ their records go into the same replay.
 """
 
 import contextlib
-import tempfile
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -25,18 +24,14 @@ def measure(budget: Budget) -> list[Row]:
     """Rates of all candidates, the goals, and our profile."""
     import jax
 
-    from gvz.run.assemble import assemble
     from learner.train_step import default_num_updates
 
     on_cpu, config = jax.default_backend() == "cpu", workload.run_config(budget)
     rows: list[Row] = []
     with contextlib.ExitStack() as stack:
-        directory = stack.enter_context(tempfile.TemporaryDirectory(prefix="gvz-benchmark-"))
-        parts = assemble(config, workload.work_directory(directory))
+        parts = stack.enter_context(workload.assembled(config))
         learner = workload.Learner(config, parts)
-        scans = (
-            (default_num_updates(learner.sizes.config),) if on_cpu else (default_num_updates(learner.sizes.config), 64)
-        )
+        scans = (default_num_updates(learner.sizes.config), *(() if on_cpu else (64,)))
         bodies: dict[str, Callable[[], float]] = {
             f"learner, {scan} to a call": partial(learner.updates_per_s, scan, budget.body_s) for scan in scans
         }

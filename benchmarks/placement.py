@@ -6,7 +6,6 @@ above 1 says that pinned is faster.
 """
 
 import dataclasses
-import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
@@ -28,15 +27,13 @@ FREE_AND_PINNED: "tuple[PlacementKind, PlacementKind]" = ("free", "pinned")
 def measure(budget: Budget) -> list[Row]:
     """Decisions per second by placement and number of actors; beside the learner, also its gradient steps."""
     from actors.placement import actor_cores
-    from gvz.run.assemble import assemble
     from gvz.run.config_files import load_config
 
     config = workload.run_config(budget) if budget.quick else load_config("rainbow_quick.py")
     config = dataclasses.replace(config, actors=dataclasses.replace(config.actors, num_actors=1, games_per_actor=GAMES))
     numbers = (1,) if budget.quick else (1, 2, 4)
     updates: dict[str, list[float]] = {}
-    with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
-        parts = assemble(config, workload.work_directory(directory))
+    with workload.assembled(config) as parts:
         learner = workload.Learner(config, parts)
 
         def pool(kind: "PlacementKind", num_actors: int) -> "PoolConfig":

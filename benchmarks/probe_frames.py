@@ -12,6 +12,7 @@ import numpy as np
 from actors.preprocess import push_frame
 from gvz.core.cache import cache_directory
 from gvz.core.env_config import EnvConfig
+from gvz.core.files import written_whole
 from gvz.env import DoomEnv
 from gvz.evaluation.play import play_episode
 from gvz.evaluation.players import ScriptedPlayer
@@ -63,9 +64,8 @@ def task_frames(task: Task, env: EnvConfig, stack_size: int, num_frames: int) ->
             play_episode(game, player, len(found), BASE_SEED)
             found.append(joined(player.kept) | {"episodes": np.full(len(player.kept), len(found))})
     frames = chosen(joined(found), np.arange(num_frames))
-    file.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(temporary := file.with_suffix(".new.npz"), allow_pickle=False, **frames)
-    temporary.replace(file)
+    with written_whole(file) as writing:
+        np.savez(writing, allow_pickle=False, **frames)
     return frames
 
 

@@ -8,13 +8,15 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 Row = dict[str, Any]
 Spread = dict[str, Any]
 """median, min and max of a quantity over the rounds, and its `values`, one per round"""
+K = TypeVar("K")
+V = TypeVar("V")
 FRAME_SKIP = 4
 """of everybody who plays"""
 
@@ -37,11 +39,9 @@ FULL = Budget(rounds=5, body_s=2.5, quick=False, peers=Path(".venv-peers/bin/pyt
 QUICK = Budget(rounds=1, body_s=0.3, quick=True, peers=Path(".venv-peers/bin/python"))
 
 
-def alternate(
-    rounds: int, bodies: Mapping[str, Callable[[], float]], *, warm_up: bool = True
-) -> dict[str, list[float]]:
+def alternate(rounds: int, bodies: Mapping[K, Callable[[], V]], *, warm_up: bool = True) -> dict[K, list[V]]:
     """Runs A, B, C, A, B, C, ... and returns one value of each body per round; the warm-up round is discarded."""
-    values: dict[str, list[float]] = {name: [] for name in bodies}
+    values: dict[K, list[V]] = {name: [] for name in bodies}
     for number in range(-int(warm_up), rounds):
         for name, body in bodies.items():
             value = body()

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 import traceback
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import ModuleType
 
@@ -79,9 +79,9 @@ def run(name: str, budget: Budget, command: str, out: Path, *, timeout_s: float 
     Returns:
         What went wrong, or nothing.
     """
-    arguments = {"budget": _plain(budget), "command": command, "out": str(out.absolute())}
+    arguments = {"budget": asdict(budget), "command": command, "out": out.absolute()}
     process = subprocess.Popen(
-        [sys.executable, "-m", "benchmarks.runner", name, json.dumps(arguments)],
+        [sys.executable, "-m", "benchmarks.runner", name, json.dumps(arguments, default=str)],
         cwd=record.ROOT,
         # a run that a benchmark starts needs room on the GPU beside it
         env={"XLA_PYTHON_CLIENT_PREALLOCATE": "false", **record.environment()},
@@ -107,10 +107,6 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     janitor.clean_dead_instances()
-
-
-def _plain(budget: Budget) -> dict[str, object]:
-    return {"rounds": budget.rounds, "body_s": budget.body_s, "quick": budget.quick, "peers": str(budget.peers)}
 
 
 def main() -> int:

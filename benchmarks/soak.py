@@ -146,8 +146,7 @@ class Watched:
 
 def soak(options: Soak, console: Console) -> dict[str, Any]:
     """Runs the whole soak; returns the record."""
-    started = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
-    hardware, commit = machine.hardware(), record.describe_commit()
+    head = about("soak", options)
     with tempfile.TemporaryDirectory(prefix="gvz-soak-") as directory:
         run = Watched(Path(directory) / "run", options.flags, record.environment())
         samples: list[dict[str, float]] = []
@@ -177,13 +176,7 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
         for stretch in stretches:
             stretch["updates_per_s"] = _rate(rows, begin, stretch)
         return {
-            "schema": SCHEMA,
-            "date": started,
-            "commit": commit,
-            "command": shlex.join(["python", "-m", "benchmarks.soak", *words_of(options)]),
-            "machine": hardware,
-            "versions": machine.versions(),
-            "settings": {**asdict(options), "out": None, "flags": list(options.flags)},
+            **head,
             "kills": kills,
             "stretches": [{k: v if k == "kind" else round(v, 3) for k, v in s.items()} for s in stretches],
             "samples": {name: [sample[name] for sample in samples] for name in samples[0]},
@@ -264,13 +257,24 @@ def _rate(rows: Sequence[dict[str, Any]], begin: float, stretch: dict[str, Any])
     return (mine[-1]["num_updates"] - mine[0]["num_updates"]) / (mine[-1]["time_s"] - mine[0]["time_s"])
 
 
-def words_of(options: Any) -> list[str]:
-    """The options of a soak, a dataclass, without default values, as words of the command line."""
+def about(name: str, options: Any, packages: Sequence[str] = machine.PACKAGES) -> dict[str, Any]:
+    """The head of the record of a soak that begins now. Of the options, a dataclass, the command has what is not as by
+    default.
+    """
     default, words = type(options)(), list[str]()
-    for name, value in asdict(options).items():
-        if name not in ("out", "flags") and value != getattr(default, name):
-            words += [f"--{name.replace('_', '-')}", f"{value:g}"]
-    return [*words, *(["--", *options.flags] if options.flags else [])]
+    for option, value in asdict(options).items():
+        if option not in ("out", "flags") and value != getattr(default, option):
+            words += [f"--{option.replace('_', '-')}", f"{value:g}"]
+    words += ["--", *options.flags] if options.flags else []
+    return {
+        "schema": SCHEMA,
+        "date": time.strftime("%Y-%m-%d %H:%M", time.gmtime()),
+        "commit": record.describe_commit(),
+        "command": shlex.join(["python", "-m", f"benchmarks.{name}", *words]),
+        "machine": machine.hardware(),
+        "versions": machine.versions(packages),
+        "settings": {**asdict(options), "out": None, "flags": list(options.flags)},
+    }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -35,7 +35,7 @@ def measure(budget: Budget) -> list[Row]:
                 "launch": partial(_help_s, *_LAUNCH),
                 "gvz": partial(_help_s, _GVZ),
                 "episode": lambda: _first_episode_s(Path(directory) / f"run_{next(counter)}", budget),
-                "actor": lambda: _actor_start_s(Path(directory) / "actor", budget),
+                "actor": lambda: _actor_start_s(budget),
             },
             warm_up=not budget.quick,
         )
@@ -81,15 +81,11 @@ def _first_episode_s(directory: Path, budget: Budget) -> float:
         end_run(process)
 
 
-def _actor_start_s(directory: Path, budget: Budget) -> float:
+def _actor_start_s(budget: Budget) -> float:
     """Processor seconds of one actor and its engines until it is ready to play."""
-    from gvz.run.assemble import assemble
-
-    parts = assemble(workload.run_config(budget), directory)
-    before = workload.processor_s()
-    with workload.playing(
-        msgspec.structs.replace(parts.pool_config, num_actors=1, cores=()),
-        np.zeros(parts.pool_config.num_params, np.float32),
-    ):
-        after = workload.processor_s()
+    with workload.assembled(workload.run_config(budget)) as parts:
+        alone = msgspec.structs.replace(parts.pool_config, num_actors=1, cores=())
+        before = workload.processor_s()
+        with workload.playing(alone, np.zeros(alone.num_params, np.float32)):
+            after = workload.processor_s()
     return sum(after[where] - before[where] for where in ("Python", "engines"))

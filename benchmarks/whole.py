@@ -38,16 +38,13 @@ def measure(budget: Budget) -> list[Row]:
     """Alternates the run, the learner alone and the actors alone."""
     import jax
 
-    from gvz.run.assemble import assemble
-
     config = workload.four_task_config(budget)
     num_runs, updates, period = (1, 400, 100) if budget.quick else (3, _MEASURED_UPDATES, _LOG_PERIOD_UPDATES)
     memory_period_s, processor_period_s = (
         (_QUICK_PERIOD_S, _QUICK_PERIOD_S) if budget.quick else (_MEMORY_PERIOD_S, _PROCESSOR_PERIOD_S)
     )
     body_s = 4 * budget.body_s
-    with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
-        parts = assemble(config, workload.work_directory(directory))
+    with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory, workload.assembled(config) as parts:
         firsts, runs, learner_alone, actors_alone = [], [], [], []
         costs: defaultdict[str, list[float]] = defaultdict(list)
         for number in range(num_runs):

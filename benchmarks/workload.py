@@ -5,6 +5,7 @@ All sizes are those of `rainbow_4task`, on one task, so that peers with a single
 
 import contextlib
 import dataclasses
+import tempfile
 import time
 from collections.abc import Callable, Generator, Mapping
 from functools import partial
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from actors.process_pool import ProcessPool
     from gvz.run.assemble import RunParts
     from gvz.run.config import RunConfig
+    from gvz.run.config_files import Settings
     from learner.agents.base import Agent
     from learner.replay import ReplaySpec, ReplayState
 
@@ -35,44 +37,36 @@ _SETTLE_S = 0.3
 """seconds played before the clock starts, so that records waiting in full rings are not counted"""
 
 
-QUICK: dict[str, dict[str, Any]] = {
-    "agent": {
-        "conv_channels": (4,),
-        "conv_kernels": (8,),
-        "conv_strides": (8,),
-        "hidden_units": 8,
-        "dueling": False,
-        "distributional": False,
-        "noisy": "off",
-    },
-    "replay": {"capacity": 2_000},
-    "learner": {"warmup_steps": 100, "batch_size": 8, "env_steps_per_update": 1.0},
-    "actors": {"num_actors": 1, "games_per_actor": 4},
+QUICK: "Settings" = {
+    "agent.conv_channels": (4,),
+    "agent.conv_kernels": (8,),
+    "agent.conv_strides": (8,),
+    "agent.hidden_units": 8,
+    "agent.dueling": False,
+    "agent.distributional": False,
+    "agent.noisy": "off",
+    "replay.capacity": 2_000,
+    "learner.warmup_steps": 100,
+    "learner.batch_size": 8,
+    "learner.env_steps_per_update": 1.0,
+    "actors.num_actors": 1,
+    "actors.games_per_actor": 4,
 }
 """changes of `rainbow_4task` in a quick run, mainly of parts that XLA compiles slowly"""
 
 
 def four_task_config(budget: Budget) -> "RunConfig":
     """`rainbow_4task`; a quick run has the smallest network and replay."""
-    from gvz.run.config_files import load_config
+    from gvz.run.config_files import load_config, with_settings
 
-    config = load_config("rainbow_4task.py")
-    changes = QUICK if budget.quick else {}
-    groups = {group: dataclasses.replace(getattr(config, group), **fields) for group, fields in changes.items()}
-    return dataclasses.replace(config, **groups)
+    return with_settings(load_config("rainbow_4task"), QUICK if budget.quick else {})
 
 
-def quick_flags(budget: Budget) -> list[str]:
+def quick_flags(budget: Budget) -> tuple[str, ...]:
     """QUICK as words of the command line; none if the budget is full."""
-    words = []
-    for group, fields in QUICK.items() if budget.quick else ():
-        for name, value in fields.items():
-            flag = name.replace("_", "-")
-            if isinstance(value, bool):
-                words.append(f"--{group}.{'' if value else 'no-'}{flag}")
-            else:
-                words += [f"--{group}.{flag}", *map(str, value if isinstance(value, tuple) else (value,))]
-    return words
+    from gvz.run.config_files import settings_flags
+
+    return settings_flags(QUICK) if budget.quick else ()
 
 
 def run_config(budget: Budget) -> "RunConfig":
@@ -83,6 +77,15 @@ def run_config(budget: Budget) -> "RunConfig":
 def random_players(config: "PoolConfig", **changes: Any) -> "PoolConfig":
     """The same pool without a network: uniformly random actions."""
     return msgspec.structs.replace(config, policy=b"", num_params=0, layout_hash=0, **changes)
+
+
+@contextlib.contextmanager
+def assembled(config: "RunConfig") -> "Generator[RunParts]":
+    """The parts of a run. Its actors log to a directory that goes with the block."""
+    from gvz.run.assemble import assemble
+
+    with tempfile.TemporaryDirectory(prefix="gvz-benchmark-") as directory:
+        yield assemble(config, Path(directory) / "work")
 
 
 @contextlib.contextmanager
@@ -155,11 +158,6 @@ def processor_s(pid: int | None = None) -> dict[str, float]:
             if process is not root:  # an actor, which may have ended engines and started others
                 seconds["engines"] += times.children_user + times.children_system
     return seconds
-
-
-def work_directory(directory: str) -> Path:
-    """Where actors log, below a temporary directory."""
-    return Path(directory) / "work"
 
 
 def filled_replay(spec: "ReplaySpec") -> "ReplayState":

@@ -88,7 +88,7 @@ def train_segmentation(
     class_weights: np.ndarray,
     key: PRNGKeyArray,
     share_done: Callable[[int, float], float],
-) -> Params:
+) -> tuple[Params, int, float]:
     """Trains a network by Adam, whose step is `learning_rate`.
 
     Args:
@@ -98,7 +98,10 @@ def train_segmentation(
         share_done: (gradient steps, last loss) -> how much of the training is done; it ends at 1.
 
     Returns:
-        The parameters.
+        The parameters, the gradient steps and the last loss.
+
+    Raises:
+        ValueError: the batches ended before the training.
     """
     network, weights = SegmentationNetwork(len(class_weights)), jnp.asarray(class_weights)
     optimizer = optax.inject_hyperparams(optax.adam)(learning_rate=_LEARNING_RATE)
@@ -119,9 +122,9 @@ def train_segmentation(
             params = network.init(key, normalized(jnp.asarray(screens)))
             state = optimizer.init(params)
         if (done := share_done(num_steps, float(last))) >= 1.0:
-            return params
+            return params, num_steps, float(last)
         params, state, last = step(params, state, screens, labels, np.float32(learning_rate(num_steps, done)))
-    return params
+    raise ValueError("batches: they ended before the training did")
 
 
 def write_onnx(params: Params, file: Path, height: int, width: int) -> None:

@@ -9,12 +9,14 @@ import os
 import shutil
 import signal
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+from gvz import cli
 from gvz.core import janitor, records
 from gvz.core.errors import GvzError
 from tests.learner import seeds
@@ -62,6 +64,21 @@ def _clean_up() -> None:
     janitor.clean_dead_instances()
     shutil.rmtree(_DIRECTORY, ignore_errors=True)
     _LOCK.close()
+
+
+@pytest.fixture
+def refusal(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """What a command of gvz says to bad input: one line on standard error, and exit code 2."""
+
+    def refusal(*arguments: str) -> str:
+        assert cli.main(list(arguments)) == 2
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert err.startswith("error: ")
+        assert err.count("\n") == 1
+        return err
+
+    return refusal
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -43,29 +43,23 @@ def test_a_crash_truncates_the_episode_and_the_next_one_is_whole():
     env.close()
 
 
-def test_an_engine_that_died_between_episodes_is_replaced():
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda engine: engine.kill(), "crash"),
+        (lambda engine: shutil.rmtree(engine.log.parent), "No such file"),  # as programs do that clean /tmp up
+    ],
+    ids=["killed", "without its files"],
+)
+def test_an_engine_that_cannot_begin_an_episode_is_replaced(damage, said):
     env = DoomEnv("defend_the_center/default")
     whole = fingerprint(env, 7)
-    assert env._engine is not None
-    env._engine.kill()
+    damage(env._engine)
     _, info = env.reset(options={"episode_seed": 7})
     assert info["engine_crash"] is True
-    assert "crash" in info["engine_error"]
+    assert said in info["engine_error"]
     assert fingerprint(env, 7) == whole
     assert env.reset()[1]["engine_crash"] is False
-    env.close()
-
-
-def test_an_engine_whose_files_were_removed_is_replaced():
-    """As programs do that clean /tmp up."""
-    env = DoomEnv("defend_the_center/default")
-    whole = fingerprint(env, 7)
-    assert env._engine is not None
-    shutil.rmtree(env._engine.log.parent)
-    _, info = env.reset(options={"episode_seed": 7})
-    assert info["engine_crash"] is True
-    assert "No such file" in info["engine_error"]
-    assert fingerprint(env, 7) == whole
     env.close()
 
 

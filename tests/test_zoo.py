@@ -72,14 +72,12 @@ def test_the_card_of_a_policy_has_its_tasks_and_scores(tmp_path, monkeypatch, ca
             assert f"  {task.id}\n" in card
 
 
-def test_a_name_that_is_no_policy_is_told(capsys):
-    assert cli.main(["zoo", "seek_and_kil"]) == 2
-    assert "zoo:seek_and_kil: no such policy (did you mean 'seek_and_kill'?)" in capsys.readouterr().err
+def test_a_name_that_is_no_policy_is_told(refusal):
+    assert "zoo:seek_and_kil: no such policy (did you mean 'seek_and_kill'?)" in refusal("zoo", "seek_and_kil")
 
 
-def test_a_policy_is_added_by_one_name_alone(capsys):
-    assert cli.main(["zoo", "mine", "--add", "runs/mine", "--name", "mine"]) == 2
-    assert "zoo: got mine beside --add" in capsys.readouterr().err
+def test_a_policy_is_added_by_one_name_alone(refusal):
+    assert "zoo: got mine beside --add" in refusal("zoo", "mine", "--add", "runs/mine", "--name", "mine")
 
 
 def test_the_findings_say_what_the_agent_with_shifted_frames_has(tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ import tyro
 from gvz.core.control_groups import num_cores
 from gvz.core.env_config import EnvConfig, Profile
 from gvz.core.errors import EXIT_INTERRUPTED, ConfigError
-from gvz.core.registry import OwnFiles
+from gvz.core.registry import NO_OWN_FILES, OwnFiles
 from gvz.core.stop import StopRequest, say
 from gvz.evaluation.selection import ALL_TASKS, TaskSelection
 from gvz.evaluation.simple import SimplePlayerName
@@ -43,10 +43,7 @@ class Evaluate:
     player: SimplePlayerName | None = None
     """random: uniformly random buttons; idle: presses nothing; sweep: a fixed sequence of buttons; scripted: the
     scenario's simple script, which gets names and places of what is in sight"""
-    agent: Path | None = None
-    """the Python file of the run's agent, if it is in a file of its own: playing executes it"""
-    encoder: Path | None = None
-    """likewise, of its encoder"""
+    own_files: Annotated[OwnFiles, tyro.conf.arg(name="")] = NO_OWN_FILES
     checkpoints: tuple[str, ...] = ("newest",)
     """which of a run's policies: newest, all, last5 (or another number), or numbers of gradient steps"""
     select: Annotated[TaskSelection, tyro.conf.arg(name="")] = ALL_TASKS
@@ -80,7 +77,7 @@ class Evaluate:
                     if out not in files:
                         files[out] = RecordFile(out)
                     held[player_spec] = files[out]
-                    jobs += missing_jobs({player_spec: files[out]}, wanted_episodes(tasks, self.episodes, self.seeds))
+                    jobs += missing_jobs(player_spec, files[out], wanted_episodes(tasks, self.episodes, self.seeds))
                 _show_progress(play_and_record(held, jobs, num_workers=workers, stop=stop), len(jobs))
             for player_spec, (tasks, _) in player_specs.items():
                 self._print_scores(player_spec, tasks, held[player_spec].rows)
@@ -97,7 +94,8 @@ class Evaluate:
             raise ConfigError(f"evaluate: got --player {self.player} and also {self.run_dirs[0]}, want one of them")
         if self.player is None and not self.run_dirs:
             raise ConfigError("evaluate: want --player or run directories (before --tasks, which takes what follows)")
-        of_runs = {"--agent": self.agent, "--encoder": self.encoder, "--checkpoints": self.checkpoints != ("newest",)}
+        agent, encoder = self.own_files
+        of_runs = {"--agent": agent, "--encoder": encoder, "--checkpoints": self.checkpoints != ("newest",)}
         if self.player is not None and (given := [flag for flag, value in of_runs.items() if value]):
             raise ConfigError(f"{given[0]}: got it beside --player {self.player}, want it with run directories alone")
         if not self.checkpoints:
@@ -126,7 +124,7 @@ class Evaluate:
             return {simple_player(self.player, env): (self.select.resolve(), out)}
         found = {}
         for run_dir in dict.fromkeys(map(run_directory, self.run_dirs)):
-            config = read_run_config(run_dir, OwnFiles(self.agent, self.encoder))
+            config = read_run_config(run_dir, self.own_files)
             tasks = self.select.of_run([scenario.id for scenario in config.table.scenarios])
             check_tasks(config, tasks)
             check_profile(config, self.profile)
@@ -136,12 +134,13 @@ class Evaluate:
         return found
 
     def _print_scores(self, player_spec: "PlayerSpec", tasks: Sequence[Task], rows: "Sequence[Row]") -> None:
+        from gvz.evaluation.episode_log import rows_of
         from gvz.evaluation.table import score_lines, score_rows
 
-        player = player_spec.identity["player"]
+        player, mine = player_spec.identity["player"], rows_of(player_spec, rows)
         for base_seed in self.seeds:
-            chosen = [row for row in rows if row.get("base_seed", 0) == base_seed]
-            found = score_rows(chosen, player_spec.identity, tasks, self.episodes)
+            chosen = [row for one, row in mine.items() if one.base_seed == base_seed and one.episode < self.episodes]
+            found = score_rows(chosen, tasks)
             if self.json:
                 for one in found:
                     print(json.dumps({"player": player, "base_seed": base_seed, **one}))

@@ -87,7 +87,7 @@ class TrainSegmenter:
 
         tasks = segmentation.training_tasks(self.scenario, self.training_set)
         of_machine = machine.describe()  # with the commit of the code that is loaded now
-        begun_s, steps, loss = machine.processor_s(), 0, 0.0
+        begun_s = machine.processor_s()
         with contextlib.ExitStack() as until_trained, Bars(line_period_s=10.0) as bars:
             unfinished = until_trained.enter_context(written_whole(self.out))
 
@@ -115,9 +115,8 @@ class TrainSegmenter:
 
             spent_s = 0.0
 
-            def share_done(num_steps: int, last_loss: float) -> float:
-                nonlocal steps, loss, spent_s
-                steps, loss = num_steps, last_loss
+            def share_done(num_steps: int, loss: float) -> float:
+                nonlocal spent_s
                 if num_steps % _LOOK_PERIOD_STEPS == 0:
                     spent_s = machine.processor_s() - begun_s
                     text = f"processor seconds, gradient step {num_steps:,}, loss {loss:.3f}"
@@ -125,7 +124,7 @@ class TrainSegmenter:
                 return spent_s / self.processor_s
 
             weights, key = segmentation.CLASS_WEIGHTS, jax.random.key(self.seed)
-            params = train_segmentation(batches, weights, key, share_done)
+            params, steps, loss = train_segmentation(batches, weights, key, share_done)
             spent_s = machine.processor_s() - begun_s
             if steps == 0:
                 raise ConfigError(

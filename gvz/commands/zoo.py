@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import tyro
 
 from gvz.core.errors import ConfigError, GvzError
-from gvz.core.registry import OwnFiles
+from gvz.core.registry import NO_OWN_FILES, OwnFiles
 from gvz.evaluation.zoo import PREFIX, pack, run_directory, score_card, zoo_names
 from gvz.run.rundir import EVALUATION_RECORDS
 
@@ -41,14 +41,10 @@ class Zoo:
     """take the place of another policy of that name"""
     checkpoint: str = "newest"
     """which of the run's policies is added: gradient steps, or newest"""
-    agent: Path | None = None
-    """the Python file of the agent, of the run or of policies, if it is in a file of its own: it is executed"""
-    encoder: Path | None = None
-    """likewise, of its encoder"""
+    own_files: Annotated[OwnFiles, tyro.conf.arg(name="")] = NO_OWN_FILES
 
     def run(self) -> int:
         """Prints the policies, or what was added. A list says of a policy that cannot be read why."""
-        own_files = OwnFiles(self.agent, self.encoder)
         if (self.add is None) != (self.name is None):
             raise ConfigError("zoo: want --add and --name together")
         if self.add is None and (self.replace or self.checkpoint != "newest"):
@@ -58,14 +54,14 @@ class Zoo:
                 raise ConfigError(f"zoo: got {' '.join(self.names)} beside --add; the policy's name is that of --name")
             if self.name in zoo_names() and not self.replace and str(self.add) != f"{PREFIX}{self.name}":
                 raise ConfigError(f"--name: the zoo has a policy {self.name} already; give another name, or --replace")
-            packed = pack(run_directory(self.add), self.name, self.checkpoint, own_files)
+            packed = pack(run_directory(self.add), self.name, self.checkpoint, self.own_files)
             print(f"{packed.file}: {packed.num_updates:,} updates, {packed.num_bytes:,} bytes")
             if not packed.num_episodes:
                 print(f"no score card yet: gvz evaluate {PREFIX}{self.name}, then add {PREFIX}{self.name} again")
         elif self.names:
-            print("\n\n".join(_card(_read(name.removeprefix(PREFIX), own_files)) for name in self.names))
+            print("\n\n".join(_card(_read(name.removeprefix(PREFIX), self.own_files)) for name in self.names))
         elif known := zoo_names():
-            print(_table({name: _read_or_why_not(name, own_files) for name in known}))
+            print(_table({name: _read_or_why_not(name, self.own_files) for name in known}))
         else:
             print("the zoo is empty")
         return 0
@@ -106,7 +102,7 @@ def _read(name: str, own_files: OwnFiles) -> _Policy:
     rows = score_card(records.read_stored(directory / EVALUATION_RECORDS)[0])
     metrics, _ = records.read_stored(directory / "metrics.jsonl")
     tasks = TaskSelection(split="test").of_run([scenario.id for scenario in config.table.scenarios])
-    scores = score_rows(rows, {}, tasks, episodes=10**9)
+    scores = score_rows(rows, tasks)
     spent_s = metrics[-1].get("run/processor_s") if metrics else None
     return _Policy(name, config, num_updates, spent_s, len(tasks), scores)
 

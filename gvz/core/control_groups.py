@@ -7,37 +7,30 @@ import random
 from collections.abc import Generator
 from pathlib import Path
 
-MOUNTED = Path("/sys/fs/cgroup")
+MOUNTED, LISTED = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+"""where the control groups are mounted, and the file that lists those of this process"""
 
 
-def own_groups(controller: str, mounted: Path = MOUNTED, listed: str | None = None) -> Generator[Path]:
+def own_groups(controller: str) -> Generator[Path]:
     """Directories of the control groups that this process is in, some of which may not exist.
 
     Args:
         controller: what is limited, such as `cpu` or `memory`.
-        mounted: where the control groups are mounted.
-        listed: the text of /proc/self/cgroup; by default it is read.
     """
-    if listed is None:
-        file = Path("/proc/self/cgroup")
-        listed = file.read_text() if file.exists() else ""
-    for line in listed.splitlines():
+    for line in LISTED.read_text().splitlines() if LISTED.exists() else ():
         _, controllers, path = line.split(":", 2)
         if not controllers or controller in controllers.split(","):
-            top = mounted / controllers  # in a container, it is that of the container
+            top = MOUNTED / controllers  # in a container, it is that of the container
             own = Path(path.strip("/"))
             yield from (top / own, *(top / parent for parent in own.parents))
 
 
-def num_cores(mounted: Path = MOUNTED, listed: str | None = None) -> int:
+def num_cores() -> int:
     """Cores that this process can keep busy: those it may use, or fewer where a container or batch job has a quota of
     processor time (`docker run --cpus`, Kubernetes' limits). A part of a core counts as one.
-
-    Args:
-        mounted, listed: as for `own_groups`.
     """
     found = [len(os.sched_getaffinity(0))]
-    for group in own_groups("cpu", mounted, listed):
+    for group in own_groups("cpu"):
         with contextlib.suppress(OSError, ValueError):  # it has no quota, or another container has it
             found.append(_quota_in(group))
     return min(found)

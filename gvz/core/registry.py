@@ -19,7 +19,9 @@ class OwnFiles(NamedTuple):
     """Python files outside the package that a run is made of. They are executed, so only the user names them."""
 
     agent: Path | None = None
+    """the Python file of a run's agent, if it is in a file of its own: it is executed"""
     encoder: Path | None = None
+    """likewise, of its encoder"""
 
 
 NO_OWN_FILES = OwnFiles()

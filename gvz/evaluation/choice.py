@@ -9,7 +9,7 @@ import tyro
 
 from gvz.core.env_config import EnvConfig, Profile
 from gvz.core.errors import ConfigError
-from gvz.core.registry import OwnFiles
+from gvz.core.registry import NO_OWN_FILES, OwnFiles
 from gvz.evaluation.simple import SimplePlayerName
 from gvz.scenarios.base import Task
 from gvz.tasks import parse_task
@@ -29,10 +29,7 @@ class EpisodeChoice:
     """a run directory, or zoo:NAME (see gvz zoo): its policy plays greedily, noise off"""
     player: SimplePlayerName | None = None
     """instead: random, idle, sweep (a fixed sequence of buttons), or the scenario's simple script"""
-    agent: Path | None = None
-    """the Python file of the run's agent, if it is in a file of its own: playing executes it"""
-    encoder: Path | None = None
-    """likewise, of its encoder"""
+    own_files: Annotated[OwnFiles, tyro.conf.arg(name="")] = NO_OWN_FILES
     checkpoint: str = "newest"
     """which of the run's policies: gradient steps, or newest"""
     task: str | None = None
@@ -64,7 +61,8 @@ class EpisodeChoice:
             raise ConfigError(f"got --player {self.player} and also {self.run_dir}, want one of them")
         if self.player is None and self.run_dir is None:
             raise ConfigError("want a run directory or --player")
-        of_runs = {"--agent": self.agent, "--encoder": self.encoder, "--checkpoint": self.checkpoint != "newest"}
+        agent, encoder = self.own_files
+        of_runs = {"--agent": agent, "--encoder": encoder, "--checkpoint": self.checkpoint != "newest"}
         if self.player is not None and (given := [flag for flag, value in of_runs.items() if value]):
             raise ConfigError(f"{given[0]}: got it beside --player {self.player}, want it with a run directory alone")
         for name, value in (("episode", self.episode), ("seed", self.seed)):
@@ -76,7 +74,7 @@ class EpisodeChoice:
                 raise ConfigError("--task: want a task id, for example defend_the_center/gore (gvz tasks lists them)")
             return simple_player(self.player, EnvConfig(profile=self.profile or "thesis")), parse_task(self.task)
         run_dir = run_directory(self.run_dir)
-        config = read_run_config(run_dir, OwnFiles(self.agent, self.encoder))
+        config = read_run_config(run_dir, self.own_files)
         task = config.table.tasks[0] if self.task is None else parse_task(self.task)
         check_tasks(config, [task])
         check_profile(config, self.profile)

@@ -129,7 +129,8 @@ def collect_evaluations(paths: Iterable[Path | str]) -> tuple[pl.DataFrame, list
     together, homeless = _at_home(together.filter(~(outside & seen_before)))
     problems += homeless
     unlike = together.filter(pl.col("params").is_null()).group_by("run_dir", *_IDENTITY, maintain_order=True)
-    for player, num_episodes in _sizes(unlike.agg(_NUM_RESULTS)):
+    unlike = unlike.agg(num_results=_NUM_RESULTS).filter(pl.col("num_results") > 1)
+    for player, num_episodes in unlike.group_by("player", maintain_order=True).len().iter_rows():
         problems.append(
             f"{player}: {num_episodes} of its episodes were found with several results, of which the first is kept; "
             "two players have this name, or two versions of one; give each a name of its own"
@@ -172,12 +173,6 @@ def _at_home(rows: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
         trained_on=pl.when(found).then("their_tasks").otherwise("trained_on"),
     )
     return rows.drop("home", "their_tasks"), problems
-
-
-def _sizes(found: pl.DataFrame) -> list[tuple[str, int]]:
-    """Each player with its number of episodes that have several results."""
-    several = found.filter(pl.col("score") > 1).group_by("player", maintain_order=True).len()
-    return [(player, count) for player, count in several.iter_rows()]
 
 
 def _is_of_run(file: Path) -> bool:

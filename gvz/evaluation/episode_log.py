@@ -114,14 +114,10 @@ class RecordFile(records.Writer):
 
 
 def missing_jobs(
-    player_specs: Mapping[PlayerSpec, RecordFile], episodes: Sequence[Episode]
+    player_spec: PlayerSpec, file: RecordFile, episodes: Iterable[Episode]
 ) -> list[tuple[PlayerSpec, Episode]]:
-    """What of `episodes` each player_spec's file does not hold yet."""
-    return [
-        (player_spec, episode)
-        for player_spec, file in player_specs.items()
-        for episode in dict.fromkeys(episodes).keys() - rows_of(player_spec, file.rows).keys()
-    ]
+    """What of `episodes` the player's file does not hold yet."""
+    return [(player_spec, episode) for episode in set(episodes) - rows_of(player_spec, file.rows).keys()]
 
 
 def play_and_record(
@@ -192,7 +188,7 @@ def evaluate_player(
     parsed = [parse_task(id_for_processes(task)) for task in tasks]
     wanted = wanted_episodes(parsed, episodes, [base_seed])
     with contextlib.closing(RecordFile(Path(out))) as file:
-        jobs, num_wanted = missing_jobs({player_spec: file}, wanted), len(set(wanted))
+        jobs, num_wanted = missing_jobs(player_spec, file, wanted), len(set(wanted))
         if held := num_wanted - len(jobs):
             note = f"{out}: holds {held} of these {num_wanted} episodes of {name!r}, which are not played again"
             print(f"{note}; another player needs another name", file=sys.stderr)

@@ -48,20 +48,13 @@ _BACKGROUND = (24, 24, 24)
 
 
 def task_frame(task: Task) -> np.ndarray:
-    """What the agent sees in a task at its map's moment: uint8[FRAME_HEIGHT, FRAME_WIDTH, 3]."""
-    return task_sight(task)[0]
-
-
-def task_sight(task: Task) -> tuple[np.ndarray, dict[str, int]]:
-    """What the agent sees in a task at its map's moment.
-
-    Returns: the screen, uint8[FRAME_HEIGHT, FRAME_WIDTH, 3]; and the pixels that each class of things takes of it.
+    """What the agent sees in a task at its map's moment: uint8[FRAME_HEIGHT, FRAME_WIDTH, 3].
 
     Raises:
         EngineError: the engine failed.
     """
     with closing(_engine(compiled := compile_task(task))) as engine:
-        return _sight(engine, _moment(task), compiled.map_of(0)[0])
+        return _frame(engine, _moment(task), compiled.map_of(0)[0])
 
 
 def _moment(task: Task) -> Moment:
@@ -81,27 +74,20 @@ def _engine(compiled: CompiledTask) -> Engine:
             width=FRAME_WIDTH,
             height=FRAME_HEIGHT,
             render_weapon=compiled.task.scenario.render_weapon,
-            labels=True,
             start_tic=10,
         )
     )
 
 
-def _sight(engine: Engine, moment: Moment, map_wad: bytes | None) -> tuple[np.ndarray, dict[str, int]]:
-    """As `task_sight`."""
+def _frame(engine: Engine, moment: Moment, map_wad: bytes | None) -> np.ndarray:
+    """The screen at the moment: uint8[FRAME_HEIGHT, FRAME_WIDTH, 3]."""
     engine.new_episode(moment.seed, map_wad)
     engine.advance([0], moment.tics)
     if (pose := moment.pose) is not None:
         engine.command(f"warp {pose.x:g} {pose.y:g}")
         engine.advance([engine.variables()[0] - pose.angle], 1)
         engine.advance([0], 1)
-    state = engine.state()
-    assert state is not None, "the agent lives"
-    assert state.labels is not None
-    pixels = dict.fromkeys((label.object_name for label in state.labels), 0)
-    for label in state.labels:
-        pixels[label.object_name] += int(np.count_nonzero(state.labels_buffer == label.value))
-    return engine.screen.copy(), pixels
+    return engine.screen.copy()
 
 
 def contact_sheet(scenario: Scenario) -> Image.Image:
@@ -115,7 +101,7 @@ def varied_sheet(scenario: Scenario) -> Image.Image:
     task = Task(scenario, maps=MapSet("varied", NUM_VARIED))
     compiled, moment = compile_task(task), _moment(task)
     with closing(_engine(compiled)) as engine:
-        frames = [_sight(engine, moment, compiled.map_of(n)[0])[0] for n in range(NUM_VARIED)]
+        frames = [_frame(engine, moment, compiled.map_of(n)[0]) for n in range(NUM_VARIED)]
     return tiled([(frame, f"map {n}", 0) for n, frame in enumerate(frames)], COLUMNS)
 
 
@@ -125,7 +111,7 @@ def procedural_sheet(scenario: Scenario) -> Image.Image:
     compiled, cells = compile_task(task), []
     with closing(_engine(compiled)) as engine:
         for n in range(NUM_PROCEDURAL):
-            frame, _ = _sight(engine, Moment(seed=n, tics=1), compiled.map_of(n)[0])
+            frame = _frame(engine, Moment(seed=n, tics=1), compiled.map_of(n)[0])
             plan = map_plan(parse_textmap(map_source(task, "thesis", NUMBERS["train"][n]).textmap))
             frame[: len(plan), FRAME_WIDTH - plan.shape[1] :] = plan
             cells.append((frame, f"map {NUMBERS['train'][n]}", 0))

@@ -10,26 +10,18 @@ from gvz.evaluation.statistics import bootstrap, normalize
 from gvz.tasks import Task
 
 
-def score_rows(
-    rows: Sequence[Row], identity: Mapping[str, Any], tasks: Sequence[Task], episodes: int
-) -> list[dict[str, Any]]:
+def score_rows(rows: Sequence[Row], tasks: Sequence[Task]) -> list[dict[str, Any]]:
     """The score of each task that was played; then, of more than one, the mean over tasks.
 
     Args:
-        rows: of a record file.
-        identity: the rows that belong to the evaluation.
+        rows: of one player, each episode once.
         tasks: in the order to list them.
-        episodes: only episodes 0 .. episodes - 1.
 
     Returns:
         JSON types: task, level and score (None of several tasks), episodes, normalized_score, and player_kills (None
         where the score is not kills); each estimate with the ends of its 95% interval, as score_low and score_high.
     """
-    mine = [row for row in rows if identity.items() <= row.items() and row["episode"] < episodes]
-    chosen: dict[Any, Row] = {}
-    for row in mine:  # an episode that is there twice counts once, the first time
-        chosen.setdefault((row["task"], row["episode"], row.get("base_seed", 0)), row)
-    by_task = {task: [row for row in chosen.values() if row["task"] == task.id] for task in tasks}
+    by_task = {task: [row for row in rows if row["task"] == task.id] for task in tasks}
     played = {task: mine for task, mine in by_task.items() if mine}
     found = [_score_row({task: mine}) for task, mine in played.items()]
     return [*found, _score_row(played)] if len(played) > 1 else found

@@ -15,17 +15,15 @@ import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gvz.core import janitor, records
 from gvz.core.cache import cache_directory
 from gvz.core.errors import ConfigError, ResourceError, nearest
+from gvz.core.files import written_whole
 from gvz.core.libraries import require_learner
 from gvz.core.registry import NO_OWN_FILES, OwnFiles
 from gvz.run.rundir import EVALUATION_RECORDS, START_RECORDS
-
-if TYPE_CHECKING:
-    import numpy as np
 
 ZOO_DIRECTORY = Path(__file__).parent.parent / "zoo"
 PREFIX = "zoo:"
@@ -161,14 +159,9 @@ def pack(run_dir: Path, name: str, checkpoint: str = "newest", own_files: OwnFil
             raise ConfigError(
                 f"zoo: {name} would have {size:,} bytes, want at most {MAX_BYTES:,}; train a smaller network"
             )
-        ZOO_DIRECTORY.mkdir(exist_ok=True)
         added = ZOO_DIRECTORY / file.name
-        unfinished = added.with_suffix(".unfinished")
-        try:
-            shutil.copy(file, unfinished)
-            unfinished.replace(added)
-        finally:
-            unfinished.unlink(missing_ok=True)
+        with written_whole(added) as writing:
+            shutil.copy(file, writing)
     return Packed(file=added, num_updates=num_updates, num_bytes=size, num_episodes=len(rows))
 
 
@@ -182,10 +175,9 @@ def _rounded(params: object) -> object:
     import jax.numpy as jnp
     import numpy as np
 
-    def rounded(leaf: "np.ndarray") -> "np.ndarray":
-        return leaf.astype(jnp.bfloat16).astype(np.float32) if leaf.dtype == np.float32 else leaf
-
-    return jax.tree.map(rounded, params)
+    return jax.tree.map(
+        lambda leaf: leaf.astype(jnp.bfloat16).astype(np.float32) if leaf.dtype == np.float32 else leaf, params
+    )
 
 
 def _keep_some_rows(record: Path, most: int) -> None:

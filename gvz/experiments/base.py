@@ -223,9 +223,7 @@ class Experiment:
     @property
     def budget(self) -> str:
         """Of a run, in words."""
-        if self.max_processor_s is None:
-            return f"{self.total_updates:,} gradient steps"
-        return f"{self.max_processor_s:,.4g} seconds of processor time, at most {self.total_updates:,} gradient steps"
+        return budget_text(self.total_updates, self.max_processor_s)
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -315,6 +313,12 @@ class Experiment:
             if self.tasks_per_level is None or taken[task.level] <= self.tasks_per_level:
                 ids.append(task.id)
         return tuple(ids)
+
+
+def budget_text(total_updates: int, max_processor_s: float | None) -> str:
+    """What a run may take, in words."""
+    limit = "" if max_processor_s is None else f"{max_processor_s:,.4g} seconds of processor time, at most "
+    return f"{limit}{total_updates:,} gradient steps"
 
 
 def _procedural_test(scenario: str) -> str:

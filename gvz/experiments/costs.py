@@ -39,11 +39,10 @@ class Cost:
     """decisions in training"""
     episodes: int = 0
     """of evaluation"""
-    evaluation_steps: int = 0
-    """decisions in evaluation, at most: every episode goes on to its time-out"""
     training_hours: float | None = 0.0
     """of one job at a time; None: a rate is not known"""
     evaluation_hours: float | None = 0.0
+    """at most: every episode goes on to its time-out"""
 
     def __add__(self, other: "Cost") -> "Cost":
         both: dict[str, Any] = {}
@@ -104,7 +103,6 @@ def run_cost(run: TrainingRun, evaluation: Evaluation, scale: float, rates: Rate
         updates=run.total_updates,
         env_steps=warmup + round(per_update * run.total_updates),
         episodes=episodes,
-        evaluation_steps=episodes * timeout_steps,
         training_hours=_hours(updates, rates.updates_per_s)
         if run.max_processor_s is None
         else run.max_processor_s / num_cores / 3600,

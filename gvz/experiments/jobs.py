@@ -6,14 +6,13 @@ The next command follows from the files on the disk, so an interrupted job goes 
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from gvz.evaluation.simple import SimplePlayerName
 from gvz.experiments import inventory
 from gvz.experiments.base import TrainingRun
 from gvz.experiments.plan import Evaluation
 from gvz.experiments.scale import scaled_settings
-from gvz.run.config_files import config_from_dict, with_settings
+from gvz.run.config_files import Settings, config_from_dict, settings_flags, with_settings
 from gvz.run.resume import differences
 from gvz.run.rundir import EVALUATION_RECORDS
 
@@ -85,7 +84,7 @@ class RunJob:
         """`field: as it is -> as the plan has it`, of a run that is trained: nobody else would see it."""
         directory = inventory.run_directory(self.results, self.run)
         file = directory / "config.json"
-        if not file.exists() or not self._trained():
+        if not file.exists() or not inventory.run_progress(self.results, self.run, self.evaluation).trained:
             return []
         try:
             saved = config_from_dict(json.loads(file.read_text()), self.run.run_config.own_files)
@@ -97,9 +96,6 @@ class RunJob:
         if limit_s not in (None, saved.max_processor_s) and inventory.last_processor_s(directory) >= limit_s:
             found.append(f"max_processor_s: {saved.max_processor_s} -> {limit_s}")
         return found
-
-    def _trained(self) -> bool:
-        return inventory.run_progress(self.results, self.run, self.evaluation).trained
 
     def done_count(self, step: str) -> int:
         """How much of `Command.total` is done: gradient steps, processor seconds or episodes of a job at work."""
@@ -153,10 +149,10 @@ def training_flags(run: TrainingRun, scale: float) -> tuple[str, ...]:
         settings["checkpoint.period_updates"] = run.checkpoint_period_updates
     else:
         settings["max_processor_s"] = run.max_processor_s
-    return ("--config", run.config, *(text for name, value in settings.items() for text in _flag(name, value)))
+    return ("--config", run.config, *settings_flags(settings))
 
 
-def _settings(run: TrainingRun, scale: float) -> dict[str, Any]:
+def _settings(run: TrainingRun, scale: float) -> Settings:
     """What the plan sets of the run's config file."""
     return {
         "tasks": run.tasks,
@@ -165,18 +161,6 @@ def _settings(run: TrainingRun, scale: float) -> dict[str, Any]:
         **run.settings,
         **scaled_settings(run.run_config, run.total_updates, scale),
     }
-
-
-def _flag(name: str, value: Any) -> tuple[str, ...]:
-    flag = "--" + name.replace("_", "-")
-    if isinstance(value, bool):
-        group, _, field = flag.removeprefix("--").rpartition(".")
-        return (flag if value else f"--{group}.no-{field}",)
-    return (flag, *_words(value))
-
-
-def _words(value: Any) -> tuple[str, ...]:
-    return tuple(word for item in value for word in _words(item)) if isinstance(value, tuple | list) else (str(value),)
 
 
 def _episodes(evaluation: Evaluation) -> tuple[str, ...]:

@@ -12,6 +12,9 @@ from gvz.core.errors import ConfigError
 from gvz.experiments.jobs import Command
 from gvz.experiments.process import LocalProcess, Process
 
+LIST_TIMEOUT_S = 60.0
+"""for the driver's list of GPUs, which takes a second"""
+
 
 class Places(Protocol):
     """Something that commands of jobs run on."""
@@ -72,13 +75,24 @@ class Machine:
 
 
 def gpus() -> tuple[str, ...]:
-    """Ids for CUDA_VISIBLE_DEVICES of the GPUs that are there and not hidden."""
+    """Ids for CUDA_VISIBLE_DEVICES of the GPUs that are there and not hidden.
+
+    Raises:
+        ConfigError: the driver does not say which there are.
+    """
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     if visible is not None:
         return tuple(id for id in visible.split(",") if id and id != "-1")
     if shutil.which("nvidia-smi") is None:
         return ()
-    listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, timeout=60, check=False).stdout
+    command = ["nvidia-smi", "-L"]
+    try:
+        listed = subprocess.run(command, capture_output=True, text=True, timeout=LIST_TIMEOUT_S, check=False).stdout
+    except subprocess.TimeoutExpired as error:
+        raise ConfigError(
+            f"GPUs: waited {LIST_TIMEOUT_S:g} s for {' '.join(command)}; mend the driver, or set CUDA_VISIBLE_DEVICES "
+            "to the GPUs that are to be used, empty for none"
+        ) from error
     return tuple(str(n) for n, line in enumerate(listed.splitlines()) if line.startswith("GPU "))
 
 

@@ -11,6 +11,7 @@ from typing import TypeVar
 
 from gvz.core import records
 from gvz.core.errors import ConfigError
+from gvz.core.files import written_whole
 from gvz.evaluation.simple import SimplePlayerName
 from gvz.experiments.base import Experiment, TrainingRun, experiment_named
 from gvz.experiments.scale import CHECK_BELOW, scaled
@@ -178,9 +179,8 @@ def write_plan(results: Path, plan: Plan) -> Plan:
             before = read_plan(results)
             both = plan if before is None else before.joined(plan)
             saved = {"schema": PLAN_SCHEMA, "scale": both.scale, "experiments": both.asked}
-            temporary = results / "plan.json.new"  # who reads meanwhile gets the old plan, whole
-            temporary.write_text(json.dumps(saved, indent=2) + "\n")
-            temporary.replace(results / "plan.json")
+            with written_whole(results / "plan.json") as writing:
+                writing.write_text(json.dumps(saved, indent=2) + "\n")
     except OSError as error:
         raise ConfigError(f"--results: {results} cannot be written: {error.strerror}") from error
     return both

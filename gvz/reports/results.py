@@ -3,6 +3,7 @@
 Reads records, never checkpoints.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,9 +55,9 @@ def read_results(paths: Sequence[Path]) -> Results:
     episodes, of_other_seeds = _of_one_base_seed(episodes)
     problems += of_other_seeds
     runs: dict[Path, Run] = {}
-    asked = []
+    asked: dict[Path, list[PlannedExperiment]] = {}
     for path in from_outside:
-        for config in files_below(path, "config.json") if path.is_dir() else []:
+        for config in files_below(path, "config.json"):
             of_group = (config.resolve().parents[1] / "config.json").exists()  # a further learner process of that run
             discarded = is_in_folder_of_run(config, path, ("discarded",))
             if config.parent.resolve() not in runs and not discarded and not of_group:
@@ -64,32 +65,36 @@ def read_results(paths: Sequence[Path]) -> Results:
                 problems += found
                 if run is not None:
                     runs[config.parent.resolve()] = run
-        for file in files_below(path, "plan.json") if path.is_dir() else []:
-            try:
-                plan = read_plan(file.parent)
-            except ConfigError as error:
-                problems.append(f"{error}; its experiments are not in this report")
-                continue
-            if plan is None:
-                problems.append(f"{file}: a link that leads nowhere; its experiments are not in this report")
-                continue
-            asked += [
-                PlannedExperiment(results=file.parent, experiment=e, scale=plan.scale) for e in plan.experiments()
-            ]
+        for file in files_below(path, "plan.json"):
+            if file.resolve() not in asked:
+                asked[file.resolve()], found = _planned(file)
+                problems += found
     evaluated = {path: set(rows["task"]) for (path,), rows in episodes.group_by("run_dir")}
-    for run in runs.values():
+    found_runs = list(runs.values())
+    for run in found_runs:
         if str(run.path) not in evaluated:
             problems.append(f"{run.path}: no evaluation of this run yet; make one with `gvz evaluate {run.path}`")
-    agents = agents_of_runs(list(runs.values()), evaluated)
-    problems += pooled_runs(list(runs.values()), agents, evaluated)
+    agents = agents_of_runs(found_runs, evaluated)
+    problems += pooled_runs(found_runs, agents, evaluated)
     return Results(
         paths=tuple(paths),
         episodes=with_agents(episodes, agents),
-        runs=with_unique_ids(list(runs.values())),
+        runs=with_unique_ids(found_runs),
         agents=agents,
-        asked=tuple(asked),
+        asked=tuple(itertools.chain.from_iterable(asked.values())),
         problems=tuple(problems),
     )
+
+
+def _planned(file: Path) -> tuple[list[PlannedExperiment], list[str]]:
+    """The experiments of a plan.json, and why it cannot be read."""
+    try:
+        plan = read_plan(file.parent)
+    except ConfigError as error:
+        return [], [f"{error}; its experiments are not in this report"]
+    if plan is None:
+        return [], [f"{file}: a link that leads nowhere; its experiments are not in this report"]
+    return [PlannedExperiment(results=file.parent, experiment=e, scale=plan.scale) for e in plan.experiments()], []
 
 
 def _of_one_base_seed(episodes: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:

@@ -160,7 +160,7 @@ def _links(results: Results, out: Path) -> Block:
     for run in results.runs:
         files += [file for name in ("config.json", "metrics", "episodes") for file in sorted(run.path.glob(f"{name}*"))]
     for path in results.paths:
-        files += [file for file in files_below(path, "*") if file.suffix in _VIDEOS] if path.is_dir() else []
+        files += [file for file in files_below(path, "*") if file.suffix in _VIDEOS]
     links = [Link(text=str(file), target=os.path.relpath(file.resolve(), out.resolve())) for file in files]
     text = "Every number above can be computed again from these files (see docs/REPORTS.md)."
     return Block(text=(text,), links=tuple(links))

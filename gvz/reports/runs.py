@@ -12,6 +12,7 @@ import polars as pl
 
 from gvz.core import records
 from gvz.evaluation.dataset import fits
+from gvz.experiments.base import budget_text
 from gvz.experiments.inventory import PROCESSOR_S
 from gvz.run.rundir import START_RECORDS
 from gvz.tasks import TrainingSet, all_scenarios, named_tasks
@@ -70,9 +71,8 @@ class Run:
     @property
     def budget(self) -> str:
         """In words; older runs have no limit of processor time."""
-        limit_s, updates = self.config.get("max_processor_s"), f"{self.total_updates:,} gradient steps"
-        limited = isinstance(limit_s, int | float)
-        return f"{limit_s:,.4g} seconds of processor time, at most {updates}" if limited else updates
+        limit_s = self.config.get("max_processor_s")
+        return budget_text(self.total_updates, limit_s if isinstance(limit_s, int | float) else None)
 
     @property
     def processor_s(self) -> float | None:

@@ -112,6 +112,22 @@ def with_settings(config: RunConfig, settings: Mapping[str, Any]) -> RunConfig:
     return build_config(plain, "settings", type(config.agent))
 
 
+def settings_flags(settings: Settings) -> tuple[str, ...]:
+    """These values as words of the command line of `gvz train`."""
+    return tuple(word for name, value in settings.items() for word in _flag(name.replace("_", "-"), value))
+
+
+def _flag(name: str, value: Any) -> tuple[str, ...]:
+    if isinstance(value, bool):
+        group, _, field = name.rpartition(".")
+        return (f"--{name}" if value else f"--{group}.no-{field}",)
+    return (f"--{name}", *_words(value))
+
+
+def _words(value: Any) -> tuple[str, ...]:
+    return tuple(word for item in value for word in _words(item)) if isinstance(value, tuple | list) else (str(value),)
+
+
 def config_to_dict(config: RunConfig) -> dict[str, Any]:
     """The configuration with its derived values, as plain JSON types."""
 

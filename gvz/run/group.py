@@ -11,7 +11,7 @@ import ipaddress
 import signal
 import socket
 from collections.abc import Callable, Generator
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 
@@ -39,15 +39,15 @@ _MUST_AGREE = ("python", "gvizdoom", "jax", "jaxlib")
 _PRIVATE = "the group asks nobody who connects for a token; want an address of a private network"
 
 
-class Group(Protocol):
-    """The processes that train together."""
+class Group:
+    """The processes that train together: here a run of one process, which asks nobody. `Several` are more."""
 
-    num_common_saved: int | None
+    num_common_saved: int | None = None
     """gradient steps of the newest checkpoint that all have; None without others"""
 
     def stops(self, stop: StopRequest) -> bool:
         """All stop now, because of a signal to any of them; `stop` then has it, too."""
-        ...
+        return stop.requested
 
     def may_update(self, ready: bool, busy: bool, num_saved: int) -> bool:
         """All do a call of the train step now.
@@ -57,51 +57,26 @@ class Group(Protocol):
             busy: it is writing a checkpoint.
             num_saved: gradient steps of its newest whole checkpoint.
         """
-        ...
+        return True
 
     def may_save(self) -> bool:
         """No process was writing a checkpoint when the last call was agreed upon."""
-        ...
+        return True
 
     def restored(self, read: Callable[[int | None], Restored | None]) -> Restored | None:
         """The newest checkpoint that all have. `read(limit)` gives this process's newest of at most `limit` updates."""
-        ...
-
-    def blamed(self) -> contextlib.AbstractContextManager[None]:
-        """Within it, an error that a gone process has caused is raised as GroupError."""
-        ...
-
-    def leave(self) -> None:
-        """All have done their work and go."""
-        ...
-
-
-class Alone:
-    """A run of one process (`Group`)."""
-
-    num_common_saved: int | None = None
-
-    def stops(self, stop: StopRequest) -> bool:
-        return stop.requested
-
-    def may_update(self, ready: bool, busy: bool, num_saved: int) -> bool:
-        return True
-
-    def may_save(self) -> bool:
-        return True
-
-    def restored(self, read: Callable[[int | None], Restored | None]) -> Restored | None:
         return read(None)
 
     def blamed(self) -> contextlib.AbstractContextManager[None]:
+        """Within it, an error that a gone process has caused is raised as GroupError."""
         return contextlib.nullcontext()
 
     def leave(self) -> None:
-        pass
+        """All have done their work and go."""
 
 
-class Several:
-    """One of several processes (`Group`)."""
+class Several(Group):
+    """One of several processes."""
 
     def __init__(self, config: RunConfig, say: Callable[[str], None]):
         """Waits for the other processes, and makes their devices known to each other. Before any other use of jax.
@@ -132,7 +107,7 @@ class Several:
             self._join_jax(host, self._link.hellos[0]["port"])
             self._opened = opened.pop_all()
         self._round, self._proposed, self._stopped, self._told, self._may_save = 0, False, False, False, True
-        self.num_common_saved: int | None = 0
+        self.num_common_saved = 0
 
     def _listen(self, host: str, port: int, opened: contextlib.ExitStack) -> int:
         """Starts the relay, which ends with `opened`; returns a free port for JAX's coordinator."""
@@ -238,7 +213,7 @@ def join(config: RunConfig, say: Callable[[str], None]) -> Group:
     Raises:
         ConfigError, WaitTimeoutError: as `Several`.
     """
-    return Alone() if config.group.num_processes == 1 else Several(config, say)
+    return Group() if config.group.num_processes == 1 else Several(config, say)
 
 
 def _check_own_address(coordinator: str) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import psutil
 
-from gvz.core.control_groups import MOUNTED, num_cores, own_groups
+from gvz.core.control_groups import num_cores, own_groups
 
 ROOT = Path(__file__).parents[2]
 """of a checkout, or where the packages are installed"""
@@ -20,6 +20,8 @@ PACKAGES = (
     *("numpy", "opencv-python-headless", "onnxruntime"),
 )
 OWN_PACKAGES = ("gvz", "actors", "learner", "configs")
+PROC = Path("/proc")
+"""where Linux tells of processors and processes"""
 _GIT_TIMEOUT_S = 30
 _INSTRUCTION_SETS = {
     "SSE4_2": "sse4_2",
@@ -39,25 +41,20 @@ def cpu_model() -> str:
     return _cpuinfo("model name") or platform.processor() or platform.machine()
 
 
-def instruction_set(cpuinfo: str | None = None, xla_flags: str | None = None) -> str:
-    """The largest of XLA's instruction sets on this processor, such as AVX512_BF16, and the limit that XLA_FLAGS sets.
-
-    By default the text of /proc/cpuinfo and the flags are this machine's.
-    """
-    flags = _cpuinfo("flags", cpuinfo).split()
+def instruction_set() -> str:
+    """The largest of XLA's instruction sets on this processor, such as AVX512_BF16, and the limit of XLA_FLAGS."""
+    flags = _cpuinfo("flags").split()
     found = [name for name, flag in _INSTRUCTION_SETS.items() if flag in flags]
     largest = found[-1] if found else platform.machine()
-    given = (os.environ.get("XLA_FLAGS", "") if xla_flags is None else xla_flags).split()
+    given = os.environ.get("XLA_FLAGS", "").split()
     caps = [flag.partition("=")[2] for flag in given if flag.startswith("--xla_cpu_max_isa=")]
     return f"{largest}, at most {caps[-1]} by XLA_FLAGS" if caps else largest
 
 
-def _cpuinfo(field: str, text: str | None = None) -> str:
-    """The first value of a field of /proc/cpuinfo, or of `text`; empty if there is none."""
-    file = Path("/proc/cpuinfo")
-    if text is None:
-        text = file.read_text() if file.exists() else ""
-    return next((line.partition(":")[2].strip() for line in text.splitlines() if line.startswith(field)), "")
+def _cpuinfo(field: str) -> str:
+    """The first value of a field of /proc/cpuinfo; empty if there is none."""
+    lines = (PROC / "cpuinfo").read_text().splitlines() if (PROC / "cpuinfo").exists() else ()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(field)), "")
 
 
 def describe() -> dict[str, Any]:
@@ -78,14 +75,10 @@ def hardware() -> dict[str, Any]:
     }
 
 
-def available_memory(mounted: Path = MOUNTED, listed: str | None = None) -> int:
-    """Bytes that this process can still take: of the machine's memory, within the limits of a container or batch job.
-
-    Args:
-        mounted, listed: as for `own_groups`.
-    """
+def available_memory() -> int:
+    """Bytes that this process can still take of the machine's memory, within the limits of a container or batch job."""
     free = [int(psutil.virtual_memory().available)]
-    for group in own_groups("memory", mounted, listed):
+    for group in own_groups("memory"):
         with contextlib.suppress(OSError, ValueError):  # it has no limit, or another container has it
             free.append(_room_in(group))
     return max(0, min(free))

@@ -4,7 +4,7 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -57,6 +57,22 @@ def channels() -> Iterator[tuple[Channel, Channel]]:
     yield learner, actor
     learner.close()
     actor.close()
+
+
+@pytest.fixture
+def queue() -> Iterator[BroadcastWriter]:
+    writer = BroadcastWriter.create("gvz-test", NUM_PARAMS, LAYOUT)
+    yield writer
+    writer.close()
+
+
+@pytest.fixture
+def make_worker(
+    spec: ActorSpec, ring: RingReader, channels: tuple[Channel, Channel], queue: BroadcastWriter
+) -> Callable[[], Worker]:
+    """Makes a worker that waits for parameters."""
+    acting = msgspec.structs.replace(spec, policy=first_param_policy(), num_params=NUM_PARAMS, layout_hash=LAYOUT)
+    return lambda: Worker(acting, channels[1], ring.descriptor, queue.descriptor)
 
 
 def params(version: int) -> tuple[np.ndarray, ParamsHeader]:
@@ -143,60 +159,43 @@ def test_a_learner_that_never_reads_is_given_up(
 
 
 def test_a_learner_that_never_publishes_is_given_up(
-    spec: ActorSpec, ring: RingReader, channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
+    make_worker: Callable[[], Worker], channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(worker, "PARAMS_TIMEOUT_S", 0.05)
-    spec = msgspec.structs.replace(spec, policy=first_param_policy(), num_params=NUM_PARAMS, layout_hash=LAYOUT)
-    queue = BroadcastWriter.create("gvz-test", NUM_PARAMS, LAYOUT)
-    try:
-        with pytest.raises(
-            WaitTimeoutError, match="actor 0 waited 0 s for the learner to publish the first parameters"
-        ):
-            Worker(spec, channels[1], ring.descriptor, queue.descriptor).run()
-        channels[0].send(Stop())
-        Worker(spec, channels[1], ring.descriptor, queue.descriptor).run()  # told to stop, it does not wait
-    finally:
-        queue.close()
+    with pytest.raises(WaitTimeoutError, match="actor 0 waited 0 s for the learner to publish the first parameters"):
+        make_worker().run()
+    channels[0].send(Stop())
+    make_worker().run()  # told to stop, it does not wait
 
 
 def test_taking_parameters_keeps_to_its_share_of_the_time(
-    spec: ActorSpec, ring: RingReader, channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
+    make_worker: Callable[[], Worker], queue: BroadcastWriter, monkeypatch: pytest.MonkeyPatch
 ):
-    spec = msgspec.structs.replace(spec, policy=first_param_policy(), num_params=NUM_PARAMS, layout_hash=LAYOUT)
-    queue = BroadcastWriter.create("gvz-test", NUM_PARAMS, LAYOUT)
-    try:
-        actor = Worker(spec, channels[1], ring.descriptor, queue.descriptor)
-        assert not actor._take_params()
-        for share, taken in ((1e9, True), (1e9, True), (1e-9, True), (1e-9, False)):
-            monkeypatch.setattr(worker, "MAX_PARAMS_SHARE", share)
-            queue.publish(*params(1))
-            assert actor._take_params() == taken
-    finally:
-        queue.close()
+    actor = make_worker()
+    assert not actor._take_params()
+    for share, taken in ((1e9, True), (1e9, True), (1e-9, True), (1e-9, False)):
+        monkeypatch.setattr(worker, "MAX_PARAMS_SHARE", share)
+        queue.publish(*params(1))
+        assert actor._take_params() == taken
 
 
 def test_a_pause_ends_no_wait_for_parameters_and_delays_no_taking_of_them(
-    spec: ActorSpec, ring: RingReader, channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
+    make_worker: Callable[[], Worker], queue: BroadcastWriter, monkeypatch: pytest.MonkeyPatch
 ):
-    spec = msgspec.structs.replace(spec, policy=first_param_policy(), num_params=NUM_PARAMS, layout_hash=LAYOUT)
-    queue = BroadcastWriter.create("gvz-test", NUM_PARAMS, LAYOUT)
-    try:
-        actor, pause, looks = Worker(spec, channels[1], ring.descriptor, queue.descriptor), make_pause(monkeypatch), []
+    actor, pause, looks = make_worker(), make_pause(monkeypatch), []
 
-        def stopped_once() -> bool:
-            looks.append(1)
-            if len(looks) == 2:
-                pause(7200)
-            elif len(looks) == 4:
-                queue.publish(*params(1))
-            return False
+    def stopped_once() -> bool:
+        looks.append(1)
+        if len(looks) == 2:
+            pause(7200)
+        elif len(looks) == 4:
+            queue.publish(*params(1))
+        return False
 
-        set_params = actor._loop.set_params
-        monkeypatch.setattr(actor._loop, "set_params", lambda *newest: (pause(7200), set_params(*newest)))
-        monkeypatch.setattr(actor, "_must_stop", stopped_once)
-        assert actor._wait_for_params()
-        queue.publish(*params(2))
-        pause(60)
-        assert actor._take_params()
-    finally:
-        queue.close()
+    set_params = actor._loop.set_params
+    monkeypatch.setattr(actor._loop, "set_params", lambda *newest: (pause(7200), set_params(*newest)))
+    monkeypatch.setattr(actor, "_must_stop", stopped_once)
+    assert actor._wait_for_params()
+    queue.publish(*params(2))
+    pause(60)
+    assert actor._take_params()

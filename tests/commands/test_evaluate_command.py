@@ -45,14 +45,11 @@ from tests.waiting import wait_until
         ("{run} --tasks defend_the_center/gor", "unknown attribute 'gor' (did you mean 'gore'?)"),
     ],
 )
-def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, tmp_path, small_run):
+def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, refusal, tmp_path, small_run):
     (tmp_path / "file").write_text("nonsense\n")
     places = {"file": tmp_path / "file", "run": small_run, "above": small_run.parent}
-    assert cli.main(["evaluate", *(word.format(**places) for word in arguments.split())]) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.startswith("error: ")
-    assert message.format(**places) in err
+    said = refusal("evaluate", *(word.format(**places) for word in arguments.split()))
+    assert message.format(**places) in said
     assert not (small_run / "evaluation.jsonl").exists()
 
 

@@ -95,13 +95,10 @@ def test_tables_of_an_earlier_export_that_are_not_written_again_are_removed(run_
     }
 
 
-def test_bad_input_is_named(run_dirs, tmp_path, capsys):
-    assert cli.main(["export"]) == 2
-    assert "got no run directory, want at least one" in capsys.readouterr().err
-    assert cli.main(["export", str(tmp_path)]) == 2
-    assert f"{tmp_path} is not a run directory (config.json: No such file or directory)" in capsys.readouterr().err
-    assert cli.main(["export", str(run_dirs[0].parent)]) == 2
-    assert f"; did you mean {run_dirs[0]}?" in capsys.readouterr().err
+def test_bad_input_is_named(run_dirs, tmp_path, refusal):
+    assert "got no run directory, want at least one" in refusal("export")
+    said = refusal("export", str(tmp_path))
+    assert f"{tmp_path} is not a run directory (config.json: No such file or directory)" in said
+    assert f"; did you mean {run_dirs[0]}?" in refusal("export", str(run_dirs[0].parent))
     (tmp_path / "file").touch()
-    assert cli.main(["export", str(run_dirs[0]), "--out", str(tmp_path / "file")]) == 2
-    assert "--out: " in capsys.readouterr().err
+    assert "--out: " in refusal("export", str(run_dirs[0]), "--out", str(tmp_path / "file"))

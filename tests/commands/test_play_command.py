@@ -26,9 +26,8 @@ TASK = "defend_the_center/flying_enemies+stone_wall"
         (f"{TASK} --name sweep", "--name: got 'sweep', want a name of your own, not random, idle, sweep, scripted"),
     ],
 )
-def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys):
-    assert cli.main(["play", *arguments.split()]) == 2
-    assert message in capsys.readouterr().err
+def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, refusal):
+    assert message in refusal("play", *arguments.split())
 
 
 def test_without_a_display_it_says_so_and_leaves_no_file(refused_without_display):

@@ -43,16 +43,12 @@ from tests.waiting import wait_until
         ("--player idle --task seek_and_kill/blue --out v.gif --tensorboard", "--tensorboard: want a run directory"),
     ],
 )
-def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, tmp_path, small_run, monkeypatch):
+def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, refusal, tmp_path, small_run, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     (tmp_path / "d.webp").mkdir()
     places = {"file": tmp_path / "file", "run": small_run, "tmp_path": tmp_path}
-    assert cli.main(["record", *(word.format(**places) for word in arguments.split())]) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.startswith("error: ")
-    assert message in err
+    assert message in refusal("record", *(word.format(**places) for word in arguments.split()))
     assert not (tmp_path / "v.webp").exists()
 
 

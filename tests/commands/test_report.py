@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from gvz.cli import main
-
 ROOT = Path(__file__).parents[2]
 
 
@@ -31,9 +29,8 @@ def test_a_run_and_chance_beside_it_damaged_and_all(tmp_path):
     assert (tmp_path / "out" / "figures" / "learning_defend_the_center_rainbow_quick.png").exists()
 
 
-def test_bad_input_is_a_line_and_exit_code_2(tmp_path, capsys):
-    assert main(["report", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out")]) == 2
-    assert "nowhere: no such file or directory" in capsys.readouterr().err
-    assert main(["report", "--out", str(tmp_path / "out")]) == 2
-    assert "report: got nothing to report on" in capsys.readouterr().err
+def test_bad_input_is_a_line_and_exit_code_2(tmp_path, refusal):
+    said = refusal("report", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"))
+    assert "nowhere: no such file or directory" in said
+    assert "report: got nothing to report on" in refusal("report", "--out", str(tmp_path / "out"))
     assert not (tmp_path / "out").exists()

@@ -13,9 +13,9 @@ from gvz import cli
         ("{run} --speed 0", "--speed: got 0, want more than 0"),
     ],
 )
-def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, capsys, small_run):
-    assert cli.main(["watch", *(word.format(run=small_run) for word in arguments.split())]) == 2
-    assert capsys.readouterr().err == f"error: {message}\n"
+def test_bad_input_gives_one_message_and_exit_code_2(arguments, message, refusal, small_run):
+    said = refusal("watch", *(word.format(run=small_run) for word in arguments.split()))
+    assert said == f"error: {message}\n"
 
 
 def test_without_a_display_the_other_command_is_named(refused_without_display):

@@ -25,8 +25,11 @@ def sixty_four_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 @pytest.mark.parametrize(("quota", "cores"), [(150_000, 2), (10_000, 1), (400_000, 4), (9_900_000, 64), (None, 64)])
 def test_a_quota_of_processor_time_is_worth_so_many_cores(
-    tmp_path: Path, group: str, listed: str, quota: int | None, cores: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, group: str, listed: str, quota: int | None, cores: int
 ):
+    (tmp_path / "listed").write_text(listed)
+    monkeypatch.setattr(control_groups, "LISTED", tmp_path / "listed")
+    monkeypatch.setattr(control_groups, "MOUNTED", tmp_path)
     directory = tmp_path / group
     directory.mkdir(parents=True, exist_ok=True)
     if group.startswith("cpu"):
@@ -34,8 +37,9 @@ def test_a_quota_of_processor_time_is_worth_so_many_cores(
         (directory / "cpu.cfs_period_us").write_text("100000\n")
     else:
         (directory / "cpu.max").write_text(f"{'max' if quota is None else quota} 100000\n")
-    assert num_cores(tmp_path, listed) == cores
-    assert num_cores(tmp_path / "none", listed) == 64
+    assert num_cores() == cores
+    monkeypatch.setattr(control_groups, "MOUNTED", tmp_path / "none")
+    assert num_cores() == 64
 
 
 def test_with_a_quota_jobs_share_so_many_cores_from_a_random_place(monkeypatch: pytest.MonkeyPatch):

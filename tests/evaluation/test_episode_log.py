@@ -57,7 +57,7 @@ def test_only_rows_of_the_same_player_rules_and_base_seed_count(file):
         row("idle", 1, base_seed=5),
     ):
         file.append(line)
-    jobs = missing_jobs({IDLE: file}, wanted_episodes([TASK], 4, [0, 5]))
+    jobs = missing_jobs(IDLE, file, wanted_episodes([TASK], 4, [0, 5]))
     assert {job[0] for job in jobs} == {IDLE}
     assert sorted(job[1] for job in jobs) == [
         *((TASK.id, 0, 5), (TASK.id, 1, 0), (TASK.id, 2, 0), (TASK.id, 2, 5), (TASK.id, 3, 5))
@@ -149,16 +149,16 @@ def test_an_evaluation_goes_on_where_it_was_left(tmp_path):
     path = tmp_path / "evaluation.jsonl"
     wanted = wanted_episodes([TASK], 2)
     file = RecordFile(path)
-    rows = play_and_record({IDLE: file}, missing_jobs({IDLE: file}, wanted), num_workers=1)
+    rows = play_and_record({IDLE: file}, missing_jobs(IDLE, file, wanted), num_workers=1)
     first = next(rows)
     assert read_rows(path) == [first], "a row is on disk before it is told of"
     rows.close()
     file.close()
     file = RecordFile(path)
-    jobs = missing_jobs({IDLE: file}, wanted)
+    jobs = missing_jobs(IDLE, file, wanted)
     assert jobs == [(IDLE, Episode(TASK.id, 1 - first["episode"]))]
     list(play_and_record({IDLE: file}, jobs, num_workers=0))
-    assert missing_jobs({IDLE: file}, wanted) == []
+    assert missing_jobs(IDLE, file, wanted) == []
     assert {r["episode"] for r in read_rows(path)} == {0, 1}
     file.close()
 
@@ -170,7 +170,7 @@ def test_anybody_s_player_is_evaluated_by_the_same_protocol(tmp_path):
     assert [(r["player"], r["task"], r["episode"]) for r in mine] == [("mine", TASK.id, 0), ("mine", TASK.id, 1)]
     file = RecordFile(path)
     random = simple_player("random", EnvConfig())
-    jobs = missing_jobs({random: file}, wanted_episodes([TASK], 2))
+    jobs = missing_jobs(random, file, wanted_episodes([TASK], 2))
     theirs = sorted(play_and_record({random: file}, jobs, num_workers=0), key=lambda r: r["episode"])
     file.close()
     assert [{**r, "player": "mine"} for r in theirs] == mine
@@ -238,9 +238,10 @@ def test_a_compressed_file_is_not_written_to(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_player_is_not_evaluated_on_an_unknown_task(tmp_path):
+@pytest.mark.parametrize("tasks", [["nowhere/default"], "nowhere/default"])
+def test_a_player_is_not_evaluated_on_an_unknown_task_also_if_it_is_named_alone(tmp_path, tasks):
     with pytest.raises(TaskError, match="unknown scenario 'nowhere'"):
-        evaluate_player(RandomPlayer, ["nowhere/default"], tmp_path / "rows.jsonl", name="mine")
+        evaluate_player(RandomPlayer, tasks, tmp_path / "rows.jsonl", name="mine")
 
 
 @pytest.mark.parametrize(
@@ -258,8 +259,3 @@ def test_an_evaluation_that_gives_no_rows_of_a_player_is_refused(tmp_path, tasks
     with pytest.raises(ConfigError, match=message):
         evaluate_player(RandomPlayer, tasks, tmp_path / "rows.jsonl", **options)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_one_task_may_be_named_alone(tmp_path):
-    with pytest.raises(TaskError, match="unknown scenario 'nowhere'"):
-        evaluate_player(RandomPlayer, "nowhere/default", tmp_path / "rows.jsonl", name="mine")

@@ -95,16 +95,6 @@ def test_a_policy_acts_greedily_on_the_stack_it_was_trained_on(run, conditioned)
     env.close()
 
 
-def test_a_conditioned_policy_plays_its_training_tasks_only():
-    config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, task_conditioned=True))
-    check_tasks(config, config.table.tasks)
-    with pytest.raises(
-        ConfigError,
-        match="the policy takes the index of one of its 4 training tasks as input",
-    ):
-        check_tasks(config, [parse_task("defend_the_center/complete")])
-
-
 def test_a_run_cannot_play_another_scenario_unless_its_actions_are_unified():
     tasks = named_tasks("seek_and_kill", level=0)
     with pytest.raises(ConfigError, match="seek_and_kill/default: the run was trained on defend_the_center"):
@@ -196,37 +186,25 @@ def test_an_evaluation_in_python_by_other_rules_than_the_policys_is_refused(run,
         policy.make_player().begin(env, *env.reset(seed=1), seed=1)
 
 
-def test_an_encoders_file_is_executed_only_if_it_is_named(tmp_path, run):
+@pytest.mark.parametrize(
+    ("what", "field", "constants"),
+    [
+        ("encoder", "encoder", {f"learner.encoders.{CONFIG.agent.encoder}": "ENCODER"}),
+        ("agent", "name", {"learner.agents.configs.rainbow": "CONFIG", "learner.agents.rainbow": "AGENT"}),
+    ],
+)
+def test_a_python_file_of_a_run_is_executed_only_if_it_is_named(what, field, constants, tmp_path, run):
     source, mark = tmp_path / "theirs.py", tmp_path / "executed"
-    source.write_text(
-        f"open({str(mark)!r}, 'w').close()\nfrom learner.encoders.{CONFIG.agent.encoder} import ENCODER as ENCODER\n"
-    )
-    config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, encoder=str(source)))
+    imports = [f"from {module} import {name} as {name}\n" for module, name in constants.items()]
+    source.write_text("".join([f"open({str(mark)!r}, 'w').close()\n", *imports]))
+    config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, **{field: str(source)}))
     (run / "config.json").write_text(json.dumps(config_to_dict(config)))
+    said = rf"its {what} is a Python file .* if you trust that file, name it: --{what} "
     for read in (lambda: read_run_config(run), lambda: TrainedPlayer(run, 20)):
-        with pytest.raises(ConfigError, match=r"its encoder is a Python file .* name it: --encoder "):
+        with pytest.raises(ConfigError, match=said):
             read()
     assert not mark.exists()
-    player_spec = trained_player(run, read_run_config(run, OwnFiles(encoder=source)), 20)
-    assert pickle.loads(pickle.dumps(player_spec)).make_player().values is None
-    assert mark.exists()
-
-
-def test_an_agents_file_is_executed_only_if_it_is_named(tmp_path, run):
-    source, mark = tmp_path / "theirs.py", tmp_path / "executed"
-    source.write_text(
-        f"open({str(mark)!r}, 'w').close()\n"
-        "from learner.agents.configs.rainbow import CONFIG as CONFIG\n"
-        "from learner.agents.rainbow import AGENT as AGENT\n"
-    )
-    config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, name=str(source)))
-    (run / "config.json").write_text(json.dumps(config_to_dict(config)))
-    with pytest.raises(ConfigError, match=r"its agent is a Python file .* if you trust that file, name it: --agent "):
-        read_run_config(run)
-    with pytest.raises(ConfigError, match="its agent is a Python file"):
-        TrainedPlayer(run, 20)
-    assert not mark.exists()
-    player_spec = trained_player(run, read_run_config(run, OwnFiles(agent=source)), 20)
+    player_spec = trained_player(run, read_run_config(run, OwnFiles(**{what: source})), 20)
     assert pickle.loads(pickle.dumps(player_spec)).make_player().values is None
     assert mark.exists()
 

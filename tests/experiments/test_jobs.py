@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -37,7 +38,7 @@ def test_the_trainer_understands_every_experiment_at_every_scale(name, scale):
 @pytest.mark.parametrize("scale", [1, 0.001])
 @pytest.mark.parametrize("name", sorted(experiments()))
 def test_a_trained_run_with_other_settings_is_known(name, scale, tmp_path, monkeypatch):
-    monkeypatch.setattr(RunJob, "_trained", lambda _: True)
+    monkeypatch.setattr(progress, "run_progress", lambda *_: SimpleNamespace(trained=True))
     run = scaled(experiments()[name], scale).runs()[-1]
     job = RunJob(results=tmp_path, run=run, evaluation=EVALUATION, scale=scale)
     assert job.other_settings() == [], "there is no run"
@@ -65,7 +66,7 @@ def test_a_trained_run_with_other_settings_is_known(name, scale, tmp_path, monke
     ],
 )
 def test_a_trained_run_with_more_processor_time_is_known(saved, used, changed, tmp_path, monkeypatch):
-    monkeypatch.setattr(RunJob, "_trained", lambda _: True)
+    monkeypatch.setattr(progress, "run_progress", lambda *_: SimpleNamespace(trained=True))
     run = experiments()["general_short"].runs()[0]
     job = RunJob(results=tmp_path, run=run, evaluation=EVALUATION, scale=1)
     directory = progress.run_directory(tmp_path, run)

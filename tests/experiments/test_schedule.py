@@ -13,6 +13,7 @@ import pytest
 from gvz.core import records
 from gvz.core.errors import ConfigError, GvzError
 from gvz.experiments import inventory as progress
+from gvz.experiments import places
 from gvz.experiments.jobs import Command, Outlook
 from gvz.experiments.places import Machine, Slot, gpus, make_slots
 from gvz.experiments.schedule import run_jobs
@@ -227,6 +228,16 @@ def test_hidden_gpus_are_not_used(monkeypatch):
     assert gpus() == ()
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,5")
     assert gpus() == ("2", "5")
+
+
+def test_a_driver_that_does_not_answer_is_named(tmp_path, monkeypatch):
+    (tmp_path / "nvidia-smi").write_text("#!/bin/sh\nexec sleep 60\n")
+    (tmp_path / "nvidia-smi").chmod(0o700)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    monkeypatch.setattr(places, "LIST_TIMEOUT_S", 0.2)
+    with pytest.raises(ConfigError, match=r"waited 0\.2 s for nvidia-smi -L; mend the driver, or set CUDA_VISIBLE_DEV"):
+        gpus()
 
 
 def test_no_jobs_at_once_is_refused():

@@ -10,6 +10,8 @@ from gvz.core.errors import ConfigError
 from gvz.run.config import RunConfig
 from gvz.run.config_files import configs_directory, load_config
 from gvz.run.curriculum_config import CurriculumConfig
+from learner.agents.configs.ppo import PPOConfig
+from learner.agents.configs.pqn import PQNConfig
 from learner.agents.configs.rainbow import RainbowConfig
 from learner.config import LearnerConfig, OnPolicyConfig, ReplayConfig
 
@@ -111,6 +113,8 @@ def test_the_page_says_what_each_configuration_has_of_the_recipe():
         (lambda: LearnerConfig(target_ema=1.0), r"learner\.target_ema: got 1\.0, want 0\.\.0\.99999"),
         (lambda: LearnerConfig(average_ema=1.0), r"learner\.average_ema: got 1\.0, want 0\.\.0\.99999"),
         (lambda: OnPolicyConfig(average_ema=1.0), r"learner\.average_ema: got 1\.0, want 0\.\.0\.99999"),
+        (lambda: PQNConfig(td_lambda=1.5), r"agent\.td_lambda: got 1\.5, want 0\.\.1"),
+        (lambda: PPOConfig(clip=0.0), r"agent\.clip: got 0\.0, want 1e-06\.\.1000000"),
     ],
 )
 def test_values_out_of_range_are_refused_by_name(make, message: str):

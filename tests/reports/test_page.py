@@ -96,6 +96,9 @@ def test_results_of_one_experiment_twice_are_an_error(tmp_path):
         (tmp_path / name / "plan.json").write_text(plan)
     with pytest.raises(ConfigError, match="more than one of the paths has results of quick_comparison"):
         make_report([tmp_path / "a", tmp_path / "b"], tmp_path / "out")
+    (tmp_path / "b" / "plan.json").unlink()
+    files, _ = make_report([tmp_path / "a", tmp_path], tmp_path / "out")  # what two of them hold is there once
+    assert files[0].read_text().count("Experiment “") == 1
 
 
 def test_figures_of_an_earlier_report_are_named_and_stay(tmp_path):

@@ -23,25 +23,29 @@ def test_a_path_is_taken_as_a_path(tmp_path):
     ("text", "message"),
     [
         ("x = 1", "got NoneType for CONFIG, want `CONFIG = RunConfig"),
-        ("x = 1\n1 / 0", ", line 2: ZeroDivisionError: division by zero"),
+        ("x = 1\n1 / 0", ", line 3: ZeroDivisionError: division by zero"),
         ("def (", "SyntaxError"),
-        ("from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='a b')", ", line 2: name: got 'a b'"),
+        ("CONFIG = RunConfig(name='a b')", ", line 2: name: got 'a b'"),
+        ("CONFIG = RunConfig(name='a', mode='asynch')", "CONFIG.mode: got 'asynch'"),
         (
-            "from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='a', mode='asynch')",
-            "CONFIG.mode: got 'asynch'",
-        ),
-        (
-            "from gvz.run.config import LearnerConfig, RunConfig\n"
             "CONFIG = RunConfig(name='a', learner=LearnerConfig(batch_size=32.5))",
             "CONFIG.learner.batch_size: got 32.5, want int",
+        ),
+        *(
+            (f"CONFIG = RunConfig(name='a')\nSCENARIO_SETTINGS = {settings}", message)
+            for settings, message in (
+                ({"seek_and_kil": {}}, "unknown scenario 'seek_and_kil' (did you mean 'seek_and_kill'"),
+                ({"seek_and_kill": {"agent.discout": 1}}, "settings: got agent.discout, want a field of RunConfig"),
+                ({"seek_and_kill": {"agent.discount": "a"}}, "settings.agent.discount: got 'a', want"),
+            )
         ),
     ],
 )
 def test_a_broken_config_file_is_named(tmp_path, text, message):
     file = tmp_path / "broken.py"
-    file.write_text(text)
+    file.write_text(f"from gvz.run.config import LearnerConfig, RunConfig\n{text}")
     with pytest.raises(ConfigError, match=re.escape(str(file)) + ".*" + re.escape(message)):
-        load_config(str(file))
+        load_config(str(file), "seek_and_kill")
 
 
 def test_settings_of_a_scenario_hold_for_runs_that_play_it_alone_and_flags_come_after_them(tmp_path):
@@ -76,23 +80,6 @@ def test_a_config_file_is_run_once_for_a_command(tmp_path):
     )
     parse(["--config", str(file), "--tasks", "seek_and_kill/red"])
     assert log.read_text() == "."
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"seek_and_kil": {}}, "unknown scenario 'seek_and_kil' (did you mean 'seek_and_kill'"),
-        ({"seek_and_kill": {"agent.discout": 0.5}}, "settings: got agent.discout, want a field of RunConfig"),
-        ({"seek_and_kill": {"agent.discount": "a"}}, "settings.agent.discount: got 'a', want"),
-    ],
-)
-def test_a_setting_of_a_scenario_that_does_not_fit_is_named(tmp_path, settings, message):
-    file = tmp_path / "broken.py"
-    file.write_text(
-        f"from gvz.run.config import RunConfig\nCONFIG = RunConfig(name='a')\nSCENARIO_SETTINGS = {settings}\n"
-    )
-    with pytest.raises(ConfigError, match=re.escape(str(file)) + ".*" + re.escape(message)):
-        load_config(str(file), "seek_and_kill")
 
 
 def test_a_name_that_no_file_can_have_is_refused():

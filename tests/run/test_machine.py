@@ -10,6 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from gvz.core import control_groups
 from gvz.core.control_groups import num_cores
 from gvz.run import machine
 
@@ -44,8 +45,11 @@ def checkout(tmp_path, monkeypatch) -> Path:
         ("memory", "4:memory:/docker/1f\n", ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_")),
     ],
 )
-def test_memory_has_the_limits_of_containers_and_batch_jobs(tmp_path, group, own_groups, files):
+def test_memory_has_the_limits_of_containers_and_batch_jobs(tmp_path, monkeypatch, group, own_groups, files):
     limit, used, prefix = files
+    (tmp_path / "listed").write_text(own_groups)
+    monkeypatch.setattr(control_groups, "LISTED", tmp_path / "listed")
+    monkeypatch.setattr(control_groups, "MOUNTED", tmp_path)
     directory = tmp_path / group
     (directory / "step").mkdir(parents=True)
     (directory / limit).write_text("3000000\n")
@@ -54,8 +58,9 @@ def test_memory_has_the_limits_of_containers_and_batch_jobs(tmp_path, group, own
     (directory / "step" / limit).write_text("max\n" if limit == "memory.max" else f"{2**63 - 4096}\n")
     (directory / "step" / used).write_text("2500000\n")
     (directory / "step" / "memory.stat").write_text("")
-    assert machine.available_memory(tmp_path, own_groups) == 930_000
-    assert 930_000 < machine.available_memory(tmp_path / "none", own_groups) <= psutil.virtual_memory().total
+    assert machine.available_memory() == 930_000
+    monkeypatch.setattr(control_groups, "MOUNTED", tmp_path / "none")
+    assert 930_000 < machine.available_memory() <= psutil.virtual_memory().total
 
 
 def test_all_of_it_is_json_and_of_this_machine():
@@ -80,8 +85,13 @@ def test_all_of_it_is_json_and_of_this_machine():
         ("Features : fp asimd", "", os.uname().machine),
     ],
 )
-def test_the_instruction_set_is_the_largest_that_xla_knows_and_its_cap_is_told(cpuinfo, xla_flags, wanted):
-    assert machine.instruction_set(cpuinfo, xla_flags) == wanted
+def test_the_instruction_set_is_the_largest_that_xla_knows_and_its_cap_is_told(
+    cpuinfo, xla_flags, wanted, tmp_path, monkeypatch
+):
+    (tmp_path / "cpuinfo").write_text(cpuinfo)
+    monkeypatch.setattr(machine, "PROC", tmp_path)
+    monkeypatch.setenv("XLA_FLAGS", xla_flags)
+    assert machine.instruction_set() == wanted
 
 
 def test_processor_time_is_that_of_this_process_of_living_children_and_of_those_waited_for():

@@ -16,7 +16,7 @@ from gvz.core import records
 from gvz.core.durable import saved_steps
 from gvz.core.errors import CheckpointError, ConfigError, GvzError, ResumeError
 from gvz.run.config_files import load_config
-from gvz.run.group import Alone
+from gvz.run.group import Group
 from gvz.run.restore import restore
 from gvz.run.rundir import RunDir, move_aside
 from learner.checkpoint import write
@@ -62,7 +62,7 @@ def test_a_run_does_not_begin_without_what_is_on_a_disk_that_is_not_there(tmp_pa
             write(run.checkpoints / "1", WEIGHTS, {})
         (run.path / folder).symlink_to(tmp_path / "not mounted")
         with pytest.raises(CheckpointError, match=rf"{folder}: leads to .*not mounted, which is not there; mount its"):
-            restore(run, WEIGHTS, Alone(), print)
+            restore(run, WEIGHTS, Group(), print)
     assert (tmp_path / "run" / "metrics.jsonl").read_text()
 
 

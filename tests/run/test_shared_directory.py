@@ -113,6 +113,5 @@ def test_an_old_lock_file_says_nothing(tmp_path):
         (["--shared", "/tmp", "--hold", "inf"], "--hold: got inf, want more than 0 and at most 86400 seconds"),
     ],
 )
-def test_what_cannot_be_is_refused(flags, text, capsys):
-    assert cli.main(["doctor", *flags]) == 2
-    assert text in capsys.readouterr().err
+def test_what_cannot_be_is_refused(flags, text, refusal):
+    assert text in refusal("doctor", *flags)

@@ -18,6 +18,13 @@ Job = tuple[str, str]
 """task id, profile"""
 
 
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache of maps of the test's own."""
+    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path / "maps"))
+    return tmp_path / "maps"
+
+
 @pytest.fixture(scope="session")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Callable[[tuple[Job, ...], Job], dict[str, Any]]:
     """f(jobs, job) -> what measure.py found for `job`; plays all `jobs` in one sub-process at the first call."""

@@ -115,8 +115,10 @@ class Player:
         values = {name: self[f"USER{41 + i}"] for i, name in enumerate(PROPERTIES)}
         return {name: v if name in INTEGERS else v / 65536 for name, v in values.items()}
 
-    def objects(self) -> list[tuple[str, float, float]]:
-        return [(o.name, o.position_x, o.position_y) for o in self.game.get_state().objects]
+    def objects(self, *names: str) -> list[tuple[str, float, float]]:
+        """(name, x, y) of everything on the map, or of the things of these names."""
+        found = self.game.get_state().objects
+        return [(o.name, o.position_x, o.position_y) for o in found if not names or o.name in names]
 
     def restart(self, seed: int) -> None:
         self.game.set_seed(seed)

@@ -47,10 +47,7 @@ TEXTURES = {  # thesis, appendix B
 }
 
 
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path / "maps"))
-    return tmp_path / "maps"
+pytestmark = pytest.mark.usefixtures("cache")
 
 
 def compiled_map(task_id: str) -> UdmfMap:

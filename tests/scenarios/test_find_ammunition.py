@@ -30,10 +30,6 @@ SCENARIO = "find_ammunition"
 """which the fixture `start` plays"""
 
 
-def things(player: Player, *names: str) -> list[tuple[str, float, float]]:
-    return [one for one in player.objects() if one[0] in names]
-
-
 def take(player: Player, thing: tuple[str, float, float]) -> None:
     while thing in player.objects():
         player.game.send_game_command(f"warp {thing[1]} {thing[2]}")
@@ -54,7 +50,7 @@ def test_an_episode_begins_without_bullets_and_with_clips_and_enemies_away_from_
         player.restart(seed)
         player.step()
         x, y = player["POSITION_X"], player["POSITION_Y"]
-        found = [one for one in player.objects() if one[0] in (clip, enemy, *DECOYS)]
+        found = player.objects(clip, enemy, *DECOYS)
         assert Counter(kind for kind, _, _ in found) == {
             clip: 12,
             enemy: 6,
@@ -74,18 +70,18 @@ def test_every_clip_has_two_bullets_a_shot_takes_one_and_no_more_clips_come(star
     player.command(903)  # or enemies end the episode too soon
     player.step("ATTACK", 40)
     assert player["AMMO2"] == 0
-    for taken, one in enumerate(things(player, clip), 1):
+    for taken, one in enumerate(player.objects(clip), 1):
         take(player, one)
         assert (player["AMMO2"], player["KITS_TAKEN"]) == (2 * taken, taken)
     assert taken == 12
-    assert things(player, clip) == []
+    assert player.objects(clip) == []
     shots, left = 0, 24
     for _ in range(600):
         player.step("ATTACK")
         shots += player["AMMO2"] < left
         left = player["AMMO2"]
     assert (shots, left) == (24, 0)
-    assert things(player, clip) == []
+    assert player.objects(clip) == []
 
 
 @pytest.mark.engine
@@ -97,11 +93,11 @@ def test_an_enemy_dies_of_one_bullet_and_another_comes_after_60_tics(start):
     assert player.properties(0)["damage_factor"] == 0.25
     player.command(901, FIRST_ENEMY, 0)
     player.step(tics=2)
-    assert (player["KILLCOUNT"], player["PLAYER_KILLS"], len(things(player, "Demon"))) == (1, 1, 5)
+    assert (player["KILLCOUNT"], player["PLAYER_KILLS"], len(player.objects("Demon"))) == (1, 1, 5)
     player.step(tics=55)
     assert player["SPAWNED"] == 6
     player.step(tics=5)
-    assert (player["SPAWNED"], len(things(player, "Demon"))) == (7, 6)
+    assert (player["SPAWNED"], len(player.objects("Demon"))) == (7, 6)
     player.command(901, FIRST_ENEMY + 1, FIRST_ENEMY + 2)
     player.step(tics=2)
     assert (player["KILLCOUNT"], player["PLAYER_KILLS"]) == (2, 1)
@@ -118,7 +114,7 @@ def test_fireballs_kill_no_imp_not_even_when_their_thrower_is_dead(start):
     balls = 0
     for tid in (*range(FIRST_ENEMY, FIRST_ENEMY + 6), *range(FIRST_ENEMY + 18, FIRST_ENEMY + 137)):
         player.step(tics=12)
-        balls += len(things(player, "ImpFireball"))
+        balls += len(player.objects("ImpFireball"))
         player.step(tics=12)
         player.command(901, tid, 0)
     player.step(tics=2)
@@ -131,12 +127,12 @@ def test_a_decoy_takes_the_bullets_that_the_agent_has(start):
     player = start("wrong_ammunition")
     player.command(903)
     player.step(tics=12)
-    take(player, things(player, "Bullets")[0])
+    take(player, player.objects("Bullets")[0])
     assert (player["AMMO2"], player["POISONS_TAKEN"]) == (2, 0)
     for taken, decoy in enumerate(DECOYS, 1):
-        take(player, things(player, decoy)[0])
+        take(player, player.objects(decoy)[0])
         assert (player["AMMO2"], player["POISONS_TAKEN"]) == (0, taken)
-    assert things(player, *DECOYS) == []
+    assert player.objects(*DECOYS) == []
 
 
 @pytest.mark.engine

@@ -27,10 +27,6 @@ SCENARIO = "find_the_key"
 """which the fixture `start` plays"""
 
 
-def things(player: Player, *names: str) -> list[tuple[str, float, float]]:
-    return [one for one in player.objects() if one[0] in names]
-
-
 def go_to(player: Player, thing: tuple[str, float, float]) -> None:
     player.game.send_game_command(f"warp {thing[1]} {thing[2]}")
     player.step("MOVE_FORWARD", 4)  # the engine notices what is touched when something moves
@@ -48,7 +44,7 @@ def test_a_room_holds_keys_and_portals_away_from_the_agent_and_from_each_other(s
     for seed in range(8):
         player.restart(seed)
         player.step()
-        found = things(player, key, "Portal", *DECOYS)
+        found = player.objects(key, "Portal", *DECOYS)
         kinds = Counter(kind for kind, _, _ in found)
         assert kinds == {key: 8, "Portal": 3, **(dict.fromkeys(DECOYS, 1) if name == "complete" else {})}
         x, y = place(player)
@@ -63,22 +59,22 @@ def test_a_room_holds_keys_and_portals_away_from_the_agent_and_from_each_other(s
 def test_the_key_opens_the_portal_and_nothing_else_does(start):
     player = start("default")
     player.step(tics=12)  # the agent cannot move before
-    portal, key = things(player, "Portal")[0], things(player, "BlueCard")[0]
+    portal, key = player.objects("Portal")[0], player.objects("BlueCard")[0]
     go_to(player, portal)
     assert (player["GOALS"], player["KITS_TAKEN"]) == (0, 0)
     assert hypot(portal[1] - place(player)[0], portal[2] - place(player)[1]) < 30
     go_to(player, key)
     assert (player["GOALS"], player["KITS_TAKEN"]) == (0, 1)
-    assert things(player, "BlueCard") == []
+    assert player.objects("BlueCard") == []
     go_to(player, portal)
     assert (player["GOALS"], player["KITS_TAKEN"]) == (1, 1)
     assert hypot(portal[1] - place(player)[0], portal[2] - place(player)[1]) > 60
-    assert len(things(player, "BlueCard")) == 8
-    again = things(player, "Portal")
+    assert len(player.objects("BlueCard")) == 8
+    again = player.objects("Portal")
     assert len(again) == 3
     go_to(player, again[0])  # the key of the room before opens nothing here
     assert player["GOALS"] == 1
-    go_to(player, things(player, "BlueCard")[0])
+    go_to(player, player.objects("BlueCard")[0])
     go_to(player, again[1])
     assert (player["GOALS"], player["KITS_TAKEN"], player["HEALTH"]) == (2, 2, 100)
 
@@ -126,9 +122,9 @@ def test_a_decoy_takes_35_health_and_the_third_one_kills(start):
     player = start("decoys")
     player.step(tics=12)  # the agent cannot move before
     for taken, health in ((1, 65), (2, 30)):
-        go_to(player, things(player, *DECOYS)[0])
+        go_to(player, player.objects(*DECOYS)[0])
         assert (player["POISONS_TAKEN"], player["HEALTH"], player["KITS_TAKEN"]) == (taken, health, 0)
-    go_to(player, things(player, *DECOYS)[0])
+    go_to(player, player.objects(*DECOYS)[0])
     assert player.game.is_player_dead()
 
 

@@ -43,12 +43,6 @@ LEAST_DIFFERENCE = 6.0
 FIFTY = MapSet("varied", 50)
 
 
-@pytest.fixture
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path / "maps"))
-    return tmp_path / "maps"
-
-
 def contents() -> list[Content]:
     """What all named tasks hold, in both profiles."""
     return [

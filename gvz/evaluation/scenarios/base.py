@@ -7,7 +7,7 @@ nothing of what is out of sight.
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -29,10 +29,6 @@ STUCK_UNITS = 4.0
 """map units; an agent that a step brings less far walks against something"""
 NEAR = 14.0
 """nearness, pixels (some 270 map units), of an enemy worth a bullet, and of a vial worth a detour"""
-
-Sweep = Sequence[tuple[str, int]]
-"""(button, decisions it is held), again and again: how to play a scenario without looking. Each scored most of 8 to 25
-such sequences, on 8 to 12 episodes of base seed 1: `default`, in Dodge Projectiles five of the test tasks."""
 
 
 class Sight:
@@ -77,6 +73,15 @@ class Sight:
     def turn_anywhere(self) -> str:
         """A button that turns, by chance."""
         return ("TURN_LEFT", "TURN_RIGHT")[self.rng.integers(2)]
+
+    def turn_round(self, wanted: "Sequence[Label]", found: Callable[[], bool]) -> Generator[str, None, bool]:
+        """Turns towards the first label, without one somewhere, at most once round; returns whether it `found` it."""
+        turn = self.turn_to(wanted[0]) if wanted else self.turn_anywhere()
+        for _ in range(FULL_TURN):
+            yield turn
+            if found():
+                return True
+        return False
 
     @property
     def place(self) -> tuple[float, float]:
@@ -138,7 +143,10 @@ class Moving:
 
 
 def sweep(scenario: str) -> Iterator[str]:
-    """The buttons of the scenario's sweep, without end.
+    """The buttons of the scenario's sweep, without end: how to play it without looking.
+
+    `SWEEP` is (button, decisions it is held), again and again. Each scored most of 8 to 25 such sequences, on 8 to 12
+    episodes of base seed 1: `default`, in Dodge Projectiles five of the test tasks.
 
     Raises:
         ConfigError: nobody has written one.

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from gvz.evaluation.scenarios.base import AIM, FULL_TURN, NEAR, Moment, Pose, Sight
+from gvz.evaluation.scenarios.base import AIM, NEAR, Moment, Pose, Sight
 
 if TYPE_CHECKING:
     from gvz.engine.engine import Label
@@ -26,16 +26,15 @@ def script(sight: Sight) -> Iterator[str]:
             sight.ahead(enemy, enemy.width / 2) and sight.nearness(enemy) > NEAR for enemy in wanted
         ):
             yield "ATTACK"
-        elif any(sight.ahead(one, max(AIM, one.width / 2)) for one in wanted):
+        elif _ahead(sight):
             yield from sight.step()
-        else:
-            turn = sight.turn_to(wanted[0]) if wanted else sight.turn_anywhere()
-            for _ in range(FULL_TURN):
-                yield turn
-                if any(sight.ahead(one, max(AIM, one.width / 2)) for one in _wanted(sight)):
-                    break
-            else:
-                yield from sight.walk_on()
+        elif not (yield from sight.turn_round(wanted, lambda: _ahead(sight))):
+            yield from sight.walk_on()
+
+
+def _ahead(sight: Sight) -> bool:
+    """Whether something wanted is straight ahead."""
+    return any(sight.ahead(one, max(AIM, one.width / 2)) for one in _wanted(sight))
 
 
 def _armed(sight: Sight) -> bool:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from gvz.evaluation.scenarios.base import AIM, FULL_TURN, HALF_TURN, NEAR, Moment, Pose, Sight
+from gvz.evaluation.scenarios.base import AIM, HALF_TURN, NEAR, Moment, Pose, Sight
 
 if TYPE_CHECKING:
     from gvz.engine.engine import Label
@@ -56,22 +56,15 @@ def script(sight: Sight) -> Iterator[str]:
 
 def _buttons(sight: Sight, memory: _Memory) -> Iterator[str]:
     while True:
-        wanted = memory.wanted(sight)
         touched = [thing for thing in _decoys(sight) if sight.ahead(thing, max(HALF_TURN, sight.nearness(thing)))]
         if touched and sight.nearness(touched[0]) > NEAR:
             yield from [sight.turn_from(touched[0])] * 2
             yield "MOVE_FORWARD"
         elif memory.ahead(sight):
             yield from sight.step()
-        else:
-            turn = sight.turn_to(wanted[0]) if wanted else sight.turn_anywhere()
-            for _ in range(FULL_TURN):
-                yield turn
-                if memory.ahead(sight):
-                    break
-            else:
-                memory.has_key = True
-                yield from sight.walk_on()
+        elif not (yield from sight.turn_round(memory.wanted(sight), lambda: memory.ahead(sight))):
+            memory.has_key = True
+            yield from sight.walk_on()
 
 
 def _keys(sight: Sight) -> "list[Label]":

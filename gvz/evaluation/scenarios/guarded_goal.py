@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator
 
-from gvz.evaluation.scenarios.base import AIM, FULL_TURN, HALF_TURN, STUCK_UNITS, Moment, Pose, Sight
+from gvz.evaluation.scenarios.base import AIM, HALF_TURN, STUCK_UNITS, Moment, Pose, Sight
 
 SWEEP = (("MOVE_FORWARD", 8), ("ATTACK", 1), ("MOVE_FORWARD", 8), ("TURN_RIGHT", 6))
 MOMENTS = {"health_gathering.wad": Moment(seed=1, tics=20, pose=Pose(916, 300, 135))}
@@ -21,7 +21,8 @@ def script(sight: Sight) -> Iterator[str]:
     while True:
         button = _button(sight)
         if button is None:
-            yield from _search(sight)
+            if not (yield from sight.turn_round((), lambda: any(one.object_name == "Goal" for one in sight.labels))):
+                yield from sight.walk_on(5)
             continue
         if {button, last} == {"TURN_LEFT", "TURN_RIGHT"}:
             button = "MOVE_FORWARD"
@@ -42,12 +43,3 @@ def _button(sight: Sight) -> str | None:
     if not goals:
         return None
     return "MOVE_FORWARD" if guards or sight.ahead(goals[0], AIM) else sight.turn_to(goals[0])
-
-
-def _search(sight: Sight) -> Iterator[str]:
-    turn = sight.turn_anywhere()
-    for _ in range(FULL_TURN):
-        yield turn
-        if any(thing.object_name == "Goal" for thing in sight.labels):
-            return
-    yield from sight.walk_on(5)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gvz.evaluation.scenarios.base import FULL_TURN, HALF_TURN, NEAR, Moment, Moving, Pose, Sight
+from gvz.evaluation.scenarios.base import HALF_TURN, NEAR, Moment, Moving, Pose, Sight
 
 SWEEP = (("MOVE_FORWARD", 18), ("TURN_RIGHT", 6))
 MOMENTS = {
@@ -34,11 +34,9 @@ def script(sight: Sight) -> Iterator[str]:
                 yield from [sight.turn_anywhere()] * 5
                 yield from ["MOVE_FORWARD"] * 5
         elif kits:
-            turn = sight.turn_to(kits[0])
-            for _ in range(FULL_TURN):
-                yield turn
-                if any(sight.ahead(kit, HALF_TURN) for kit in sight.nearest("Health", but="Poison")):
-                    break
+            yield from sight.turn_round(
+                kits, lambda: any(sight.ahead(kit, HALF_TURN) for kit in sight.nearest("Health", but="Poison"))
+            )
         else:
             yield from [sight.turn_anywhere()] * int(sight.rng.integers(2, 8))
             yield from ["MOVE_FORWARD"] * 4

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from gvz.evaluation.scenarios.base import FULL_TURN, HALF_TURN, Moment, Moving, Pose, Sight
+from gvz.evaluation.scenarios.base import HALF_TURN, Moment, Moving, Pose, Sight
 
 SWEEP = (("MOVE_FORWARD", 5), ("TURN_RIGHT", 3), ("ATTACK", 1))
 MOMENTS = {"health_gathering_supreme.wad": Moment(seed=5, tics=2, pose=Pose(700, 1100, 180))}
@@ -19,10 +19,9 @@ def script(sight: Sight) -> Iterator[str]:
         if any(sight.ahead(enemy, enemy.width / 2) for enemy in enemies):
             yield "ATTACK"
         elif enemies and not any(sight.ahead(enemy, HALF_TURN) for enemy in enemies):
-            turn = sight.turn_to(enemies[0])
-            for _ in range(FULL_TURN):
-                yield turn
-                if any(sight.ahead(enemy, max(HALF_TURN, enemy.width / 2)) for enemy in sight.nearest("Monster")):
-                    break
+            yield from sight.turn_round(
+                enemies,
+                lambda: any(sight.ahead(one, max(HALF_TURN, one.width / 2)) for one in sight.nearest("Monster")),
+            )
         else:
             yield from sight.step(5)
