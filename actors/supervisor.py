@@ -58,7 +58,7 @@ class SupervisedActor:
         self._heartbeat_ns = 0
         self._kill_at: float | None = None  # set when it is stuck and was asked for its stacks
         self._ended_at: deque[float] = deque()  # ends of its processes within the restart window
-        self._failed_starts = 0  # ends in a row before a process was stable
+        self._backoff_s = _FIRST_BACKOFF_S  # before the last start
 
     @property
     def ready(self) -> bool:
@@ -181,12 +181,12 @@ class SupervisedActor:
             )
             self.failure = WorkerError(f"{message} The end of {log_path(self._spec)}:\n{log_tail}")
             return Fault(actor=actor, lane=None, kind="gave_up", message=message, traceback=log_tail)
-        self._failed_starts = 0 if stable else self._failed_starts + 1
-        backoff_s = min(_FIRST_BACKOFF_S * 2**self._failed_starts, _LONGEST_BACKOFF_S)
-        self._start_at = now + backoff_s
+        self._backoff_s = _FIRST_BACKOFF_S if stable else min(2 * self._backoff_s, _LONGEST_BACKOFF_S)
+        self._start_at = now + self._backoff_s
         self.restarts += 1
         self._renumber()
-        message = f"actor {actor} {what}; restart {len(self._ended_at)} of {limits.max_restarts} in {backoff_s:.2f} s"
+        which = f"restart {len(self._ended_at)} of {limits.max_restarts}"
+        message = f"actor {actor} {what}; {which} in {self._backoff_s:.2f} s"
         return Fault(actor=actor, lane=None, kind=kind, message=message, traceback=log_tail)
 
     def _renumber(self) -> None:

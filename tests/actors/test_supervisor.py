@@ -10,7 +10,7 @@ from actors import supervisor
 from actors.config import ActorsConfig
 from actors.pool import lanes_to_begin_with
 from actors.supervisor import SupervisedActor
-from gvz.transport.messages import Fault, Message, Ready
+from gvz.transport.messages import EpisodeStats, Fault, Message, Ready
 from gvz.transport.ring import WriterState
 
 
@@ -83,3 +83,33 @@ def test_after_a_stable_life_the_next_start_comes_soon(actor: SupervisedActor):
         actor.start()
         get_ready(actor, begin)
         assert end(actor, begin + lived_s).message.endswith(f"in {wait}")
+
+
+def test_an_actor_that_fails_for_days_is_started_again_each_time(actor: SupervisedActor):
+    for number in range(1100):
+        fault = end(actor, 1000.0 * number)
+        actor.start()
+    assert fault.message.endswith("restart 1 of 1 in 15.00 s")
+
+
+def test_a_new_process_is_given_the_time_of_a_start_whatever_its_predecessor_did(actor: SupervisedActor):
+    get_ready(actor, 0.0)
+    actor.watch(0.0, 31.0)
+    (fault,) = actor.watch(1.0, 0.0)
+    assert fault.kind == "stuck"
+    actor.start()
+    assert not actor.ready
+    assert actor.watch(2.0, 119.0) == []
+    assert not actor.process.dumped
+    actor.watch(3.0, 2.0)
+    assert actor.process.dumped
+
+
+def test_an_episode_of_no_task_of_the_run_is_a_fault(actor: SupervisedActor):
+    stats = EpisodeStats(
+        lane=0, task=2, episode=0, seed=0, score=0.0, reward=0.0, reward_components={}, length_frames=4, length_steps=1,
+        params_version=0, terminated=True, truncated=False,
+    )  # fmt: skip
+    actor.process.said.append(stats)
+    (fault,) = actor.watch(0.0, 0.0)
+    assert "got an episode of lane 0, task 2, want one of lanes [0, 1] and a task below 2" in fault.message
