@@ -57,7 +57,7 @@ class SupervisedActor:
         self._silent_s = 0.0  # without a sign of life (or, before Ready, since the start) while we watched
         self._heartbeat_ns = 0
         self._kill_at: float | None = None  # set when it is stuck and was asked for its stacks
-        self._ended_at: deque[float] = deque()  # ends of its processes within the restart window
+        self._ended_at: deque[float] = deque()  # ends of its processes that count
         self._backoff_s = _FIRST_BACKOFF_S  # before the last start
 
     @property
@@ -164,7 +164,8 @@ class SupervisedActor:
 
     def _replace(self, now: float, kind: str, what: str) -> Fault:
         """Ends what is left of the process and plans the next, if the budget allows."""
-        stable = self.ready and self._ready_at is not None and now - self._ready_at > _STABLE_S
+        was_ready = self.ready
+        stable = was_ready and self._ready_at is not None and now - self._ready_at > _STABLE_S
         process, self.process = self.process, None
         if process is not None:
             process.end(grace_s=0.0)
@@ -172,11 +173,12 @@ class SupervisedActor:
         janitor.clean_dead_instances()
         actor, limits = self._spec.actor, self._limits
         self._ended_at.append(now)
-        while now - self._ended_at[0] > limits.restart_window_s:
+        while was_ready and now - self._ended_at[0] > limits.restart_window_s:  # starts that fail may take as long
             self._ended_at.popleft()
         if len(self._ended_at) > limits.max_restarts:
+            within_s = max(limits.restart_window_s, now - self._ended_at[0])
             message = (
-                f"actor {actor} {what}; that was end {len(self._ended_at)} within {limits.restart_window_s:.0f} s, "
+                f"actor {actor} {what}; that was end {len(self._ended_at)} within {within_s:.0f} s, "
                 f"and actors.max_restarts allows {limits.max_restarts} restarts."
             )
             self.failure = WorkerError(f"{message} The end of {log_path(self._spec)}:\n{log_tail}")
