@@ -146,21 +146,21 @@ class SupervisedActor:
         return []
 
     def _is_stuck(self, watched_s: float) -> bool:
-        heartbeat_ns = self.ring.writer_status().heartbeat_ns
-        moved = self.ready and heartbeat_ns != self._heartbeat_ns
+        status = self.ring.writer_status()
+        moved = self.ready and status.heartbeat_ns != self._heartbeat_ns
         self._silent_s = 0.0 if moved else self._silent_s + watched_s
-        self._heartbeat_ns = heartbeat_ns
-        return self._silent_s > getattr(self._limits, self._patience())
+        self._heartbeat_ns = status.heartbeat_ns
+        return self._silent_s > getattr(self._limits, self._patience(status.state))
 
-    def _patience(self) -> str:
+    def _patience(self, state: WriterState) -> str:
         """Which setting bounds its silence: to start an engine takes its time, also in mid-run."""
-        acting = self.ready and self.ring.writer_status().state != WriterState.RESETTING
+        acting = self.ready and state != WriterState.RESETTING
         return "heartbeat_timeout_s" if acting else "start_timeout_s"
 
     def _silence(self) -> str:
         what = "gave no sign of life for" if self.ready else "had not started its games after"
-        state = self.ring.writer_status().state.name.lower()
-        return f"{what} {self._silent_s:.1f} s (actors.{self._patience()}); it was {state}"
+        state = self.ring.writer_status().state
+        return f"{what} {self._silent_s:.1f} s (actors.{self._patience(state)}); it was {state.name.lower()}"
 
     def _replace(self, now: float, kind: str, what: str) -> Fault:
         """Ends what is left of the process and plans the next, if the budget allows."""

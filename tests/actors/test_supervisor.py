@@ -11,7 +11,7 @@ from actors.config import ActorsConfig
 from actors.pool import lanes_to_begin_with
 from actors.supervisor import SupervisedActor
 from gvz.transport.messages import EpisodeStats, Fault, Message, Ready
-from gvz.transport.ring import WriterState
+from gvz.transport.ring import WriterState, WriterStatus
 
 
 class Process:
@@ -127,3 +127,22 @@ def test_an_episode_of_no_task_of_the_run_is_a_fault(actor: SupervisedActor):
     actor.process.said.append(stats)
     (fault,) = actor.watch(0.0, 0.0)
     assert "got an episode of lane 0, task 2, want one of lanes [0, 1] and a task below 2" in fault.message
+
+
+def test_an_actor_that_ends_a_long_reset_while_it_is_looked_at_is_not_stuck(
+    actor: SupervisedActor, monkeypatch: pytest.MonkeyPatch
+):
+    get_ready(actor, 0.0)
+    writer, look = actor.ring.writer(), actor.ring.writer_status
+    writer.beat(WriterState.RESETTING)
+    actor.watch(0.0, 1.0)
+
+    def look_and_act() -> WriterStatus:
+        status = look()
+        writer.beat(WriterState.ACTING)
+        return status
+
+    monkeypatch.setattr(actor.ring, "writer_status", look_and_act)
+    actor.watch(0.0, 99.0)
+    actor.watch(0.0, 29.0)
+    assert not actor.process.dumped

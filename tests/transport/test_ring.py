@@ -233,16 +233,19 @@ def test_another_layout_is_refused(reader: RingReader, capacity: int, shape: tup
         RingWriter.attach(reader.descriptor, capacity, shape)
 
 
-def test_records_count_when_they_are_whole(reader: RingReader, writer: RingWriter):
+def test_records_count_when_they_are_whole_and_a_state_when_its_heartbeat_has_come(
+    reader: RingReader, writer: RingWriter
+):
     sequence, found = steps_of(reader)["sequence"], []
 
     class Words(list[int]):
         def __setitem__(self, index, value):
-            found.append((index, value, sequence[:2].tolist()))
+            found.append((index, sequence[:2].tolist()))
 
     writer._words = Words([0] * 16)
     write(writer, 0, 1)
-    assert found == [(0, 2, [0, 1])]
+    writer.beat(WriterState.ACTING)
+    assert found == [(0, [0, 1]), (1, [0, 1]), (2, [0, 1])], "published, heartbeat, state"
 
 
 # ---- damage: what a broken writer, or anything else with access, may have done to the memory
