@@ -124,6 +124,7 @@ class RingMachine(RuleBasedStateMachine):
         assert self.writer.free == CAPACITY - len(self.unread)
 
     def teardown(self):
+        self.writer.close()  # its mapping holds a descriptor
         self.reader.close()
 
 
