@@ -34,7 +34,8 @@ class ActorsConfig:
     heartbeat_timeout_s: float = 30.0
     """an actor without a heartbeat for this many seconds is killed and replaced"""
     max_restarts: int = 20
-    """restarts of one actor within restart_window_s before the run stops with an error"""
+    """restarts of one actor within restart_window_s before the run stops with an error; starts that fail in a row count
+    however long they take"""
     restart_window_s: float = 600.0
     """length of the window in which restarts are counted"""
     recycle_episodes: int = 1000

@@ -57,8 +57,8 @@ class SupervisedActor:
         self._silent_s = 0.0  # without a sign of life (or, before Ready, since the start) while we watched
         self._heartbeat_ns = 0
         self._kill_at: float | None = None  # set when it is stuck and was asked for its stacks
-        self._ended_at: deque[float] = deque()  # ends of its processes within the restart window
-        self._failed_starts = 0  # ends in a row before a process was stable
+        self._ended_at: deque[float] = deque()  # ends of its processes that count
+        self._backoff_s = _FIRST_BACKOFF_S  # before the last start
 
     @property
     def ready(self) -> bool:
@@ -146,25 +146,26 @@ class SupervisedActor:
         return []
 
     def _is_stuck(self, watched_s: float) -> bool:
-        heartbeat_ns = self.ring.writer_status().heartbeat_ns
-        moved = self.ready and heartbeat_ns != self._heartbeat_ns
+        status = self.ring.writer_status()
+        moved = self.ready and status.heartbeat_ns != self._heartbeat_ns
         self._silent_s = 0.0 if moved else self._silent_s + watched_s
-        self._heartbeat_ns = heartbeat_ns
-        return self._silent_s > getattr(self._limits, self._patience())
+        self._heartbeat_ns = status.heartbeat_ns
+        return self._silent_s > getattr(self._limits, self._patience(status.state))
 
-    def _patience(self) -> str:
+    def _patience(self, state: WriterState) -> str:
         """Which setting bounds its silence: to start an engine takes its time, also in mid-run."""
-        acting = self.ready and self.ring.writer_status().state != WriterState.RESETTING
+        acting = self.ready and state != WriterState.RESETTING
         return "heartbeat_timeout_s" if acting else "start_timeout_s"
 
     def _silence(self) -> str:
         what = "gave no sign of life for" if self.ready else "had not started its games after"
-        state = self.ring.writer_status().state.name.lower()
-        return f"{what} {self._silent_s:.1f} s (actors.{self._patience()}); it was {state}"
+        state = self.ring.writer_status().state
+        return f"{what} {self._silent_s:.1f} s (actors.{self._patience(state)}); it was {state.name.lower()}"
 
     def _replace(self, now: float, kind: str, what: str) -> Fault:
         """Ends what is left of the process and plans the next, if the budget allows."""
-        stable = self.ready and self._ready_at is not None and now - self._ready_at > _STABLE_S
+        was_ready = self.ready
+        stable = was_ready and self._ready_at is not None and now - self._ready_at > _STABLE_S
         process, self.process = self.process, None
         if process is not None:
             process.end(grace_s=0.0)
@@ -172,21 +173,22 @@ class SupervisedActor:
         janitor.clean_dead_instances()
         actor, limits = self._spec.actor, self._limits
         self._ended_at.append(now)
-        while now - self._ended_at[0] > limits.restart_window_s:
+        while was_ready and now - self._ended_at[0] > limits.restart_window_s:  # starts that fail may take as long
             self._ended_at.popleft()
         if len(self._ended_at) > limits.max_restarts:
+            within_s = max(limits.restart_window_s, now - self._ended_at[0])
             message = (
-                f"actor {actor} {what}; that was end {len(self._ended_at)} within {limits.restart_window_s:.0f} s, "
+                f"actor {actor} {what}; that was end {len(self._ended_at)} within {within_s:.0f} s, "
                 f"and actors.max_restarts allows {limits.max_restarts} restarts."
             )
             self.failure = WorkerError(f"{message} The end of {log_path(self._spec)}:\n{log_tail}")
             return Fault(actor=actor, lane=None, kind="gave_up", message=message, traceback=log_tail)
-        self._failed_starts = 0 if stable else self._failed_starts + 1
-        backoff_s = min(_FIRST_BACKOFF_S * 2**self._failed_starts, _LONGEST_BACKOFF_S)
-        self._start_at = now + backoff_s
+        self._backoff_s = _FIRST_BACKOFF_S if stable else min(2 * self._backoff_s, _LONGEST_BACKOFF_S)
+        self._start_at = now + self._backoff_s
         self.restarts += 1
         self._renumber()
-        message = f"actor {actor} {what}; restart {len(self._ended_at)} of {limits.max_restarts} in {backoff_s:.2f} s"
+        which = f"restart {len(self._ended_at)} of {limits.max_restarts}"
+        message = f"actor {actor} {what}; {which} in {self._backoff_s:.2f} s"
         return Fault(actor=actor, lane=None, kind=kind, message=message, traceback=log_tail)
 
     def _renumber(self) -> None:

@@ -217,8 +217,10 @@ def test_sticky_actions_hold_the_buttons_of_the_decision_before_with_their_proba
     monkeypatch.setattr(Engine, "advance", lambda engine, *how: held.append(how[0]) or advance(engine, *how))
 
     def played(actions: Sequence[int], probability: float) -> list[bytes]:
-        held.clear()
         with closing(DoomEnv("dodge_projectiles/default", repeat_action_probability=probability)) as env:
+            env.reset(options={"episode_seed": 1})
+            env.step(1)  # another episode's last decision
+            held.clear()
             env.reset(options={"episode_seed": 3})
             return [env.step(action)[0].tobytes() for action in actions]
 

@@ -74,7 +74,7 @@ class SupervisedHost:
         self.params_age_s = 0.0
         self.actor_restarts, self.waited_for_space_s = 0, 0.0  # of earlier incarnations
         self._in_episode = np.zeros(len(pool.lanes), bool)
-        self._failed_starts = 0
+        self._backoff_s = _FIRST_BACKOFF_S
 
     @property
     def is_playing(self) -> bool:
@@ -152,8 +152,8 @@ class SupervisedHost:
         """
         life, self.incarnation = self.incarnation, None
         assert life is not None
-        self._failed_starts = 0 if life.was_stable(now_s) else self._failed_starts + 1
-        self.start_at_s = now_s + min(_FIRST_BACKOFF_S * 2**self._failed_starts, _LONGEST_BACKOFF_S)
+        self._backoff_s = _FIRST_BACKOFF_S if life.was_stable(now_s) else min(2 * self._backoff_s, _LONGEST_BACKOFF_S)
+        self.start_at_s = now_s + self._backoff_s
         self.avoid = life.machine
         if life.newest is not None:
             self.actor_restarts += life.newest.restarts

@@ -159,6 +159,7 @@ class RingReader(_Ring):
             TransportError: an unknown state.
         """
         state = self._words[_STATE]
+        self._fence()
         if state not in WriterState._value2member_map_:
             raise TransportError(f"ring {self.name}: got writer state {state}, want 0..{max(WriterState)}")
         return WriterStatus(
@@ -229,8 +230,9 @@ class RingWriter(_Ring):
 
     def beat(self, state: WriterState) -> None:
         """Writes the state and a heartbeat."""
-        self._words[_STATE] = state
         self._words[_HEARTBEAT_NS] = time.monotonic_ns()
+        self._fence()  # who sees the state sees its heartbeat
+        self._words[_STATE] = state
 
     def wait_for_space(
         self, num_records: int, timeout_s: float, *, cancelled: Callable[[], bool] = lambda: False

@@ -147,16 +147,17 @@ def test_game_variables_past_actions_masks_and_extras_are_acted_on_and_recorded(
 
 
 def test_an_assigned_task_begins_with_the_lanes_next_episode(tmp_path: Path):
-    pool_config = inline_config(tmp_path)
+    pool_config, states, played = inline_config(tmp_path), [], []
     with InlinePool(pool_config) as pool:
         pool.drain(5)
         pool.assign(0, 1)
-        steps, _ = gather(pool.drain(3 * 12))
-        state = pool.state()
-        onward, _ = gather(pool.drain(30))
-    with InlinePool(pool_config, state) as pool:
-        np.testing.assert_array_equal(gather(pool.drain(30))[0], onward)
-    own = steps[steps["lane"] == 0]
+        for _ in range(2):  # it waits for its episode; it is played
+            states.append(pool.state())
+            played.append(gather(pool.drain(3 * 12))[0])
+    for state, steps in zip(states, played, strict=True):
+        with InlinePool(pool_config, state) as pool:
+            np.testing.assert_array_equal(gather(pool.drain(3 * 12))[0], steps)
+    own = played[0][played[0]["lane"] == 0]
     np.testing.assert_array_equal(own["task"], own["episode"] > 0)
     assert own["episode"].max() > 0
 
@@ -310,6 +311,11 @@ def test_what_is_published_is_copied_and_recorded(tmp_path: Path):
         steps, _ = gather(pool.drain(60))
         np.testing.assert_array_equal(steps, gather(other.drain(60))[0])
         assert (steps["params_version"] == 4).all()
+        pool.drain(3 * 3)
+        pool.publish(*params(5))
+        last, _ = gather(pool.drain(3))
+        assert last["terminated"].all()
+        assert {m.params_version for m in pool.poll() if isinstance(m, EpisodeStats)} == {4}, "of the last action"
 
 
 def test_closing_can_be_repeated_and_leaves_no_shared_memory(tmp_path: Path):

@@ -89,8 +89,10 @@ def test_a_resumed_pool_goes_on_with_new_episodes(tmp_path: Path):
     with ProcessPool(pool_config) as pool:
         run = Run(pool, pool_config)
         run.play(300)
+        run.until_all_full()
+        unread = np.concatenate([actor.ring.peek(1000).steps for actor in pool._actors])
         state = pool.state()
-    assert max(int(step["episode"]) for step in run.checker.last.values()) < max(state["next_episodes"])
+    assert (unread["episode"] < np.array(state["next_episodes"])[unread["lane"]]).all()
     with ProcessPool(pool_config, state) as pool:
         resumed = Run(pool, pool_config)
         resumed.until(lambda: len(resumed.first_episodes()) == 4)

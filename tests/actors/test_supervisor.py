@@ -10,8 +10,8 @@ from actors import supervisor
 from actors.config import ActorsConfig
 from actors.pool import lanes_to_begin_with
 from actors.supervisor import SupervisedActor
-from gvz.transport.messages import Fault, Message, Ready
-from gvz.transport.ring import WriterState
+from gvz.transport.messages import EpisodeStats, Fault, Message, Ready
+from gvz.transport.ring import WriterState, WriterStatus
 
 
 class Process:
@@ -62,9 +62,19 @@ def end(actor: SupervisedActor, now: float) -> Fault:
 
 def test_an_end_counts_only_within_the_window(actor: SupervisedActor):
     for now in (0.0, 150.0, 300.0):
-        assert end(actor, now).kind == "died"
+        get_ready(actor, now)
+        assert end(actor, now + 50.0).kind == "died"
         actor.start()
-    assert end(actor, 350.0).kind == "gave_up", "two within 100 s"
+    get_ready(actor, 350.0)
+    assert "that was end 2 within 100 s" in end(actor, 400.0).message
+
+
+def test_starts_that_fail_count_however_long_they_take(actor: SupervisedActor):
+    assert end(actor, 0.0).kind == "died"
+    actor.start()
+    fault = end(actor, 135.0)
+    assert fault.kind == "gave_up"
+    assert "that was end 2 within 135 s, and actors.max_restarts allows 1 restarts" in fault.message
 
 
 def test_an_actor_that_starts_an_engine_in_mid_run_is_given_the_time_of_a_start(actor: SupervisedActor):
@@ -83,3 +93,56 @@ def test_after_a_stable_life_the_next_start_comes_soon(actor: SupervisedActor):
         actor.start()
         get_ready(actor, begin)
         assert end(actor, begin + lived_s).message.endswith(f"in {wait}")
+
+
+def test_an_actor_that_soon_dies_each_time_is_started_again_for_days(
+    actor: SupervisedActor, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(supervisor.janitor, "clean_dead_instances", list)  # it takes milliseconds
+    for number in range(1100):
+        get_ready(actor, 1000.0 * number)
+        fault = end(actor, 1000.0 * number)
+        actor.start()
+    assert fault.message.endswith("restart 1 of 1 in 15.00 s")
+
+
+def test_a_new_process_is_given_the_time_of_a_start_whatever_its_predecessor_did(actor: SupervisedActor):
+    get_ready(actor, 0.0)
+    actor.watch(0.0, 31.0)
+    (fault,) = actor.watch(1.0, 0.0)
+    assert fault.kind == "stuck"
+    actor.start()
+    assert not actor.ready
+    assert actor.watch(2.0, 119.0) == []
+    assert not actor.process.dumped
+    actor.watch(3.0, 2.0)
+    assert actor.process.dumped
+
+
+def test_an_episode_of_no_task_of_the_run_is_a_fault(actor: SupervisedActor):
+    stats = EpisodeStats(
+        lane=0, task=2, episode=0, seed=0, score=0.0, reward=0.0, reward_components={}, length_frames=4, length_steps=1,
+        params_version=0, terminated=True, truncated=False,
+    )  # fmt: skip
+    actor.process.said.append(stats)
+    (fault,) = actor.watch(0.0, 0.0)
+    assert "got an episode of lane 0, task 2, want one of lanes [0, 1] and a task below 2" in fault.message
+
+
+def test_an_actor_that_ends_a_long_reset_while_it_is_looked_at_is_not_stuck(
+    actor: SupervisedActor, monkeypatch: pytest.MonkeyPatch
+):
+    get_ready(actor, 0.0)
+    writer, look = actor.ring.writer(), actor.ring.writer_status
+    writer.beat(WriterState.RESETTING)
+    actor.watch(0.0, 1.0)
+
+    def look_and_act() -> WriterStatus:
+        status = look()
+        writer.beat(WriterState.ACTING)
+        return status
+
+    monkeypatch.setattr(actor.ring, "writer_status", look_and_act)
+    actor.watch(0.0, 99.0)
+    actor.watch(0.0, 29.0)
+    assert not actor.process.dumped

@@ -150,6 +150,22 @@ def test_told_to_stop_it_ends_well(spec: ActorSpec, ring: RingReader, monkeypatc
         process.end(grace_s=0.0)
 
 
+def test_it_hears_of_the_end_also_where_its_ring_never_fills(
+    spec: ActorSpec, ring: RingReader, channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
+):
+    actor, steps = Worker(spec, channels[1], ring.descriptor, None), []
+
+    def step() -> None:
+        steps.append(1)
+        assert len(steps) < 10, "it was told to stop"
+        if len(steps) == 3:
+            channels[0].send(Stop())
+
+    monkeypatch.setattr(actor._loop, "step", step)
+    actor.run()
+    assert len(steps) == 3
+
+
 def test_a_learner_that_never_reads_is_given_up(
     spec: ActorSpec, ring: RingReader, channels: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
 ):

@@ -116,12 +116,13 @@ def test_the_next_life_of_a_host_plays_new_episodes_and_those_that_were_cut_are_
 
 def test_a_host_that_does_not_stay_up_is_started_later_each_time(host):
     waits = []
-    for playing_s in (0.0, 0.0, None, *[0.0] * 5, -1.0):
+    for playing_s in (0.0, 0.0, None, *[0.0] * 1100, -1.0):
         host.incarnation.playing_s = playing_s
         host.end(10.0)
         waits.append(host.start_at_s - 10.0)
         begin(host)
-    assert waits == [1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0, 30.0, 0.5], "the last one has played for 11 s"
+    assert waits[:7] == [1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0]
+    assert waits[-2:] == [30.0, 0.5], "the last one has played for 11 s"
 
 
 @pytest.mark.parametrize(

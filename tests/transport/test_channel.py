@@ -8,7 +8,7 @@ import pytest
 
 from gvz.core.errors import TransportError, WaitTimeoutError
 from gvz.transport.channel import MAX_MESSAGE_BYTES, Channel
-from gvz.transport.messages import Fault, Ready, Stop
+from gvz.transport.messages import Fault, Ready, Stop, encode
 
 
 @pytest.fixture
@@ -31,6 +31,19 @@ def test_messages_arrive_whole_and_in_order(pair: tuple[Channel, Channel]):
         a.send(message)
     assert b.receive() == sent
     assert b.receive() == []
+
+
+def test_a_message_that_comes_in_pieces_is_taken_when_it_is_whole():
+    left, right = socket.socketpair()
+    channel, data = Channel(right, peer="A"), encode(Stop())
+    *early, last = struct.pack("<I", len(data)) + data
+    for byte in early:
+        left.sendall(bytes([byte]))
+        assert channel.receive() == []
+    left.sendall(bytes([last]))
+    assert channel.receive() == [Stop()]
+    left.close()
+    channel.close()
 
 
 def test_a_message_larger_than_the_sockets_buffer_passes(pair: tuple[Channel, Channel]):

@@ -124,6 +124,7 @@ class RingMachine(RuleBasedStateMachine):
         assert self.writer.free == CAPACITY - len(self.unread)
 
     def teardown(self):
+        self.writer.close()  # its mapping holds a descriptor
         self.reader.close()
 
 
@@ -231,6 +232,21 @@ def test_closing_can_be_repeated_and_leaves_the_other_end_its_memory(reader: Rin
 def test_another_layout_is_refused(reader: RingReader, capacity: int, shape: tuple[int, int, int]):
     with pytest.raises(TransportError, match=r"layout hash|bytes"):
         RingWriter.attach(reader.descriptor, capacity, shape)
+
+
+def test_records_count_when_they_are_whole_and_a_state_when_its_heartbeat_has_come(
+    reader: RingReader, writer: RingWriter
+):
+    sequence, found = steps_of(reader)["sequence"], []
+
+    class Words(list[int]):
+        def __setitem__(self, index, value):
+            found.append((index, sequence[:2].tolist()))
+
+    writer._words = Words([0] * 16)
+    write(writer, 0, 1)
+    writer.beat(WriterState.ACTING)
+    assert found == [(0, [0, 1]), (1, [0, 1]), (2, [0, 1])], "published, heartbeat, state"
 
 
 # ---- damage: what a broken writer, or anything else with access, may have done to the memory

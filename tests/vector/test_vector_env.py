@@ -295,6 +295,8 @@ def test_infos_of_some_games_have_masks():
             "_d": np.array([False, False, True]),
         },
     )
+    batch["_a"][:] = False
+    assert batch["_b"].tolist() == [True, False, True], "each key has a mask of its own"
 
 
 @pytest.mark.engine

@@ -124,7 +124,7 @@ def test_same_step_gives_the_lost_episode_its_end_and_begins_the_next():
 
 
 def test_games_that_waited_for_an_action_when_their_worker_died_are_cut_too():
-    envs = gvz.make_vec(TASK, 2, num_workers=1, batch_size=1, render_mode="rgb_array")
+    envs = gvz.make_vec("health_gathering/default", 2, num_workers=1, batch_size=1, render_mode="rgb_array")
     envs.reset(seed=1)
     envs.send(TURN)
     (waiting,) = envs.recv()[4]["env_id"]
@@ -138,6 +138,7 @@ def test_games_that_waited_for_an_action_when_their_worker_died_are_cut_too():
     observation, reward, terminated, truncated, infos = envs.recv()
     np.testing.assert_array_equal(observation, before)
     assert (reward[0], terminated[0], truncated[0], infos["engine_crash"][0]) == (0.0, False, True, True)
+    assert infos["reward_components"]["living"][0] == 0.0
     envs.send(TURN[:1], [waiting])
     infos = envs.recv()[4]
     assert (infos["episode_frames"][0], infos["engine_crash"][0]) == (0, False)
@@ -169,6 +170,19 @@ def test_death_upon_death_is_an_error_that_says_what_happened_and_closes_everyth
         envs.step(TURN[:1])
     with pytest.raises(ClosedEnvironmentError):
         envs.reset()
+
+
+def test_a_whole_episode_makes_a_workers_death_forgotten(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(crew, "_MAX_DEATHS", 1)
+    envs = gvz.make_vec(TASK, 1, frame_skip=35)
+    for _ in range(2):
+        envs.reset(seed=1)
+        os.kill(envs._crew.pids[0], signal.SIGKILL)
+        assert envs.step(TURN[:1])[4]["engine_crash"].all()
+        envs.step(TURN[:1])
+        while not np.logical_or(*envs.step(TURN[:1])[2:4]).all():
+            pass
+    envs.close()
 
 
 def test_an_error_of_a_worker_is_raised_here_and_closes_everything(monkeypatch: pytest.MonkeyPatch):
