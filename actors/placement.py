@@ -41,18 +41,27 @@ def actor_cores(kind: PlacementKind, num_actors: int) -> list[int | None]:
 def _hold(cores: list[int], count: int) -> list[int]:
     """The last `count` of these cores that no other run holds, now held by this one; none if there are fewer."""
     give_back()
-    held: list[int] = []
-    for core in reversed(cores):
-        lock = (janitor.runtime_dir() / f"actors-{core}.lock").open("w")
+    held = held_cores(reversed(cores), count, "actors")
+    _locks.extend(held.values())
+    return sorted(held)
+
+
+def held_cores(cores: Iterable[int], count: int, holder: str) -> dict[int, IO[str]]:
+    """The first `count` of these cores that no other holder of this name has, each with its lock; none if there are
+    fewer. Holders are processes of this user on this machine. A lock lasts as long as it is open.
+    """
+    held: dict[int, IO[str]] = {}
+    for core in cores:
+        lock = (janitor.runtime_dir() / f"{holder}-{core}.lock").open("w")
         if len(held) < count and records.lock(lock):
-            held.append(core)
-            _locks.append(lock)
+            held[core] = lock
         else:
             lock.close()
-    if len(held) < count:
-        give_back()
-        return []
-    return sorted(held)
+    if len(held) == count:
+        return held
+    for lock in held.values():
+        lock.close()
+    return {}
 
 
 def give_back() -> None:

@@ -24,6 +24,7 @@ from typing import Any
 
 import psutil
 
+from actors.placement import give_back
 from benchmarks import workload
 from benchmarks.rounds import Budget, Row, goal, measured, rates
 
@@ -120,6 +121,7 @@ def run_command(
     `further` are flags. `look` is called with the process's id, only from the first row on, because sampling slows the
     process down.
     """
+    give_back()  # the cores of this process's own parts: the run has the machine to itself
     flags = ["--learner.total-updates", str(updates), "--log.period-updates", str(log_period)]
     flags += [*workload.quick_flags(budget), *further]
     command = [sys.executable, "-m", "gvz.launch", "--config", "rainbow_4task.py", "--run-dir", str(directory), *flags]

@@ -43,9 +43,9 @@ _WEAPON_UP_TIC = 10
 """tic at which the weapon is ready: episodes with a weapon start there, as LevDoom's do"""
 _COUNTED = {"kills": "KILLCOUNT", "goals": "GOALS"}
 """metric -> the variable that counts it"""
-_MAX_CRASHES = 3
 _FUZZY = re.compile("fuzzy|spectre|blursphere|type=58,", re.IGNORECASE)
 """what draws something with the fuzz effect: a render style, Doom's spectre (thing 58), what hides the agent"""
+_MAX_CRASHES = 3
 """crashes in a row, without a complete episode in between, after which the environment raises an error"""
 
 

@@ -12,7 +12,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from benchmarks import plots, record, remote, report, rounds, runner
+from actors import placement
+from benchmarks import plots, record, remote, report, rounds, runner, whole
 from gvz.core.control_groups import num_cores
 from gvz.core.errors import ConfigError
 from tests.processes import arguments
@@ -67,6 +68,18 @@ def test_a_body_runs_and_measures_its_goals(name):
             assert spread is None or len(spread["values"]) == 1, row
             assert spread is None or spread["median"] >= 0 or "exponent" in row["name"], row
     assert json.loads(json.dumps(rows)) == rows
+
+
+def test_a_run_that_is_measured_may_have_the_cores_of_the_benchmarks_own_parts(tmp_path, monkeypatch):
+    def start(*_, **__):
+        assert lock.closed
+        raise FileNotFoundError
+
+    lock = (tmp_path / "lock").open("w")
+    monkeypatch.setattr(placement, "_locks", [lock])
+    monkeypatch.setattr(subprocess, "Popen", start)
+    with pytest.raises(FileNotFoundError):
+        whole.run_command(tmp_path / "run", QUICK, 1, 1, 1.0, print)
 
 
 def test_the_command_writes_a_record_that_the_page_refuses(tmp_path):

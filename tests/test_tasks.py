@@ -328,9 +328,9 @@ def test_an_attribute_whose_name_or_groups_would_make_another_task_is_refused(ch
         ({"metric": "kill"}, "got the metric 'kill', want one of frames_alive, kills, goals"),
         (
             {"timeouts": {"thesis": 1100}},
-            r"got timeouts {'thesis': 1100}, want a positive one of \('thesis', 'levdoom'\)",
+            "got timeouts {'thesis': 1100}, want a positive one for each profile",
         ),
-        ({"upper_bounds": {"thesis": 0, "levdoom": 1}}, "got upper_bounds .*, want a positive one"),
+        ({"upper_bounds": {"thesis": 0, "levdoom": 1}}, "got upper_bounds .*, want a positive one for each"),
         ({"combination_buttons": ("ATTACK", "SPEED")}, "combination_buttons: got {'SPEED'}, want some of ATTACK, TURN"),
         (
             {"rewards": {"shells": Reward(event=Fell("AMMO3"), weight=-1.0, levdoom=-1.0)}},

@@ -4,12 +4,10 @@ import os
 import random
 import socket
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
-from actors.placement import idle_cores
-from gvz.core import janitor, records
+from actors.placement import held_cores, idle_cores
 from gvz.experiments.process import LocalProcess
 
 RAYS_OWN = ("RAY_", "OMP_NUM_THREADS", "PYTHONBREAKPOINT")
@@ -66,18 +64,5 @@ def hold_cores(count: int) -> tuple[tuple[int, ...], list[IO[str]]]:
     """
     allowed, idle = sorted(os.sched_getaffinity(0)), idle_cores()
     first = random.randrange(len(allowed))
-    cores: list[int] = []
-    locks: list[IO[str]] = []
-    for core in sorted(allowed[first:] + allowed[:first], key=lambda core: core not in idle):
-        lock = (janitor.runtime_dir() / f"core-{core}.lock").open("w")
-        if len(cores) < count and records.lock(lock):
-            cores.append(core)
-            locks.append(lock)
-        else:
-            lock.close()
-    if len(cores) == count:
-        return tuple(cores), locks
-    for lock in locks:
-        with suppress(OSError):
-            lock.close()
-    return tuple(allowed), []
+    held = held_cores(sorted(allowed[first:] + allowed[:first], key=lambda core: core not in idle), count, "core")
+    return (tuple(held), list(held.values())) if held else (tuple(allowed), [])

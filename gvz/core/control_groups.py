@@ -5,6 +5,7 @@ import math
 import os
 import random
 from collections.abc import Generator
+from functools import cache
 from pathlib import Path
 
 MOUNTED, LISTED = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
@@ -29,11 +30,17 @@ def num_cores() -> int:
     """Cores that this process can keep busy: those it may use, or fewer where a container or batch job has a quota of
     processor time (`docker run --cpus`, Kubernetes' limits). A part of a core counts as one.
     """
-    found = [len(os.sched_getaffinity(0))]
+    return min([len(os.sched_getaffinity(0)), *_quotas()])
+
+
+@cache
+def _quotas() -> tuple[int, ...]:
+    """Cores that each quota is worth. Read once in a process: configurations ask again and again."""
+    found: list[int] = []
     for group in own_groups("cpu"):
         with contextlib.suppress(OSError, ValueError):  # it has no quota, or another container has it
             found.append(_quota_in(group))
-    return min(found)
+    return tuple(found)
 
 
 def _quota_in(group: Path) -> int:

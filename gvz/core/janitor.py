@@ -47,8 +47,8 @@ QUEUE_PREFIXES = ("ViZDoomMQCtr", "ViZDoomMQDoom")
 """of the names of an engine's message queues in shared memory, each followed by its instance id"""
 _ENGINE_SHM_PREFIXES = ("ViZDoomSM", *QUEUE_PREFIXES)
 _PR_SET_PDEATHSIG = 1
-_UNREADABLE = (OSError, ValueError, KeyError, TypeError, RecursionError)
-"""what reading a damaged or forged record ends in"""
+_UNREADABLE = (OSError, ValueError, KeyError, TypeError, RecursionError, ResourceError)
+"""what reading a damaged or forged record ends in, or one on a file system without locks"""
 _held: dict[Path, int] = {}
 """descriptors of this process's records, locked. No file objects: Python closes these while it ends, when a thread of
 ViZDoom's client may still start an engine."""
@@ -114,14 +114,12 @@ def temporary_directory(place: Path | None = None) -> Generator[Path, None, None
 def record(directory: Path) -> None:
     """Notes that this process owns a private directory. Call it before that is made: no instant is unprotected."""
     path = _record_path(_checked(directory))
-    file = _opened(path)
-    while not (records.lock(file) and path.exists()):  # a janitor has taken the empty file for one of a dead owner
-        file.close()
-        file = _opened(path)
-    with file:
-        json.dump({"directory": str(directory), "owner_pid": os.getpid()}, file)
-        file.flush()
-        _held[directory] = os.dup(file.fileno())  # shares the lock
+    while directory not in _held:
+        with _opened(path) as file:
+            if records.lock(file) and path.exists():  # else a janitor has taken the empty file for one of a dead owner
+                json.dump({"directory": str(directory), "owner_pid": os.getpid()}, file)
+                file.flush()
+                _held[directory] = os.dup(file.fileno())  # shares the lock
 
 
 def forget(directory: Path) -> None:

@@ -36,7 +36,7 @@ MAX_ROWS = {"metrics.jsonl": 100, "episodes.jsonl": 4_000}
 
 def zoo_names() -> list[str]:
     """Names of the policies."""
-    return sorted(file.stem for file in ZOO_DIRECTORY.glob("*.zip"))
+    return sorted(file.stem for file in ZOO_DIRECTORY.glob("[!.]*.zip"))  # one that is being written begins with a dot
 
 
 def run_directory(path: Path) -> Path:

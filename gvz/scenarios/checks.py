@@ -67,12 +67,12 @@ def _check_attributes(scenario: "Scenario") -> None:
 def _check_score(scenario: "Scenario") -> None:
     from gvz.scenarios.base import BOOKKEEPING, Metric  # which imports this module
 
-    where, profiles = f"scenario {scenario.id}", get_args(Profile)
+    where = f"scenario {scenario.id}"
     if scenario.metric not in get_args(Metric):
         raise TaskError(f"{where}: got the metric {scenario.metric!r}, want one of {', '.join(get_args(Metric))}")
     for field in ("timeouts", "upper_bounds"):
-        if not all(getattr(scenario, field).get(profile, 0) > 0 for profile in profiles):
-            raise TaskError(f"{where}: got {field} {getattr(scenario, field)}, want a positive one of {profiles}")
+        if not all(getattr(scenario, field).get(profile, 0) > 0 for profile in get_args(Profile)):
+            raise TaskError(f"{where}: got {field} {getattr(scenario, field)}, want a positive one for each profile")
     if strange := set(scenario.combination_buttons or ()) - set(scenario.buttons):
         raise TaskError(f"{where}, combination_buttons: got {strange}, want some of {', '.join(scenario.buttons)}")
     variables = (*scenario.game_variables, *ALWAYS_READ, *BOOKKEEPING)

@@ -203,7 +203,9 @@ def map_source(task: Task, profile: Profile, number: int | None = None) -> MapSo
     every = _all_ways(task, profile).overlaid(content)
     decorate = "\n".join(every.actors.values())
     _check_sprites(task, decorate)
-    drawn.things += [make_thing(t.type, t.x, t.y, tid=t.tid) for t in _checked_things(task, content, drawn, decorate)]
+    drawn.things += [
+        make_thing(t.type, t.x, t.y, tid=t.tid) for t in _checked_things(task, profile, content, drawn, decorate)
+    ]
     try:
         check_textures(drawn, {*stock_textures(), *content.blends})
         textures = "".join(
@@ -333,7 +335,7 @@ def _base_map(file_name: str) -> UdmfMap:
     return parse_textmap(read_maps(read_wad(scenario_wad(file_name)))[MAP_NAME]["TEXTMAP"].decode("latin-1"))
 
 
-def _checked_things(task: Task, content: Content, drawn: UdmfMap, decorate: str) -> tuple[Thing, ...]:
+def _checked_things(task: Task, profile: Profile, content: Content, drawn: UdmfMap, decorate: str) -> tuple[Thing, ...]:
     """The things added to the base map. The engine itself would leave out an invalid thing, or show a sign instead."""
     scenario = task.scenario
     parts = [scenario.content, scenario.levdoom, *scenario.levdoom_tasks.values()]
@@ -346,7 +348,7 @@ def _checked_things(task: Task, content: Content, drawn: UdmfMap, decorate: str)
         )
     assert content.base_wad is not None
     for attribute in map(scenario.attribute, task.attributes):
-        if (own := {**attribute.content.things, **attribute.levdoom.things}) and content.base_wad not in own:
+        if (own := _change(attribute, profile).things) and content.base_wad not in own:
             raise TaskError(
                 f"task {task.id}: {attribute.name} has things on {', '.join(own)} alone, want places on "
                 f"{content.base_wad}, too, or () for none there"

@@ -18,7 +18,7 @@ from gvz.scenarios.base import Blend, Chance, Content, Period, Textures, Thing, 
 
 def is_whole(change: Content) -> bool:
     """Whether an attribute's content cannot be graded."""
-    named = any(isinstance(value, str | tuple) for value in change.parameters.values())
+    named = any(isinstance(value, str | tuple | bool) for value in change.parameters.values())
     return named or bool(change.base_wad or change.actors)
 
 
@@ -69,7 +69,7 @@ def _part_way(before: Mapping[str, Value], change: Mapping[str, Value], share: f
 
 def _between(before: Value | None, value: Value, share: float) -> Value:
     if isinstance(value, str | bool):
-        return Chance(str(value), share, before if isinstance(before, str) else None)
+        return Chance(str(value), share, str(before) if isinstance(before, str | bool) else None)
     assert isinstance(value, int | float | Uniform), "change is not whole"
     if not isinstance(before, int | float | Uniform):
         return Toward(value, share)

@@ -1,6 +1,7 @@
 """The number of cores follows the quota of a container or batch job."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,8 +11,11 @@ from gvz.core.control_groups import num_cores, some_cores
 
 
 @pytest.fixture(autouse=True)
-def sixty_four_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+def sixty_four_cores(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(64)))
+    control_groups._quotas.cache_clear()
+    yield
+    control_groups._quotas.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -39,6 +43,8 @@ def test_a_quota_of_processor_time_is_worth_so_many_cores(
         (directory / "cpu.max").write_text(f"{'max' if quota is None else quota} 100000\n")
     assert num_cores() == cores
     monkeypatch.setattr(control_groups, "MOUNTED", tmp_path / "none")
+    assert num_cores() == cores, "read once: the configurations of all experiments ask 3,000 times"
+    control_groups._quotas.cache_clear()
     assert num_cores() == 64
 
 

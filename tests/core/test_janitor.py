@@ -1,6 +1,8 @@
 """The janitor removes what dead owners left, and nothing else."""
 
 import contextlib
+import errno
+import fcntl
 import json
 import mmap
 import os
@@ -19,6 +21,7 @@ from gvz.core import janitor
 from gvz.core.errors import ResourceError
 from gvz.core.stop import StopRequest
 from gvz.engine import process
+from gvz.run import doctor
 from tests.processes import run_until_killed
 from tests.waiting import wait_until
 
@@ -179,6 +182,21 @@ def test_forged_records_delete_nothing(registry: Path, name: str):
     assert (registry / "forged.json").exists()
     with pytest.raises(ValueError, match=r"record of .*: want an absolute path that ends in gvz-engine-"):
         janitor.record(Path(name))
+
+
+def test_without_locks_records_are_left_alone_and_the_doctor_goes_on(
+    registry: Path, directory: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def flock(*_: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with pytest.raises(ResourceError, match="cannot be locked"):
+        janitor.record(directory)
+    (line,) = janitor.clean_dead_instances()
+    assert line.startswith(f"left alone: unreadable record {registry}")
+    assert "cannot be locked: No locks available" in line
+    assert doctor.check_leftovers().state == "ok"
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from gvz.commands import zoo as zoo_command
 from gvz.core import janitor
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError, ResourceError
+from gvz.core.files import written_whole
 from gvz.core.registry import OwnFiles
 from gvz.evaluation import zoo
 from gvz.evaluation.episode_log import RecordFile, read_rows
@@ -74,6 +75,12 @@ def test_a_packed_policy_has_the_network_of_its_segmented_frames(tmp_path):
     assert trained_player(run_directory("zoo:two"), again, 20).identity == identity
     kept.write_bytes(kept.read_bytes() + b"another network")
     assert trained_player(packed, found, 20).identity != identity, "these would be episodes of another player"
+
+
+def test_a_policy_that_is_being_written_is_not_listed(run):
+    pack(run, "one")
+    with written_whole(zoo.ZOO_DIRECTORY / "two.zip"):
+        assert zoo_names() == ["one"]
 
 
 def test_files_that_the_cache_lost_are_unpacked_again(run):

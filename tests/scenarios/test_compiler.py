@@ -295,6 +295,15 @@ def test_things_of_another_map_alone_are_refused():
             compile_task(task)
 
 
+def test_things_of_profile_levdoom_alone_do_not_bind_a_task_of_the_thesis():
+    hall, places = scenario_named("health_gathering"), {"health_gathering.wad": (Thing(35, 300, 300),)}
+    candle = Attribute(name="candle", groups=("candles",), content=Content(), levdoom=Content(things=places))
+    task = Task(dataclasses.replace(hall, attributes=(*hall.attributes, candle)), ("candle", "supreme"))
+    compile_task(task)
+    with pytest.raises(TaskError, match=r"candle has things on health_gathering\.wad alone"):
+        compile_task(task, "levdoom")
+
+
 def test_an_integer_radius_is_refused():
     centre = scenario_named("defend_the_center")
     content = centre.content.overlaid(Content(parameters={"radius": 735}))

@@ -167,6 +167,7 @@ def test_a_file_has_the_blends_of_all_maps_that_its_episodes_play():
         (Content(parameters={"delay": 3}, entity={"RenderStyle": "STYLE_Add"}), False),
         (Content(parameters={"classes": ("Demon",)}), True),
         (Content(parameters={"kit": '"Stimpack"'}), True),
+        (Content(parameters={"moves": True}), True),
         (Content(base_wad="basic.wad"), True),
         (Content(actors={"Big": "ACTOR Big : Demon\n{\n}\n"}), True),
     ],
@@ -210,6 +211,13 @@ def test_a_share_of_the_things_has_a_style_or_flag_and_the_others_keep_the_scena
     assert "SetActorProperty(0, APROP_Invulnerable, True);" in map_source(task, "thesis").script
     half = map_source(dataclasses.replace(task, severities=(("safe", 0.5),)), "thesis").script
     assert "if (Random(0.0, 1.0) < 0.5) SetActorProperty(0, APROP_Invulnerable, True);" in half
+    safe_content = centre.content.overlaid(Content(agent={"Invulnerable": True}))
+    unsafe = dataclasses.replace(safe, content=Content(agent={"Invulnerable": False}))
+    scenario = dataclasses.replace(task.scenario, content=safe_content, attributes=(unsafe,))
+    assert (
+        "SetActorProperty(0, APROP_Invulnerable, True); "
+        "if (Random(0.0, 1.0) < 0.5) SetActorProperty(0, APROP_Invulnerable, False);"
+    ) in map_source(Task(scenario, ("safe",), severities=(("safe", 0.5),)), "thesis").script
 
 
 @pytest.mark.parametrize(("profile", "whole", "first"), [("thesis", 30, 1), ("levdoom", 60, 0)])
