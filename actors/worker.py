@@ -130,15 +130,8 @@ def main() -> int:
     except Exception as error:  # the process boundary: whatever it is, the learner is to hear of it
         kind = "engine_start" if isinstance(error, EngineError) else "exception"
         message = f"{type(error).__name__}: {error}"
-        channel.send(
-            Fault(
-                actor=spec.actor,
-                lane=None,
-                kind=kind,
-                message=message,
-                traceback=traceback.format_exc(),
-            )
-        )
+        text = traceback.format_exc()
+        channel.send(Fault(actor=spec.actor, lane=None, kind=kind, message=message, traceback=text))
         with contextlib.suppress(OSError):  # the disk with the log is full
             traceback.print_exc()
         return 1

@@ -4,19 +4,18 @@
 instead of its 128, so that there are 312 rollouts and not 78.
 """
 
+from dataclasses import replace
+
 from actors.config import ActorsConfig
 from configs.rainbow_quick import CONFIG as RAINBOW
-from gvz.run.config import CheckpointConfig, RunConfig
-from learner.agents.configs.ppo import PPOConfig
-from learner.config import OnPolicyConfig
+from gvz.run.config import CheckpointConfig
+from learner.config import OnPolicyConfig, change_agent
 
-CONFIG = RunConfig(
+CONFIG = replace(
+    RAINBOW,
     name="ppo_quick",
-    scenario=RAINBOW.scenario,
-    training_set=RAINBOW.training_set,
-    env=RAINBOW.env,
     actors=ActorsConfig(num_actors=2, games_per_actor=4),
-    agent=PPOConfig(conv_channels=(16, 32), conv_kernels=(8, 4), conv_strides=(4, 2), hidden_units=128),
+    agent=change_agent(RAINBOW.agent, "ppo"),
     replay=None,
     learner=OnPolicyConfig(total_updates=3_750, rollout_steps=32, num_epochs=3, num_minibatches=4, learning_rate=5e-4),
     checkpoint=CheckpointConfig(period_updates=1_000),

@@ -10,14 +10,13 @@ from actors.config import ActorsConfig
 from configs.ppo_quick import CONFIG as PPO
 from configs.rainbow_segmented import CONFIG as SEGMENTED
 from configs.rainbow_segmented import SCENARIO_SETTINGS as SEGMENTED_SETTINGS
-
-_SHARED = ("conv_channels", "conv_kernels", "conv_strides", "hidden_units", "discount", "game_variables")
+from learner.config import change_agent
 
 CONFIG = dataclasses.replace(
     SEGMENTED,
     name="ppo_segmented",
     actors=ActorsConfig(num_actors=2),
-    agent=dataclasses.replace(PPO.agent, **{name: getattr(SEGMENTED.agent, name) for name in _SHARED}),
+    agent=change_agent(SEGMENTED.agent, "ppo"),
     replay=None,
     learner=dataclasses.replace(PPO.learner, total_updates=500_000),
 )

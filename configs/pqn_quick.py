@@ -4,22 +4,19 @@ Windows of 32 steps, two epochs and lambda are the paper's for Atari (Gallici et
 of the decisions as there. There are 8 games instead of its 128, and 8 minibatches of 32 steps instead of 32 of 128.
 """
 
-from actors.config import ActorsConfig
-from configs.rainbow_quick import CONFIG as RAINBOW
-from gvz.run.config import CheckpointConfig, RunConfig
+from dataclasses import replace
+
+from configs.ppo_quick import CONFIG as PPO
+from gvz.run.config import CheckpointConfig
 from learner.agents.configs.pqn import PQNConfig
 from learner.config import OnPolicyConfig
 
-CONFIG = RunConfig(
+CONFIG = replace(
+    PPO,
     name="pqn_quick",
-    scenario=RAINBOW.scenario,
-    training_set=RAINBOW.training_set,
-    env=RAINBOW.env,
-    actors=ActorsConfig(num_actors=2, games_per_actor=4),
     agent=PQNConfig(
         conv_channels=(16, 32), conv_kernels=(8, 4), conv_strides=(4, 2), hidden_units=128, epsilon_decay_steps=8_000
     ),
-    replay=None,
     learner=OnPolicyConfig(
         total_updates=5_000,
         rollout_steps=32,

@@ -4,8 +4,4 @@ from dataclasses import replace
 
 from configs.rainbow_4task import CONFIG as RAINBOW
 
-CONFIG = replace(
-    RAINBOW,
-    name="rainbow_hidden_4096",
-    agent=replace(RAINBOW.agent, hidden_units=4096),
-)
+CONFIG = replace(RAINBOW, name="rainbow_hidden_4096", agent=replace(RAINBOW.agent, hidden_units=4096))

@@ -4,8 +4,4 @@ from dataclasses import replace
 
 from configs.rainbow_4task import CONFIG as RAINBOW
 
-CONFIG = replace(
-    RAINBOW,
-    name="rainbow_no_double",
-    agent=replace(RAINBOW.agent, double=False),
-)
+CONFIG = replace(RAINBOW, name="rainbow_no_double", agent=replace(RAINBOW.agent, double=False))

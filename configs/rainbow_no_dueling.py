@@ -4,8 +4,4 @@ from dataclasses import replace
 
 from configs.rainbow_4task import CONFIG as RAINBOW
 
-CONFIG = replace(
-    RAINBOW,
-    name="rainbow_no_dueling",
-    agent=replace(RAINBOW.agent, dueling=False),
-)
+CONFIG = replace(RAINBOW, name="rainbow_no_dueling", agent=replace(RAINBOW.agent, dueling=False))

@@ -4,8 +4,4 @@ from dataclasses import replace
 
 from configs.rainbow_4task import CONFIG as RAINBOW
 
-CONFIG = replace(
-    RAINBOW,
-    name="rainbow_no_noisy",
-    agent=replace(RAINBOW.agent, noisy="off"),
-)
+CONFIG = replace(RAINBOW, name="rainbow_no_noisy", agent=replace(RAINBOW.agent, noisy="off"))

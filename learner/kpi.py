@@ -1,5 +1,7 @@
 """Key performance indicators of the tasks and the loss weights made of them."""
 
+from typing import Any
+
 import numpy as np
 
 from learner.config import LearnerConfig
@@ -51,21 +53,20 @@ class TaskKpis:
         # max / KPI >= bound is KPI <= max / bound: no division by a KPI of 0.
         return np.where(kpis * bound <= best, bound, best / np.maximum(kpis, 1e-300)).astype(np.float32)
 
-    def state(self) -> dict[str, np.ndarray]:
-        """Copies of all that is remembered, for a checkpoint."""
-        return {"scores": self._scores.copy(), "num_episodes": self._num_episodes.copy()}
+    def state(self) -> dict[str, Any]:
+        """All that is remembered, for a checkpoint: msgpack types."""
+        return {"scores": self._scores.tolist(), "num_episodes": self._num_episodes.tolist()}
 
-    def restore(self, state: dict[str, np.ndarray]) -> None:
+    def restore(self, state: dict[str, Any]) -> None:
         """Takes back what `state` gave.
 
         Raises:
             ValueError: it was made for other tasks or another window.
         """
         for name, mine in (("scores", self._scores), ("num_episodes", self._num_episodes)):
-            if state[name].shape != mine.shape:
+            if (shape := np.shape(state[name])) != mine.shape:
                 raise ValueError(
-                    f"TaskKpis.restore: {name} has shape {state[name].shape}, want {mine.shape} "
-                    "(number of tasks, kpi_window_episodes)"
+                    f"TaskKpis.restore: {name} has shape {shape}, want {mine.shape} (number of tasks, "
+                    "kpi_window_episodes)"
                 )
-        self._scores[:] = state["scores"]
-        self._num_episodes[:] = state["num_episodes"]
+            mine[:] = state[name]

@@ -27,20 +27,8 @@ class RateLimiter:
             env_steps_per_update: decisions (all games together) for one gradient step, more than 0.
             warmup_steps: decisions before the first update.
             tolerance: decisions by which the actors may lead.
-            num_updates_per_call: gradient steps that are done at once.
-
-        Raises:
-            ValueError: an argument out of range.
+            num_updates_per_call: gradient steps that are done at once, at least 1.
         """
-        for name, value, low in (
-            ("warmup_steps", warmup_steps, 0),
-            ("tolerance", tolerance, 0),
-            ("num_updates_per_call", num_updates_per_call, 1),
-        ):
-            if value < low:
-                raise ValueError(f"rate limiter: got {name} {value}, want at least {low}")
-        if not 0 < env_steps_per_update < math.inf:
-            raise ValueError(f"rate limiter: got env_steps_per_update {env_steps_per_update}, want more than 0")
         # exact, and what was written: as a float 0.1 is a little more than a tenth, and ten updates cost over one step
         self._ratio = Fraction(str(env_steps_per_update))
         self._warmup_steps = warmup_steps

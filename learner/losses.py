@@ -18,7 +18,7 @@ def q_learning_td(
     r_t: Float[Array, " B"],
     discount_t: Float[Array, " B"],
     q_t_value: Float[Array, "B A"],
-    q_t_selector: Float[Array, "B A"] | None = None,
+    q_t_selector: Float[Array, "B A"],
 ) -> Float[Array, " B"]:
     """TD error of (double, n-step) Q-learning: r + discount * Q'(s', argmax_a S(s', a)) - Q(s, a).
 
@@ -28,8 +28,7 @@ def q_learning_td(
         r_t: (n-step) reward.
         discount_t: what multiplies the bootstrap; 0 where terminated.
         q_t_value: target network's action values at t.
-        q_t_selector: who chooses the action at t: the online network's values for double Q-learning; None lets
-            the target network choose its own maximum.
+        q_t_selector: who chooses the action at t: the online network's values for double Q-learning, else `q_t_value`.
 
     Returns:
         TD errors; no gradient flows through the target.
@@ -37,10 +36,8 @@ def q_learning_td(
     Source: thesis eq. 4.1 with the missing plus sign, 4.7, 4.9 (double) and 4.16 (n-step).
     """
     chex.assert_rank([q_tm1, a_tm1, r_t, discount_t, q_t_value], [2, 1, 1, 1, 2])
-    chex.assert_equal_shape([q_tm1, q_t_value])
-    selector = q_t_value if q_t_selector is None else q_t_selector
-    chex.assert_equal_shape([q_tm1, selector])
-    target = r_t + discount_t * take_action(q_t_value, jnp.argmax(selector, axis=-1))
+    chex.assert_equal_shape([q_tm1, q_t_value, q_t_selector])
+    target = r_t + discount_t * take_action(q_t_value, jnp.argmax(q_t_selector, axis=-1))
     return jax.lax.stop_gradient(target) - take_action(q_tm1, a_tm1)
 
 
@@ -110,7 +107,7 @@ def categorical_q_learning(
     discount_t: Float[Array, " B"],
     logits_t_value: Float[Array, "B A N"],
     atoms: Float[Array, " N"],
-    q_t_selector: Float[Array, "B A"] | None = None,
+    q_t_selector: Float[Array, "B A"],
 ) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
     """Cross-entropy between the projected target distribution and the online one, and their KL divergence.
 
@@ -121,8 +118,7 @@ def categorical_q_learning(
         discount_t: 0 where terminated.
         logits_t_value: target network's logits at t.
         atoms: the support.
-        q_t_selector: action values that choose the action at t (double: the online network's means); None lets
-            the target network choose by its own means.
+        q_t_selector: action values that choose the action at t: means of the online network (double) or of the target.
 
     Returns:
         (cross-entropy, KL divergence), one each per sample. Both have the same gradient; the KL divergence is 0 for
@@ -133,9 +129,7 @@ def categorical_q_learning(
     """
     chex.assert_rank([logits_tm1, a_tm1, r_t, discount_t, logits_t_value], [3, 1, 1, 1, 3])
     chex.assert_equal_shape([logits_tm1, logits_t_value])
-    probabilities_t = jax.nn.softmax(logits_t_value)
-    selector = expectation(probabilities_t, atoms) if q_t_selector is None else q_t_selector
-    p_t = take_action(probabilities_t, jnp.argmax(selector, axis=-1))  # [B, N]
+    p_t = take_action(jax.nn.softmax(logits_t_value), jnp.argmax(q_t_selector, axis=-1))  # [B, N]
     target = project(r_t[:, None] + discount_t[:, None] * atoms[None], p_t, atoms)
     target = jax.lax.stop_gradient(target)
     log_p_tm1 = jax.nn.log_softmax(take_action(logits_tm1, a_tm1))
@@ -158,7 +152,7 @@ def quantile_target(
     r_t: Float[Array, " B"],
     discount_t: Float[Array, " B"],
     z_t_value: Float[Array, "B A M"],
-    q_t_selector: Float[Array, "B A"] | None = None,
+    q_t_selector: Float[Array, "B A"],
 ) -> Float[Array, "B M"]:
     """r + discount * Z'(s', argmax_a S(s', a)), quantile by quantile; no gradient flows through it.
 
@@ -166,15 +160,13 @@ def quantile_target(
         r_t: (n-step) reward.
         discount_t: 0 where terminated.
         z_t_value: target network's quantile values at t; M of QR-DQN, or at M fractions that IQN sampled.
-        q_t_selector: action values that choose the action at t (double); None lets the target network choose by the
-            means of its quantiles.
+        q_t_selector: action values that choose the action at t: means of the online network (double) or of the target.
 
     Source: Dabney et al. 2018 (QR-DQN), Algorithm 1; Dabney et al. 2018 (IQN), eq. 2.
     """
     chex.assert_rank([r_t, discount_t, z_t_value], [1, 1, 3])
-    selector = z_t_value.mean(axis=-1) if q_t_selector is None else q_t_selector
-    chex.assert_equal_shape([selector, z_t_value[:, :, 0]])
-    z_t = take_action(z_t_value, jnp.argmax(selector, axis=-1))
+    chex.assert_equal_shape([q_t_selector, z_t_value[:, :, 0]])
+    z_t = take_action(z_t_value, jnp.argmax(q_t_selector, axis=-1))
     return jax.lax.stop_gradient(r_t[:, None] + discount_t[:, None] * z_t)
 
 

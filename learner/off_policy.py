@@ -86,7 +86,7 @@ class OffPolicyLearner:
             self._state, self._replay = self._placement.place(arrays["learner"], arrays["replay"])
             self._ingest.restore(state["ingest"])
             self._limiter.restore(state["limiter"])
-            self._kpis.restore({name: np.asarray(values) for name, values in state["kpis"].items()})
+            self._kpis.restore(state["kpis"])
 
     @property
     def params(self) -> Params:
@@ -159,8 +159,4 @@ class OffPolicyLearner:
         return {"learner": state, "replay": replay_state}
 
     def state(self) -> dict[str, Any]:
-        return {
-            "ingest": self._ingest.state(),
-            "limiter": self._limiter.state(),
-            "kpis": {name: array.tolist() for name, array in self._kpis.state().items()},
-        }
+        return {"ingest": self._ingest.state(), "limiter": self._limiter.state(), "kpis": self._kpis.state()}

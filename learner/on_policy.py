@@ -23,7 +23,7 @@ from learner.config import OnPolicyConfig
 from learner.export import flatten_params
 from learner.ingest import Ingest, Staleness
 from learner.rollouts import Rollouts, RolloutSpec
-from learner.train_step import check_finite, read_metrics
+from learner.train_step import LearnerState, check_finite, read_metrics
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -61,7 +61,7 @@ class OnPolicyParts:
         """Of the windows."""
         return rollouts.memory_bytes(self.spec)
 
-    def init(self, key: jax.Array) -> rollout_step.OnPolicyState:
+    def init(self, key: jax.Array) -> LearnerState:
         """The state before the first update."""
         return rollout_step.init(self.agent, self.spec, self.config, key)
 

@@ -13,7 +13,7 @@ from learner.agents.base import OnPolicyAgent, Params, SampleLosses, Samples, Ta
 from learner.config import OnPolicyConfig
 from learner.rollouts import RolloutSpec, steps_of
 from learner.store import Store
-from learner.train_step import NonFinite, averaged, gradient_step, no_non_finite, no_sums
+from learner.train_step import LearnerState, averaged, gradient_step, no_non_finite, no_sums
 
 
 @jax.tree_util.register_dataclass
@@ -31,25 +31,10 @@ class MetricSums:
     task_loss: Float[Array, " Z"]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, kw_only=True, slots=True)
-class OnPolicyState:
-    """All that the learner remembers between updates, beside the windows."""
-
-    params: Params
-    average_params: Params | None
-    """moving average of the parameters, if one is kept"""
-    opt_state: optax.OptState
-    key: PRNGKeyArray
-    num_updates: Int[Array, ""]
-    metrics: MetricSums
-    non_finite: NonFinite
+Update = Callable[[LearnerState, Store, Int[Array, ""]], LearnerState]
 
 
-Update = Callable[[OnPolicyState, Store, Int[Array, ""]], OnPolicyState]
-
-
-def init(agent: OnPolicyAgent, spec: RolloutSpec, config: OnPolicyConfig, key: PRNGKeyArray) -> OnPolicyState:
+def init(agent: OnPolicyAgent, spec: RolloutSpec, config: OnPolicyConfig, key: PRNGKeyArray) -> LearnerState:
     """The state before the first update."""
     key_params, key_state = jax.random.split(key)
     params = agent.init(key_params)
@@ -71,8 +56,9 @@ def init(agent: OnPolicyAgent, spec: RolloutSpec, config: OnPolicyConfig, key: P
         task_samples=per_task,
         task_loss=per_task,
     )
-    state = OnPolicyState(
+    state = LearnerState(
         params=params,
+        target_params=None,
         average_params=None if config.average_ema is None else params,
         opt_state=optimizer(config).init(params),
         key=key_state,
@@ -101,7 +87,7 @@ def make_update(agent: OnPolicyAgent, spec: RolloutSpec, config: OnPolicyConfig)
         `num_updates` is how many of its minibatches are learnt from, at most `config.updates_per_rollout`.
     """
 
-    def update(state: OnPolicyState, windows: Store, num_updates: Int[Array, ""]) -> OnPolicyState:
+    def update(state: LearnerState, windows: Store, num_updates: Int[Array, ""]) -> LearnerState:
         steps, slots = steps_of(spec, windows)
         targets, slots = jax.tree.map(jnp.ravel, agent.targets(steps)), slots.ravel()
         key, key_order = jax.random.split(state.key)
@@ -109,7 +95,7 @@ def make_update(agent: OnPolicyAgent, spec: RolloutSpec, config: OnPolicyConfig)
         orders = jax.vmap(lambda key: jax.random.permutation(key, len(slots)))(keys)
         orders = orders.reshape(config.updates_per_rollout, -1)
 
-        def one(i: Array, state: OnPolicyState) -> OnPolicyState:
+        def one(i: Array, state: LearnerState) -> LearnerState:
             chosen = orders[i]
             at = slots[chosen]
             batch = Samples(

@@ -226,27 +226,11 @@ class SeveralDevices:
 
     def _joined(self, tree: Any, specs: Any) -> Any:
         """This process's arrays as parts of arrays of all processes: the same bytes."""
-        num_processes = jax.process_count()
-        if num_processes == 1:
-            return tree
-
-        def join(leaf: jax.Array, spec: PartitionSpec) -> jax.Array:
-            shape = (leaf.shape[0] * num_processes, *leaf.shape[1:]) if spec == SHARDED else leaf.shape
-            return _of_parts(shape, NamedSharding(self._everywhere, spec), leaf)
-
-        return jax.tree.map(join, tree, specs)
+        return _on_mesh(tree, specs, self._here, self._everywhere)
 
     def _parted(self, tree: Any, specs: Any) -> Any:
         """The parts of this process: the inverse of `_joined`."""
-        num_processes = jax.process_count()
-        if num_processes == 1:
-            return tree
-
-        def part(leaf: jax.Array, spec: PartitionSpec) -> jax.Array:
-            shape = (leaf.shape[0] // num_processes, *leaf.shape[1:]) if spec == SHARDED else leaf.shape
-            return _of_parts(shape, NamedSharding(self._here, spec), leaf)
-
-        return jax.tree.map(part, tree, specs)
+        return _on_mesh(tree, specs, self._everywhere, self._here)
 
     @cached_property
     def _state_specs(self) -> Any:
@@ -280,6 +264,16 @@ def _jit(here: Callable[..., Any], mesh: Mesh, takes: Any, gives: Any, donated: 
     """Jits what each device does."""
     mapped = jax.shard_map(here, mesh=mesh, in_specs=takes, out_specs=gives, check_vma=False)
     return jax.jit(mapped, donate_argnums=donated)
+
+
+def _on_mesh(tree: Any, specs: Any, before: Mesh, mesh: Mesh) -> Any:
+    """Arrays over a mesh made of the parts that this process has of arrays over another one."""
+
+    def moved(leaf: jax.Array, spec: PartitionSpec) -> jax.Array:
+        shape = (leaf.shape[0] * mesh.size // before.size, *leaf.shape[1:]) if spec == SHARDED else leaf.shape
+        return _of_parts(shape, NamedSharding(mesh, spec), leaf)
+
+    return tree if before == mesh else jax.tree.map(moved, tree, specs)
 
 
 def _of_parts(shape: tuple[int, ...], sharding: NamedSharding, leaf: jax.Array) -> jax.Array:

@@ -8,7 +8,7 @@ reads its metrics, by the functions here.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from gvz.core.errors import NonFiniteError
 from learner import replay
 from learner.across import ALONE, Across
-from learner.agents.base import AgentLoss, OffPolicyAgent, Params
+from learner.agents.base import AgentLoss, OffPolicyAgent, Params, SampleLosses
 from learner.config import LearnerConfig, ReplayConfig
 from learner.replay import ReplaySpec, ReplayState, SampleInfo, Transitions
 
@@ -63,49 +63,26 @@ class NonFinite:
     weights: Float[Array, " B"]
 
 
-class TrainedState(Protocol):
-    """What `gradient_step` and `read_metrics` need of a learner's state."""
-
-    __dataclass_fields__: ClassVar[dict[str, Any]]
-
-    @property
-    def params(self) -> Params: ...
-    @property
-    def opt_state(self) -> optax.OptState: ...
-    @property
-    def num_updates(self) -> Int[Array, ""]: ...
-    @property
-    def metrics(self) -> Any: ...
-    @property
-    def non_finite(self) -> NonFinite: ...
-
-
-class Losses(Protocol):
-    """What an agent says of a batch: one number per sample, and more for the records."""
-
-    @property
-    def loss(self) -> Float[Array, " B"]: ...
-
-
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LearnerState:
-    """All that the learner remembers between updates, beside the replay."""
+    """All that a learner remembers between updates, beside its records."""
 
     params: Params
     target_params: Params
+    """None if the agent learns from rollouts"""
     average_params: Params | None
     """moving average of the parameters, if one is kept"""
     opt_state: optax.OptState
     key: PRNGKeyArray
     num_updates: Int[Array, ""]
-    metrics: MetricSums
+    metrics: Any
+    """`MetricSums`, or that of `learner.rollout_step`"""
     non_finite: NonFinite
 
 
 T = TypeVar("T")
-StateT = TypeVar("StateT", bound=TrainedState)
-LossesT = TypeVar("LossesT", bound=Losses)
+LossesT = TypeVar("LossesT", AgentLoss, SampleLosses)
 TrainStep = Callable[[LearnerState, ReplayState, Float[Array, " Z"]], tuple[LearnerState, ReplayState]]
 
 
@@ -225,7 +202,9 @@ def default_num_updates(learner_config: LearnerConfig) -> int:
     return 1 if jax.default_backend() == "cpu" else 8
 
 
-def read_metrics(state: StateT, task_names: Sequence[str], diagnostics_dir: Path) -> tuple[dict[str, float], StateT]:
+def read_metrics(
+    state: LearnerState, task_names: Sequence[str], diagnostics_dir: Path
+) -> tuple[dict[str, float], LearnerState]:
     """Brings the means since the last read to the host and starts new sums. Waits for the device.
 
     Args:
@@ -256,7 +235,7 @@ def read_metrics(state: StateT, task_names: Sequence[str], diagnostics_dir: Path
     return metrics, replace(state, metrics=no_sums(state.metrics))
 
 
-def check_finite(state: TrainedState, diagnostics_dir: Path) -> None:
+def check_finite(state: LearnerState, diagnostics_dir: Path) -> None:
     """Raises NonFiniteError as `read_metrics` does. Waits for the device."""
     if jax.device_get(state.non_finite.num_skipped) > 0:
         raise _save_non_finite(jax.device_get(state.non_finite), diagnostics_dir)
@@ -279,7 +258,7 @@ def no_sums(sums: T) -> T:
 
 
 def gradient_step(
-    state: StateT,
+    state: LearnerState,
     optimizer: optax.GradientTransformation,
     mean_loss: Callable[[Params], tuple[Float[Array, ""], LossesT]],
     batch: Any,
@@ -287,7 +266,7 @@ def gradient_step(
     *,
     hold_gradient: bool,
     across: Across = ALONE,
-) -> tuple[StateT, Float[Array, ""], LossesT, Float[Array, ""]]:
+) -> tuple[LearnerState, Float[Array, ""], LossesT, Float[Array, ""]]:
     """One gradient step, which is skipped and noted if its loss or its gradient is not finite.
 
     Args:

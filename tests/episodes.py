@@ -1,11 +1,18 @@
-"""Episodes of an environment, played in ways that several tests want. Imports numpy and gvz.env."""
+"""Episodes of an environment, played in ways that several tests want. Imports numpy, gvz.env and gvz.evaluation."""
 
 import hashlib
 import json
+from collections.abc import Callable
+from contextlib import closing
+from typing import Any
 
 import numpy as np
 
+from gvz.core.env_config import EnvConfig
 from gvz.env import DoomEnv
+from gvz.evaluation.play import play_episode
+from gvz.evaluation.players import CLASSES
+from gvz.evaluation.simple import player_env
 
 TURN = 1
 """an action of Defend the Center that wastes no ammunition"""
@@ -37,3 +44,11 @@ def idle_to_the_end(env: DoomEnv, action: int = TURN) -> list[tuple]:
     while not steps or not (steps[-1][2] or steps[-1][3]):
         steps.append(env.step(action))
     return steps
+
+
+def evaluated(
+    task: str, name: str, num_episodes: int = 3, player: Callable[[], Any] | None = None
+) -> list[dict[str, Any]]:
+    """Rows of the first evaluation episodes of base seed 1, of a simple player or of another that sees what it sees."""
+    with closing(DoomEnv(task, player_env(name, EnvConfig()))) as env:
+        return [play_episode(env, (player or CLASSES[name])(), episode, 1) for episode in range(num_episodes)]

@@ -189,7 +189,7 @@ class Scenario:
     """what it is measured with; scores over several scenarios are of one suite"""
     content: Content
     """contents of the default task's map"""
-    levdoom: Content
+    levdoom: Content = field(default_factory=Content)
     """what replaces parts of it in profile levdoom"""
     script: str
     """ACS source with `$names` (string.Template): `content.parameters`, and `$entity_properties`,

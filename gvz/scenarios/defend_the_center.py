@@ -13,11 +13,12 @@ Attributes: thesis B.1, below. `complete` takes mossy_bricks for its textures. T
 
 import math
 import random
+from dataclasses import replace
 from functools import partial
 
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
 from gvz.scenarios.layout import WAY, Layout, Place, draw_pillar, ring, vary
-from gvz.scenarios.parts import COUNTED_MARINE, RESIZED, retextured, things_at
+from gvz.scenarios.parts import COUNTED_MARINE, RESIZED_ENEMIES, rendered, retextured, things_at
 from gvz.scenarios.rewards import Fell, Pace, Reward, Rose, death
 
 WAD = "defend_the_center.wad"
@@ -170,20 +171,8 @@ SCENARIO = Scenario(
         Attribute(name="gore", groups=("decorations",), content=Content(things={WAD: things_at(GORE)})),
         retextured("mossy_bricks", "A-MOSBRI", "FLOOR4_6", "CEIL5_1"),
         retextured("stone_wall", "FLAT5_7", "FLOOR1_6", "CEIL3_3"),
-        Attribute(
-            name="fuzzy_enemies",
-            groups=("entity_rendering",),
-            aliases=("fuzzy",),
-            content=Content(entity={"RenderStyle": "STYLE_Fuzzy"}),
-            levdoom=SLOW_RESPAWN,
-        ),
-        Attribute(
-            name="resized_enemies",
-            groups=("entity_size",),
-            aliases=("resized",),
-            content=RESIZED,
-            levdoom=SLOW_RESPAWN,
-        ),
+        replace(rendered("fuzzy_enemies", "STYLE_Fuzzy", "fuzzy"), levdoom=SLOW_RESPAWN),
+        replace(RESIZED_ENEMIES, levdoom=SLOW_RESPAWN),
         Attribute(
             name="fast_enemies",
             groups=("entity_speed",),

@@ -151,7 +151,6 @@ SCENARIO = Scenario(
         entity={"Speed": 0.0},
         agent={"DamageFactor": 0.7},
     ),
-    levdoom=Content(),
     variety=Variety(
         entities=("DoomImp",),
         entity_parameters=("classes",),

@@ -226,7 +226,6 @@ DECOYS = ("WrongShells", "WrongRocket", "WrongCell", "WrongRockets")
 SCENARIO = Scenario(
     id="find_ammunition",
     title="Find Ammunition",
-    suite="extended",
     script=SCRIPT,
     draw_map=drain_acid,
     content=Content(
@@ -254,7 +253,6 @@ SCENARIO = Scenario(
             **_decoy("WrongRockets", "RocketBox"),
         },
     ),
-    levdoom=Content(),
     variety=Variety(
         entities=("Demon", "Bullets"),
         entity_parameters=("classes", "clip"),

@@ -27,7 +27,7 @@ import random
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
 from gvz.scenarios.health_gathering import OBSTACLES, draw_hall
 from gvz.scenarios.layout import Layout
-from gvz.scenarios.parts import ACS_APART, ACS_NEAR, SHORT_AGENT, retextured, starts_at
+from gvz.scenarios.parts import ACS_APART, ACS_NEAR, SHORT_AGENT, rendered, retextured, starts_at
 from gvz.scenarios.rewards import Pace, Reward, Rose, death, living
 from gvz.scenarios.seek_and_kill import SPOTS as MAZE_SPOTS
 from gvz.scenarios.seek_and_kill import drain_acid
@@ -203,7 +203,6 @@ def draw_rooms_of_spots(rng: random.Random, strength: float) -> Layout:
 SCENARIO = Scenario(
     id="find_the_key",
     title="Find the Key",
-    suite="extended",
     script=SCRIPT,
     draw_map=drain_acid,
     content=Content(
@@ -222,7 +221,6 @@ SCENARIO = Scenario(
         entity={"ScaleX": 2.5, "ScaleY": 2.5},  # as they are, keys are too small to be seen across the room
         actors=PORTAL,
     ),
-    levdoom=Content(),
     variety=Variety(
         entities=("BlueCard",), entity_parameters=("key",), max_decorations=16, draw_layout=draw_rooms_of_spots
     ),
@@ -238,12 +236,7 @@ SCENARIO = Scenario(
             content=Content(parameters={"key": '"BlueSkull"', "shown_key": '"BlueSkull"'}),
         ),
         Attribute(name="resized_things", groups=("entity_size",), aliases=("resized",), content=RESIZED_THINGS),
-        Attribute(
-            name="glowing_things",
-            groups=("entity_rendering",),
-            aliases=("glowing",),
-            content=Content(entity={"RenderStyle": "STYLE_Add"}),
-        ),
+        rendered("glowing_things", "STYLE_Add", "glowing"),
         SHORT_AGENT,
         Attribute(
             name="decoys",

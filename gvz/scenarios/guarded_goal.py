@@ -25,7 +25,7 @@ Source: thesis 6.2.1, its last idea for a scenario, with its small rewards for k
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
 from gvz.scenarios.find_the_key import ROOM_SPOTS, draw_rooms_of_spots
 from gvz.scenarios.health_gathering import COLUMNS
-from gvz.scenarios.parts import ACS_NEAR, SHORT_AGENT, retextured, starts_at, things_at
+from gvz.scenarios.parts import ACS_NEAR, SHORT_AGENT, rendered, retextured, starts_at, things_at
 from gvz.scenarios.rewards import Fell, Pace, Reward, Rose, death
 from gvz.scenarios.seek_and_kill import drain_acid
 
@@ -203,7 +203,6 @@ RESIZED_GUARDS = Content(entity={"ScaleX": Uniform(0.75, 3.0), "ScaleY": Uniform
 SCENARIO = Scenario(
     id="guarded_goal",
     title="Guarded Goal",
-    suite="extended",
     script=SCRIPT,
     draw_map=drain_acid,
     content=Content(
@@ -220,7 +219,6 @@ SCENARIO = Scenario(
         entity={"Speed": 0.0, "ScaleX": 1.5, "ScaleY": 1.5},
         actors=_portal("Goal", "IFOG AB") | _portal("Trap", "TFOG AB"),
     ),
-    levdoom=Content(),
     variety=Variety(
         entities=("DoomImp",), entity_parameters=("guard",), max_decorations=16, draw_layout=draw_rooms_of_spots
     ),
@@ -235,9 +233,7 @@ SCENARIO = Scenario(
         ),
         Attribute(name="knights", groups=("entity_type",), content=_guards("HellKnight", 48.0, 0.4)),
         Attribute(name="resized_guards", groups=("entity_size",), aliases=("resized",), content=RESIZED_GUARDS),
-        Attribute(
-            name="shadows", groups=("entity_rendering",), content=Content(entity={"RenderStyle": "STYLE_Shadow"})
-        ),
+        rendered("shadows", "STYLE_Shadow"),
         SHORT_AGENT,
         Attribute(name="traps", groups=("traps",), content=Content(parameters={"num_traps": 2})),
     ),

@@ -16,7 +16,7 @@ import random
 
 from gvz.scenarios.base import Attribute, Content, Period, Scenario, Textures, Uniform, Variety, words
 from gvz.scenarios.layout import Layout, draw_rooms, furnished, vary
-from gvz.scenarios.parts import RESIZED, retextured, starts_at, things_at
+from gvz.scenarios.parts import RESIZED, rendered, retextured, starts_at, things_at
 from gvz.scenarios.rewards import Pace, Reward, Rose, death, living
 
 WAD = "health_gathering.wad"
@@ -257,18 +257,8 @@ SCENARIO = Scenario(
             content=Content(parameters={"odd_kit": '"Stimpack"'}),
             levdoom=Content(parameters={"even_kit": '"Stimpack"'}),
         ),
-        Attribute(
-            name="resized_kits",
-            groups=("entity_size",),
-            aliases=("resized",),
-            content=RESIZED,
-        ),
-        Attribute(
-            name="shaded_kits",
-            groups=("entity_rendering",),
-            aliases=("shaded",),
-            content=Content(entity={"RenderStyle": "STYLE_Shaded"}),
-        ),
+        Attribute(name="resized_kits", groups=("entity_size",), aliases=("resized",), content=RESIZED),
+        rendered("shaded_kits", "STYLE_Shaded", "shaded"),
         Attribute(
             name="short_agent",
             groups=("agent_height",),

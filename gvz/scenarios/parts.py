@@ -8,12 +8,6 @@ from gvz.scenarios.layout import MAP_SPOT
 RESIZED = Content(entity={"ScaleX": Uniform(0.3, 3.0), "ScaleY": Uniform(0.3, 3.0)})
 """enemies or kits of any width and height"""
 RESIZED_ENEMIES = Attribute(name="resized_enemies", groups=("entity_size",), aliases=("resized",), content=RESIZED)
-GLOWING_ENEMIES = Attribute(
-    name="glowing_enemies",
-    groups=("entity_rendering",),
-    aliases=("glowing",),
-    content=Content(entity={"RenderStyle": "STYLE_Add"}),
-)
 SHORT_AGENT = Attribute(
     name="short_agent", groups=("agent_height",), content=Content(agent={"ViewHeight": Uniform(0.0, 100.0)})
 )
@@ -24,6 +18,15 @@ COUNTED_MARINE = {"MarineChainsawVzd": "ACTOR MarineChainsawVzd : MarineChainsaw
 def retextured(name: str, wall: str, floor: str, ceiling: str) -> Attribute:
     """An attribute that changes all textures."""
     return Attribute(name=name, groups=("textures",), content=Content(textures=Textures(wall, floor, ceiling)))
+
+
+def rendered(name: str, style: str, *aliases: str) -> Attribute:
+    """An attribute that gives enemies or kits a render style of the engine's, such as STYLE_Add."""
+    content = Content(entity={"RenderStyle": style})
+    return Attribute(name=name, groups=("entity_rendering",), aliases=aliases, content=content)
+
+
+GLOWING_ENEMIES = rendered("glowing_enemies", "STYLE_Add", "glowing")
 
 
 def things_at(places: Mapping[int, Iterable[tuple[float, float]]]) -> tuple[Thing, ...]:

@@ -131,7 +131,6 @@ PEACEFUL_SOUL = {"PeacefulSoul": 'ACTOR PeacefulSoul : LostSoul\n{\n  DamageFact
 SCENARIO = Scenario(
     id="rockets",
     title="Rockets",
-    suite="extended",
     script=SCRIPT,
     draw_map=drain_acid,
     content=Content(
@@ -146,7 +145,6 @@ SCENARIO = Scenario(
             "scatter": 96.0,
         },
     ),
-    levdoom=Content(),
     variety=Variety(
         entities=("Demon",), entity_parameters=("enemy",), max_decorations=16, draw_layout=draw_rooms_of_spots
     ),

@@ -19,7 +19,7 @@ import random
 
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Variety, words
 from gvz.scenarios.layout import Layout, draw_rooms, furnished, vary
-from gvz.scenarios.parts import COUNTED_MARINE, RESIZED_ENEMIES, retextured, starts_at, things_at
+from gvz.scenarios.parts import COUNTED_MARINE, RESIZED_ENEMIES, rendered, retextured, starts_at, things_at
 from gvz.scenarios.rewards import HISTORY_STEPS, Fell, Pace, Reward, Rose, death, living, moved
 from gvz.wad.udmf import UdmfMap
 
@@ -209,11 +209,7 @@ SCENARIO = Scenario(
         retextured("red", "FIREWALL", "CRACKLE4", "DORED"),
         Attribute(name="obstacles", groups=("decorations",), content=Content(things={WAD: things_at(TORCHES)})),
         RESIZED_ENEMIES,
-        Attribute(
-            name="shadows",
-            groups=("entity_rendering",),
-            content=Content(entity={"RenderStyle": "STYLE_Shadow"}),
-        ),
+        rendered("shadows", "STYLE_Shadow"),
         Attribute(
             name="mixed_enemies",
             groups=("entity_type",),

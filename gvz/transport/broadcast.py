@@ -17,16 +17,19 @@ from gvz.transport.segment import ALIGN_BYTES, Fence, Segment, aligned, hash_lay
 
 _TICKET, _VERSION, _NUM_UPDATES, _EPSILON_BITS, _NUM_WORDS = 0, 1, 2, 3, 8
 """u64 words before each slot's vector; the payload also starts with 8 words, and the first counts publications"""
+_NUM_SLOTS = 3
+"""versions kept, at least 2: one is read while one is written. A reader must repeat its copy only when two publications
+begin during it"""
 _READ_TIMEOUT_S = 30.0
 
 
 class _ParamsQueue:
     """The mapped arrays of both ends."""
 
-    def __init__(self, segment: Segment, num_params: int, num_slots: int, layout_hash: int):
+    def __init__(self, segment: Segment, num_params: int, layout_hash: int):
         payload = segment.payload
         stride = _slot_bytes(num_params)
-        starts = [8 * _NUM_WORDS + slot * stride for slot in range(num_slots)]
+        starts = [8 * _NUM_WORDS + slot * stride for slot in range(_NUM_SLOTS)]
         self.name = segment.name
         self.num_params = num_params
         self.layout_hash = layout_hash
@@ -47,20 +50,17 @@ class BroadcastWriter(_ParamsQueue):
     """The learner's end, which creates the queue."""
 
     @classmethod
-    def create(cls, name: str, num_params: int, layout_hash: int, *, num_slots: int = 3) -> "BroadcastWriter":
+    def create(cls, name: str, num_params: int, layout_hash: int) -> "BroadcastWriter":
         """Creates a queue that holds no version yet of a vector float32[num_params]; `name` is its name in errors.
 
-        Readers must pass the same `layout_hash`, a u64 of the parameter tree. Of the at least 2 versions kept, a reader
-        must repeat its copy only when `num_slots - 1` publications begin during it.
+        Readers must pass the same `layout_hash`, a u64 of the parameter tree.
 
         Raises:
             ResourceError: there is not enough memory.
         """
-        if num_slots < 2:
-            raise ValueError(f"num_slots: got {num_slots}, want at least 2 (one is read while one is written)")
-        whole_hash = hash_layout("broadcast", num_params, num_slots, layout_hash)
-        segment = Segment.create(name, broadcast_bytes(num_params, num_slots), layout_hash=whole_hash)
-        queue = cls(segment, num_params, num_slots, layout_hash)
+        whole_hash = hash_layout("broadcast", num_params, _NUM_SLOTS, layout_hash)
+        segment = Segment.create(name, broadcast_bytes(num_params), layout_hash=whole_hash)
+        queue = cls(segment, num_params, layout_hash)
         for words in (queue._count, *queue._words):
             for index in range(_NUM_WORDS):
                 words[index] = 0
@@ -100,20 +100,20 @@ class BroadcastWriter(_ParamsQueue):
 class BroadcastReader(_ParamsQueue):
     """An actor's end."""
 
-    def __init__(self, segment: Segment, num_params: int, num_slots: int, layout_hash: int):
-        super().__init__(segment, num_params, num_slots, layout_hash)
+    def __init__(self, segment: Segment, num_params: int, layout_hash: int):
+        super().__init__(segment, num_params, layout_hash)
         self._seen = 0  # publications
 
     @classmethod
-    def attach(cls, descriptor: int, num_params: int, layout_hash: int, *, num_slots: int = 3) -> "BroadcastReader":
+    def attach(cls, descriptor: int, num_params: int, layout_hash: int) -> "BroadcastReader":
         """Maps the queue.
 
         Raises:
             TransportError: the descriptor does not belong to a queue, or the queue was created for other parameters.
         """
-        whole_hash = hash_layout("broadcast", num_params, num_slots, layout_hash)
-        segment = Segment.attach(descriptor, broadcast_bytes(num_params, num_slots), layout_hash=whole_hash)
-        return cls(segment, num_params, num_slots, layout_hash)
+        whole_hash = hash_layout("broadcast", num_params, _NUM_SLOTS, layout_hash)
+        segment = Segment.attach(descriptor, broadcast_bytes(num_params), layout_hash=whole_hash)
+        return cls(segment, num_params, layout_hash)
 
     def read(self) -> tuple[np.ndarray, ParamsHeader] | None:
         """The newest version, float32[P] and its header, if it is newer than the last one read; else None.
@@ -162,9 +162,9 @@ class BroadcastReader(_ParamsQueue):
                 )
 
 
-def broadcast_bytes(num_params: int, num_slots: int = 3) -> int:
+def broadcast_bytes(num_params: int) -> int:
     """Bytes of shared memory of a queue, without the segment's header."""
-    return 8 * _NUM_WORDS + num_slots * _slot_bytes(num_params)
+    return 8 * _NUM_WORDS + _NUM_SLOTS * _slot_bytes(num_params)
 
 
 def _slot_bytes(num_params: int) -> int:

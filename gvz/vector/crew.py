@@ -282,7 +282,6 @@ def _raised(worker: _Worker, message: Message) -> GvzError:
     who = f"vector environment: worker {worker.spec.worker}"
     if not isinstance(message, Fault):
         return WorkerError(f"{who}: got {type(message).__name__}, want Outcomes or Screen")
-    kind = getattr(errors, message.kind, None)
-    if message.kind in ("EngineError", "ConfigError", "TaskError", "ResourceError") and kind is not None:
-        return kind(f"{who}: {message.message}")
+    if message.kind in ("EngineError", "ConfigError", "TaskError", "ResourceError"):
+        return getattr(errors, message.kind)(f"{who}: {message.message}")
     return WorkerError(f"{who}: {message.kind}: {message.message}\n{message.traceback}")

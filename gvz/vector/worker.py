@@ -106,15 +106,8 @@ def main() -> int:
     try:
         worker.run()
     except Exception as error:  # the process boundary: whatever it is, the environment is to hear of it
-        channel.send(
-            Fault(
-                actor=spec.worker,
-                lane=None,
-                kind=type(error).__name__,
-                message=str(error),
-                traceback=traceback.format_exc(),
-            )
-        )
+        kind, text = type(error).__name__, traceback.format_exc()
+        channel.send(Fault(actor=spec.worker, lane=None, kind=kind, message=str(error), traceback=text))
         return 1
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # if it comes now, it must not interrupt what it asks for

@@ -120,6 +120,15 @@ def export_act(act: Any, param_shapes: Sequence[tuple[int, ...]], obs: Observati
     return bytes(jax.export.export(jax.jit(policy), platforms=["cpu"])(*arguments).serialize())
 
 
+def first_param_policy(num_params: int) -> bytes:
+    """The acting function of two games that plays its first parameter."""
+
+    def act(params, obs, _key, _epsilon):
+        return params[0][0].astype("int32") + 0 * obs["task"]
+
+    return export_act(act, [(num_params,)], ObservationBatch(2, FRAME_SHAPE, 4))
+
+
 def make(task: str, options: dict[str, Any]) -> CountingEnv:
     return CountingEnv(task, options)
 

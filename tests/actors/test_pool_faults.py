@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 from fake_env import config
-from watched_pool import Run, alive, segments
+from watched_pool import alive, playing, segments
 
 from actors import supervisor
 from actors.config import ActorsConfig
@@ -28,9 +28,7 @@ from tests.waiting import wait_until
 @pytest.mark.parametrize("fault", ["kill", "raise", "segfault"])
 def test_a_dead_actor_is_replaced_and_nothing_published_is_lost(tmp_path: Path, fault: str):
     options = {} if fault == "kill" else {"fault": fault, "fault_at": 57, "fault_file": str(tmp_path / "struck")}
-    pool_config = config(tmp_path / "work", options)
-    with ProcessPool(pool_config) as pool:
-        run = Run(pool, pool_config)
+    with playing(config(tmp_path / "work", options)) as run:
         pids = run.until_all_ready()
         run.play(200)
         if fault == "kill":
@@ -38,7 +36,7 @@ def test_a_dead_actor_is_replaced_and_nothing_published_is_lost(tmp_path: Path, 
         run.until(lambda: any(f.kind == "died" for f in run.faults()))
         run.until(lambda: len([m for m in run.messages if isinstance(m, Ready)]) == 3)
         run.play(500)
-        assert pool.statistics().restarts == 1
+        assert run.pool.statistics().restarts == 1
         died = next(f for f in run.faults() if f.kind == "died")
     assert len({m.pid for m in run.messages if isinstance(m, Ready)}) == 3
     if fault != "kill":  # which may hit between two episodes
@@ -56,19 +54,17 @@ def test_a_dead_actor_is_replaced_and_nothing_published_is_lost(tmp_path: Path, 
 
 def test_many_kills_lose_nothing_and_leak_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(supervisor, "_STABLE_S", 0.0)  # no waiting: this actor is not to blame
-    pool_config = config(tmp_path, {})
-    with ProcessPool(pool_config) as pool:
-        run = Run(pool, pool_config)
+    with playing(config(tmp_path, {})) as run:
         run.until_all_ready()
         me = psutil.Process()
         before = (me.num_fds(), len(me.children()), len(segments()))
         for kill in range(6):
-            os.kill(pool.writer_statuses()[kill % 2].pid, signal.SIGKILL)
-            run.until(lambda wanted=kill + 1: pool.statistics().restarts == wanted)
+            os.kill(run.pool.writer_statuses()[kill % 2].pid, signal.SIGKILL)
+            run.until(lambda wanted=kill + 1: run.pool.statistics().restarts == wanted)
             run.until_all_ready()
             run.play(300)
         after = (me.num_fds(), len(me.children()), len(segments()))
-        assert pool.statistics().restarts == 6
+        assert run.pool.statistics().restarts == 6
     assert after == before
 
 
@@ -80,9 +76,7 @@ def test_a_stuck_actor_shows_its_stacks_and_is_replaced(tmp_path: Path, fault: s
         if fault == "stop"
         else {"fault": "hang", "fault_at": 57, "fault_file": str(tmp_path / "struck")}
     )
-    pool_config = config(tmp_path / "work", options, actors=ActorsConfig(heartbeat_timeout_s=2.0))
-    with ProcessPool(pool_config) as pool:
-        run = Run(pool, pool_config)
+    with playing(config(tmp_path / "work", options, actors=ActorsConfig(heartbeat_timeout_s=2.0))) as run:
         pids = run.until_all_ready()
         run.play(200)
         if fault == "stop":
@@ -100,9 +94,7 @@ def test_a_stuck_actor_shows_its_stacks_and_is_replaced(tmp_path: Path, fault: s
 
 
 def test_the_learners_own_sleep_is_not_the_actors_silence(tmp_path: Path):
-    pool_config = config(tmp_path, {}, actors=ActorsConfig(heartbeat_timeout_s=1.0))
-    with ProcessPool(pool_config) as pool:
-        run = Run(pool, pool_config)
+    with playing(config(tmp_path, {}, actors=ActorsConfig(heartbeat_timeout_s=1.0))) as run:
         pids = run.until_all_ready()
         for pid in pids:  # the whole machine sleeps
             os.kill(pid, signal.SIGSTOP)
@@ -110,26 +102,21 @@ def test_the_learners_own_sleep_is_not_the_actors_silence(tmp_path: Path):
         for pid in pids:
             os.kill(pid, signal.SIGCONT)
         run.play(500)
-        assert pool.statistics().restarts == 0
+        assert run.pool.statistics().restarts == 0
 
 
 def test_an_actor_that_starts_too_slowly_is_named(tmp_path: Path):
     pool_config = config(tmp_path, {}, actors=ActorsConfig(start_timeout_s=0.05, max_restarts=0))
-    with (
-        ProcessPool(pool_config) as pool,
-        pytest.raises(WorkerError, match=r"had not started its games after \d+\.\d s"),
-    ):
-        Run(pool, pool_config).until(lambda: False)
+    said = r"had not started its games after \d+\.\d s"
+    with playing(pool_config) as run, pytest.raises(WorkerError, match=said):
+        run.until(lambda: False)
 
 
 def test_a_spent_budget_is_an_error_that_tells_why(tmp_path: Path):
-    pool_config = config(
-        tmp_path, {"fault": "no_start", "fault_task": "b"}, actors=ActorsConfig(max_restarts=2, restart_window_s=100)
-    )
-    with ProcessPool(pool_config) as pool:
-        run = Run(pool, pool_config)
-        with pytest.raises(WorkerError) as raised:
-            run.until(lambda: False)
+    actors = ActorsConfig(max_restarts=2, restart_window_s=100)
+    pool_config = config(tmp_path, {"fault": "no_start", "fault_task": "b"}, actors=actors)
+    with playing(pool_config) as run, pytest.raises(WorkerError) as raised:
+        run.until(lambda: False)
     text = str(raised.value)
     assert "exited with code 1; that was end 3 within 100 s, and actors.max_restarts allows 2 restarts." in text
     assert f"The end of {tmp_path / 'actor_'}" in text
@@ -142,9 +129,7 @@ def test_a_spent_budget_is_an_error_that_tells_why(tmp_path: Path):
 
 
 def test_a_process_that_cannot_be_started_again_counts_as_one_that_failed(tmp_path: Path):
-    pool_config = config(tmp_path / "work", {}, actors=ActorsConfig(max_restarts=2))
-    with ProcessPool(pool_config) as pool:
-        run = Run(pool, pool_config)
+    with playing(config(tmp_path / "work", {}, actors=ActorsConfig(max_restarts=2))) as run:
         pids = run.until_all_ready()
         shutil.rmtree(tmp_path / "work")
         (tmp_path / "work").touch()  # where the logs go
@@ -166,7 +151,6 @@ def test_a_first_process_that_cannot_be_started_is_an_error_with_advice(
 
 
 def test_an_actor_that_tells_of_anothers_game_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    pool_config = config(tmp_path, {})
     receive = Channel.receive
 
     def receive_a_strangers(channel: Channel) -> list[Message]:
@@ -174,12 +158,11 @@ def test_an_actor_that_tells_of_anothers_game_is_replaced(tmp_path: Path, monkey
         stranger = next(m for m in run.messages if isinstance(m, EpisodeStats) and m.lane == 3)
         return [*receive(channel), stranger]
 
-    with ProcessPool(pool_config) as pool:
-        run = Run(pool, pool_config)
+    with playing(config(tmp_path, {})) as run:
         run.until_all_ready()
         run.until(lambda: 3 in run.first_episodes())
         monkeypatch.setattr(Channel, "receive", receive_a_strangers)
-        run.until(lambda: pool.statistics().restarts == 1)
+        run.until(lambda: run.pool.statistics().restarts == 1)
         run.play(300)
     (fault,) = run.faults()
     assert "actor 0 sent what is no message of its own (got an episode of lane 3, task 1, want one of lanes [0, 1]" in (

@@ -7,15 +7,13 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import jax.numpy as jnp
 import msgspec
 import numpy as np
 import pytest
-from fake_env import FRAME_SHAPE, config, export_act
+from fake_env import FRAME_SHAPE, config, first_param_policy
 
 from actors import worker
 from actors.pool import lanes_to_begin_with
-from actors.preprocess import ObservationBatch
 from actors.process import log_path, start_actor
 from actors.worker import Worker
 from gvz.core import records
@@ -28,13 +26,6 @@ from tests.full_disk import full_disk
 from tests.waiting import make_pause
 
 LAYOUT, NUM_PARAMS = 5, 4
-
-
-def first_param_policy() -> bytes:
-    def act(params, obs, _key, _epsilon):
-        return jnp.full(len(obs["task"]), params[0][0].astype(jnp.int32))
-
-    return export_act(act, [(NUM_PARAMS,)], ObservationBatch(2, FRAME_SHAPE, 4))
 
 
 @pytest.fixture
@@ -71,7 +62,9 @@ def make_worker(
     spec: ActorSpec, ring: RingReader, channels: tuple[Channel, Channel], queue: BroadcastWriter
 ) -> Callable[[], Worker]:
     """Makes a worker that waits for parameters."""
-    acting = msgspec.structs.replace(spec, policy=first_param_policy(), num_params=NUM_PARAMS, layout_hash=LAYOUT)
+    acting = msgspec.structs.replace(
+        spec, policy=first_param_policy(NUM_PARAMS), num_params=NUM_PARAMS, layout_hash=LAYOUT
+    )
     return lambda: Worker(acting, channels[1], ring.descriptor, queue.descriptor)
 
 

@@ -2,8 +2,9 @@
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from fake_env import Checker
@@ -53,6 +54,13 @@ class Run:
         """Until every actor waits for space in its ring; nothing is drained."""
         full = WriterState.WAITING_FOR_SPACE
         wait_until(lambda: {s.state for s in self.pool.writer_statuses()} == {full}, "full rings", DEADLINE_S)
+
+
+@contextlib.contextmanager
+def playing(pool_config: PoolConfig, state: dict[str, Any] | None = None) -> Generator[Run]:
+    """A `ProcessPool` in a test; it is closed at the end."""
+    with ProcessPool(pool_config, state) as pool:
+        yield Run(pool, pool_config)
 
 
 def gather(blocks: list[StepBlock]) -> tuple[np.ndarray, np.ndarray]:

@@ -53,10 +53,12 @@ HEAD = (
 )
 
 
-def run(code: str, **options: object) -> subprocess.CompletedProcess[str]:
-    """Runs code that may use `config` and Engine in a process of its own."""
+def run(code: str, returncode: int = 0, **options: object) -> str:
+    """Runs code that may use `config` and Engine in a process of its own, which ends with this code; its output."""
     command = [sys.executable, "-W", "error", "-c", HEAD + code]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, **options)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, **options)
+    assert done.returncode == returncode, done.stderr
+    return done.stdout
 
 
 def test_an_episode_is_played_and_ends_with_the_players_death(engine: Engine):
@@ -140,18 +142,15 @@ def test_a_forgotten_engine_leaves_nothing():
     [("", 0), ("raise KeyError", 1), ("import sys; sys.exit(3)", 3), ("engine.kill(); engine.close()", 0)],
 )
 def test_the_interpreters_exit_leaves_nothing(ending: str, code: int):
-    done = run(
-        f"engine = Engine(config); engine.new_episode(1); print(engine.instance_id, engine.log.parent)\n{ending}"
-    )
-    assert done.returncode == code
-    instance_id, directory = done.stdout.split()
+    begin = "engine = Engine(config); engine.new_episode(1); print(engine.instance_id, engine.log.parent)\n"
+    instance_id, directory = run(begin + ending, code).split()
     assert not list(janitor.SHM_DIR.glob(f"*{instance_id}"))
     assert not Path(directory).exists()
 
 
 @pytest.mark.parametrize("ending", ["sys.exit(0)", "del engine; sys.exit(0)"])
 def test_a_forked_childs_exit_leaves_the_parents_engine_alone(ending: str):
-    done = run(
+    run(
         "import os, sys, warnings\n"
         "warnings.simplefilter('ignore')  # Python 3.12 warns of any fork beside threads\n"
         "engine = Engine(config); engine.new_episode(1)\n"
@@ -160,12 +159,11 @@ def test_a_forked_childs_exit_leaves_the_parents_engine_alone(ending: str):
         "assert os.waitpid(child, 0)[1] == 0\n"
         "assert engine.step([], 4) is not None\n"
     )
-    assert done.returncode == 0, done.stderr
 
 
 def test_a_fork_does_not_watch_its_parents_engines():
     """It has the parent's call and the parent's lock as they were, without the threads that would end both."""
-    done = run(
+    run(
         "import os, signal, warnings; from gvz.engine import process\n"
         "warnings.simplefilter('ignore')  # Python 3.12 warns of any fork beside threads\n"
         "engine = Engine(config); engine.new_episode(1)\n"
@@ -176,27 +174,23 @@ def test_a_fork_does_not_watch_its_parents_engines():
         "assert os.waitpid(child, 0)[1] == 0\n"
         "assert engine.step([], 4) is not None\n"
     )
-    assert done.returncode == 0, done.stderr
 
 
 def test_nothing_is_written_into_the_working_directory_or_home(tmp_path: Path):
-    done = run("Engine(config).new_episode(1)", cwd=tmp_path, env={**os.environ, "HOME": str(tmp_path)})
-    assert done.returncode == 0, done.stderr
+    run("Engine(config).new_episode(1)", cwd=tmp_path, env={**os.environ, "HOME": str(tmp_path)})
     assert list(tmp_path.iterdir()) == []
 
 
 def test_nothing_but_our_records_is_written_into_the_temporary_directory(tmp_path: Path):
     environment = {name: value for name, value in os.environ.items() if name != "GVZ_RUNTIME_DIR"}
-    done = run("Engine(config).new_episode(1)", env={**environment, "TMPDIR": str(tmp_path)})
-    assert done.returncode == 0, done.stderr
+    run("Engine(config).new_episode(1)", env={**environment, "TMPDIR": str(tmp_path)})
     [records] = tmp_path.iterdir()
     assert records.name == f"gvizdoom-{os.getuid()}"
     assert list(records.glob("*.json")) == []
 
 
 def test_home_and_working_directory_may_be_read_only():
-    done = run("Engine(config).new_episode(1)", cwd="/proc", env={**os.environ, "HOME": "/proc"})
-    assert done.returncode == 0, done.stderr
+    run("Engine(config).new_episode(1)", cwd="/proc", env={**os.environ, "HOME": "/proc"})
 
 
 def test_a_settings_file_that_vizdoom_would_load_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

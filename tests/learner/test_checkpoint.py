@@ -182,8 +182,7 @@ def test_another_shape_names_the_leaf(tmp_path):
 
 def test_another_schema_is_refused(tmp_path):
     save(tmp_path, 1)
-    file = tmp_path / "checkpoints" / "1" / "manifest.json"
-    file.write_text(json.dumps({**json.loads(file.read_text()), "schema": 99}))
+    rewritten(schema=99)(tmp_path / "checkpoints" / "1")
     with pytest.raises(CheckpointError, match="schema 99, want 1"):
         checkpoint.verify(tmp_path / "checkpoints" / "1")
 

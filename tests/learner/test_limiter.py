@@ -5,7 +5,6 @@ from fractions import Fraction
 
 import hypothesis.strategies as st
 import numpy as np
-import pytest
 from hypothesis import given, settings
 
 from learner.limiter import RateLimiter
@@ -111,18 +110,3 @@ def test_a_resume_brings_no_burst_and_no_second_warm_up():
     assert (limiter.num_updates_allowed(), limiter.num_steps_allowed()) == (0, 100)
     limiter.insert(4)
     assert limiter.num_updates_allowed() == 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((0.0, 0, 0), "got env_steps_per_update 0.0, want more than 0"),
-        ((float("nan"), 0, 0), "got env_steps_per_update nan, want more than 0"),
-        ((1.0, -1, 0), "got warmup_steps -1, want at least 0"),
-        ((1.0, 0, -1), "got tolerance -1, want at least 0"),
-        ((1.0, 0, 0, 0), "got num_updates_per_call 0, want at least 1"),
-    ],
-)
-def test_parameters_out_of_range_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=f"rate limiter: {message}"):
-        RateLimiter(*arguments)

@@ -19,7 +19,7 @@ def random_batch(seed: int, B: int = 7, A: int = 4, N: int = 11) -> dict[str, np
     return {
         "q_tm1": rng.normal(size=(B, A)).astype(np.float32),
         "q_t": rng.normal(size=(B, A)).astype(np.float32),
-        "selector": rng.normal(size=(B, A)).astype(np.float32),
+        "selector": rng.normal(size=(B, A)).astype(np.float32),  # of double Q-learning
         "logits_tm1": rng.normal(size=(B, A, N)).astype(np.float32),
         "logits_t": rng.normal(size=(B, A, N)).astype(np.float32),
         "a_tm1": rng.integers(0, A, B).astype(np.int32),
@@ -29,49 +29,42 @@ def random_batch(seed: int, B: int = 7, A: int = 4, N: int = 11) -> dict[str, np
     }
 
 
+def means(b: dict) -> np.ndarray:
+    """Of the distributions at t."""
+    return np.asarray(losses.expectation(jax.nn.softmax(b["logits_t"]), b["atoms"]))
+
+
 # --- Q-learning ---------------------------------------------------------------------------------------------------
 
 
 def test_q_learning_td_is_the_hand_worked_number():
     # r + gamma max Q' - Q(s, a): 1 + 0.9 * 4 - 2 = 2.6; terminated: -1 + 0 - 5 = -6.
+    # A selector that prefers action 1 lets the target value that at -1: 1 + 0.9 * -1 - 2 = -1.9.
     td = losses.q_learning_td(
-        q_tm1=jnp.array([[2.0, 7.0], [3.0, 5.0]]),
-        a_tm1=jnp.array([0, 1]),
-        r_t=jnp.array([1.0, -1.0]),
-        discount_t=jnp.array([0.9, 0.0]),
-        q_t_value=jnp.array([[4.0, -1.0], [100.0, 200.0]]),
+        q_tm1=jnp.array([[2.0, 7.0], [3.0, 5.0], [2.0, 7.0]]),
+        a_tm1=jnp.array([0, 1, 0]),
+        r_t=jnp.array([1.0, -1.0, 1.0]),
+        discount_t=jnp.array([0.9, 0.0, 0.9]),
+        q_t_value=jnp.array([[4.0, -1.0], [100.0, 200.0], [4.0, -1.0]]),
+        q_t_selector=jnp.array([[4.0, -1.0], [100.0, 200.0], [0.0, 0.5]]),
     )
-    np.testing.assert_allclose(td, [2.6, -6.0], rtol=1e-6)
-
-
-def test_double_q_learning_lets_the_selector_choose_and_the_target_value():
-    # The selector prefers action 1, which the target values at -1: 1 + 0.9 * -1 - 2 = -1.9, not 2.6.
-    td = losses.q_learning_td(
-        q_tm1=jnp.array([[2.0, 7.0]]),
-        a_tm1=jnp.array([0]),
-        r_t=jnp.array([1.0]),
-        discount_t=jnp.array([0.9]),
-        q_t_value=jnp.array([[4.0, -1.0]]),
-        q_t_selector=jnp.array([[0.0, 0.5]]),
-    )
-    np.testing.assert_allclose(td, [-1.9], rtol=1e-6)
+    np.testing.assert_allclose(td, [2.6, -6.0, -1.9], rtol=1e-6)
 
 
 @pytest.mark.parametrize("double", [False, True])
 def test_td_equals_the_float64_oracle(double: bool):
     for seed in range(20):
         b = random_batch(seed)
-        selector = b["selector"] if double else None
-        args = (b["q_tm1"], b["a_tm1"], b["r_t"], b["discount_t"], b["q_t"])
-        td = losses.q_learning_td(*map(jnp.asarray, args), None if selector is None else jnp.asarray(selector))
-        np.testing.assert_allclose(td, reference.td(*args, selector), rtol=1e-5, atol=1e-5)
+        args = (b["q_tm1"], b["a_tm1"], b["r_t"], b["discount_t"], b["q_t"], b["selector" if double else "q_t"])
+        td = losses.q_learning_td(*map(jnp.asarray, args))
+        np.testing.assert_allclose(td, reference.td(*args), rtol=1e-5, atol=1e-5)
 
 
 def test_no_gradient_flows_into_the_td_target():
     b = {name: jnp.asarray(value) for name, value in random_batch(0).items()}
 
     def loss(q_tm1, q_t):
-        return losses.q_learning_td(q_tm1, b["a_tm1"], b["r_t"], b["discount_t"], q_t).sum()
+        return losses.q_learning_td(q_tm1, b["a_tm1"], b["r_t"], b["discount_t"], q_t, q_t).sum()
 
     into_tm1, into_t = jax.grad(loss, argnums=(0, 1))(b["q_tm1"], b["q_t"])
     assert float(jnp.abs(into_t).max()) == 0.0
@@ -127,19 +120,17 @@ def test_projection_keeps_mass_and_equals_the_oracle(seed: int, r: float, discou
 def test_categorical_loss_equals_the_float64_oracle(double: bool):
     for seed in range(20):
         b = random_batch(seed)
-        selector = b["selector"] if double else None
-        args = (b["logits_tm1"], b["a_tm1"], b["r_t"], b["discount_t"], b["logits_t"], b["atoms"])
-        ours = losses.categorical_q_learning(
-            *map(jnp.asarray, args), None if selector is None else jnp.asarray(selector)
-        )
-        np.testing.assert_allclose(np.stack(ours), reference.categorical(*args, selector), rtol=1e-4, atol=1e-5)
+        selector = b["selector"] if double else means(b)
+        args = (b["logits_tm1"], b["a_tm1"], b["r_t"], b["discount_t"], b["logits_t"], b["atoms"], selector)
+        ours = losses.categorical_q_learning(*map(jnp.asarray, args))
+        np.testing.assert_allclose(np.stack(ours), reference.categorical(*args), rtol=1e-4, atol=1e-5)
 
 
 def test_categorical_loss_of_a_terminal_reward_on_an_atom_is_its_negative_log_probability():
     atoms = jnp.array([-1.0, 0.0, 1.0])
     logits = jnp.log(jnp.array([[[0.2, 0.3, 0.5]]]))
     loss, kl = losses.categorical_q_learning(
-        logits, jnp.array([0]), jnp.array([1.0]), jnp.array([0.0]), jnp.zeros((1, 1, 3)), atoms
+        logits, jnp.array([0]), jnp.array([1.0]), jnp.array([0.0]), jnp.zeros((1, 1, 3)), atoms, jnp.zeros((1, 1))
     )
     np.testing.assert_allclose(loss, [-np.log(0.5)], rtol=1e-6)
     np.testing.assert_allclose(kl, [-np.log(0.5)], rtol=1e-6)  # a point mass has no entropy
@@ -149,7 +140,9 @@ def test_kl_is_zero_for_a_perfect_prediction_while_cross_entropy_is_the_entropy(
     atoms = jnp.array([-1.0, 0.0, 1.0])
     p = jnp.array([0.2, 0.3, 0.5])
     logits = jnp.log(p)[None, None]
-    loss, kl = losses.categorical_q_learning(logits, jnp.array([0]), jnp.array([0.0]), jnp.array([1.0]), logits, atoms)
+    loss, kl = losses.categorical_q_learning(
+        logits, jnp.array([0]), jnp.array([0.0]), jnp.array([1.0]), logits, atoms, jnp.zeros((1, 1))
+    )
     np.testing.assert_allclose(loss, [-(p * jnp.log(p)).sum()], rtol=1e-6)
     assert float(kl[0]) < 1e-6
 
@@ -158,9 +151,9 @@ def test_cross_entropy_and_kl_have_one_gradient_and_none_into_the_target():
     b = {name: jnp.asarray(value) for name, value in random_batch(3).items()}
 
     def total(which: int, logits_tm1: jax.Array, logits_t: jax.Array) -> jax.Array:
-        return losses.categorical_q_learning(logits_tm1, b["a_tm1"], b["r_t"], b["discount_t"], logits_t, b["atoms"])[
-            which
-        ].sum()
+        rest = (b["a_tm1"], b["r_t"], b["discount_t"])
+        selector = losses.expectation(jax.nn.softmax(logits_t), b["atoms"])
+        return losses.categorical_q_learning(logits_tm1, *rest, logits_t, b["atoms"], selector)[which].sum()
 
     grads = [jax.grad(total, argnums=(1, 2))(which, b["logits_tm1"], b["logits_t"]) for which in (0, 1)]
     np.testing.assert_allclose(grads[0][0], grads[1][0], atol=1e-7)
@@ -197,7 +190,7 @@ def test_losses_agree_with_rlax(rlax: ModuleType):
         atoms = jnp.tile(b["atoms"], (7, 1))
         pairs = {
             "q_learning": (
-                losses.q_learning_td(b["q_tm1"], *rest, b["q_t"]),
+                losses.q_learning_td(b["q_tm1"], *rest, b["q_t"], b["q_t"]),
                 jax.vmap(rlax.q_learning)(b["q_tm1"], *rest, b["q_t"]),
             ),
             "double_q_learning": (
@@ -206,7 +199,7 @@ def test_losses_agree_with_rlax(rlax: ModuleType):
             ),
             "huber": (losses.huber(b["r_t"]), rlax.huber_loss(b["r_t"])),
             "categorical_q_learning": (
-                losses.categorical_q_learning(b["logits_tm1"], *rest, b["logits_t"], b["atoms"])[0],
+                losses.categorical_q_learning(b["logits_tm1"], *rest, b["logits_t"], b["atoms"], means(b))[0],
                 jax.vmap(rlax.categorical_q_learning)(atoms, b["logits_tm1"], *rest, atoms, b["logits_t"]),
             ),
             "categorical_double_q_learning": (
@@ -223,6 +216,6 @@ def test_losses_agree_with_rlax(rlax: ModuleType):
 def test_shapes_that_do_not_belong_together_are_refused():
     b = {name: jnp.asarray(value) for name, value in random_batch(0).items()}
     with pytest.raises(AssertionError, match="equal_shape"):
-        losses.q_learning_td(b["q_tm1"], b["a_tm1"], b["r_t"], b["discount_t"], b["q_t"][:, :2])
+        losses.q_learning_td(b["q_tm1"], b["a_tm1"], b["r_t"], b["discount_t"], b["q_t"][:, :2], b["q_t"])
     with pytest.raises(AssertionError, match="rank"):
-        losses.q_learning_td(b["q_tm1"], b["q_tm1"], b["r_t"], b["discount_t"], b["q_t"])  # pyright: ignore
+        losses.q_learning_td(b["q_tm1"], b["q_tm1"], b["r_t"], b["discount_t"], b["q_t"], b["q_t"])  # pyright: ignore

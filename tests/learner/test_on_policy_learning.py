@@ -5,7 +5,6 @@ XLA's optimization, and held in all 40 runs (`make learning-seeds`; 2026-11-29, 
 of 10 reach the optimum, too, but for PQN in Catch: 8 of 10.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -127,23 +126,12 @@ def windows(first: dict[str, Any], rest: dict[str, Any]) -> Store:
 CATCH, CREDIT = catch(), umbrella()
 
 
-def assert_optimal(training: Training, seed: int, note: Callable[[str, float], None]) -> None:
-    returns = training(seed)
-    note("mean return", float(returns.mean()))
+@pytest.mark.parametrize(
+    "training",
+    [Training(CATCH, PQN, 300), Training(CATCH, PPO, 150), Training(CREDIT, PQN, 150), Training(CREDIT, PPO, 150)],
+    ids=["PQN, catch", "PPO, catch", "PQN, credit", "PPO, credit"],
+)
+def test_the_optimum_is_reached(training: Training, learning_seed, record_property):
+    returns = training(learning_seed)
+    record_property("mean return", float(returns.mean()))
     assert (returns == training.game.optimum).all(), f"mean return {returns.mean()}"
-
-
-def test_pqn_reaches_the_optimum_of_catch(learning_seed, record_property):
-    assert_optimal(Training(CATCH, PQN, 300), learning_seed, record_property)
-
-
-def test_ppo_reaches_the_optimum_of_catch(learning_seed, record_property):
-    assert_optimal(Training(CATCH, PPO, 150), learning_seed, record_property)
-
-
-def test_pqn_reaches_the_optimum_of_a_credit_task(learning_seed, record_property):
-    assert_optimal(Training(CREDIT, PQN, 150), learning_seed, record_property)
-
-
-def test_ppo_reaches_the_optimum_of_a_credit_task(learning_seed, record_property):
-    assert_optimal(Training(CREDIT, PPO, 150), learning_seed, record_property)

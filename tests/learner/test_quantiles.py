@@ -88,9 +88,9 @@ def test_descending_the_loss_finds_the_quantiles():
 def test_quantile_target_bootstraps_from_the_chosen_action():
     z_t = jnp.array([[[1.0, 3.0], [2.0, 4.0]], [[5.0, 5.0], [0.0, 0.0]]])
     r_t, discount_t = jnp.array([1.0, 1.0]), jnp.array([0.5, 0.0])
-    np.testing.assert_allclose(losses.quantile_target(r_t, discount_t, z_t), [[2.0, 3.0], [1.0, 1.0]])
-    other = jnp.array([[1.0, 0.0], [1.0, 0.0]])
-    np.testing.assert_allclose(losses.quantile_target(r_t, discount_t, z_t, other), [[1.5, 2.5], [1.0, 1.0]])
+    own, other = z_t.mean(axis=2), jnp.array([[1.0, 0.0], [1.0, 0.0]])
+    for selector, wanted in ((own, [[2.0, 3.0], [1.0, 1.0]]), (other, [[1.5, 2.5], [1.0, 1.0]])):
+        np.testing.assert_allclose(losses.quantile_target(r_t, discount_t, z_t, selector), wanted)
 
 
 def test_quantile_loss_equals_finite_differences_and_stops_at_the_target():
@@ -101,7 +101,7 @@ def test_quantile_loss_equals_finite_differences_and_stops_at_the_target():
         check_grads(lambda z: losses.quantile_huber(z, *args), (wide["z_tm1"][:, 0],), order=1, modes=["rev"])
 
     def loss(z_t):
-        target = losses.quantile_target(b["r_t"], b["discount_t"], z_t)
+        target = losses.quantile_target(b["r_t"], b["discount_t"], z_t, z_t.mean(2))
         munchausen = losses.munchausen_target(z_t.mean(2), b["a_tm1"], b["r_t"], b["discount_t"], z_t, z_t.mean(2))
         return sum(losses.quantile_huber(b["z_tm1"][:, 0], b["fractions"], t).sum() for t in (target, munchausen))
 
@@ -114,7 +114,8 @@ def test_quantile_loss_equals_finite_differences_and_stops_at_the_target():
 def test_quantile_q_learning_agrees_with_rlax(rlax: ModuleType, double: bool):
     for seed in range(5):
         b = random_batch(seed)
-        target = losses.quantile_target(b["r_t"], b["discount_t"], b["z_t"], b["selector"] if double else None)
+        choice = b["selector"] if double else b["z_t"].mean(2)
+        target = losses.quantile_target(b["r_t"], b["discount_t"], b["z_t"], choice)
         ours = losses.quantile_huber(losses.take_action(b["z_tm1"], b["a_tm1"]), b["fractions"], target)
         # Theirs is [quantiles, actions], and the selector is a distribution too: all of its quantiles at its mean.
         selector = jnp.repeat(b["selector"][:, :, None], M, axis=2) if double else b["z_t"]
@@ -173,7 +174,8 @@ def test_without_bonus_and_temperature_munchausen_is_quantile_q_learning():
     found = losses.munchausen_target(
         b["q_tm1"], b["a_tm1"], b["r_t"], b["discount_t"], b["z_t"], b["z_t"].mean(2), alpha=0.0, temperature=1e-6
     )
-    np.testing.assert_allclose(found, losses.quantile_target(b["r_t"], b["discount_t"], b["z_t"]), atol=1e-4)
+    wanted = losses.quantile_target(b["r_t"], b["discount_t"], b["z_t"], b["z_t"].mean(2))
+    np.testing.assert_allclose(found, wanted, atol=1e-4)
 
 
 def test_shapes_that_do_not_belong_together_are_refused():

@@ -23,7 +23,7 @@ from learner.config import OnPolicyConfig
 from learner.on_policy import OnPolicyParts
 from learner.rollouts import Rollout, RolloutSpec
 from learner.store import Store
-from learner.train_step import read_metrics
+from learner.train_step import LearnerState, read_metrics
 
 pytestmark = pytest.mark.isa
 
@@ -174,7 +174,7 @@ def pqn_loss(learner: Float64Learner, w: np.ndarray) -> np.ndarray:
     return (learner.returns - q) ** 2 / 2
 
 
-def fresh_state(agent, config=CONFIG) -> rollout_step.OnPolicyState:
+def fresh_state(agent, config=CONFIG) -> LearnerState:
     return jax.jit(lambda key: rollout_step.init(agent, rollout_spec(extras_of(agent)), config, key))(jax.random.key(0))
 
 
@@ -313,7 +313,7 @@ def test_every_epoch_and_every_rollout_has_an_order_of_its_own(tmp_path: Path):
         made_up_windows(1), extras=np.arange(L * W, dtype=np.float32)[:, None], last=np.zeros(L * W, bool)
     )
 
-    def learnt(state: rollout_step.OnPolicyState, num_updates: int) -> float:
+    def learnt(state: LearnerState, num_updates: int) -> float:
         state = compiled(agent, config)(jax.tree.map(jnp.copy, state), windows, np.int32(num_updates))
         return num_updates * read_metrics(state, NAMES, tmp_path)[0]["squares"]
 

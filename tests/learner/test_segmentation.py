@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import jax
@@ -124,6 +125,14 @@ def inner(found: np.ndarray, label: int) -> np.ndarray:
     return cv2.erode(np.uint8(found == label), np.ones((5, 5)), borderValue=0) > 0
 
 
+def elsewhere(*surroundings: views.Shot, **options: Any) -> list[np.ndarray]:
+    """Labels of those of 60 views of `parted` whose enemy stands before the other surroundings."""
+    drawn = (views.changed_view(np.random.default_rng(n), shot(*parted()), *surroundings, **options) for n in range(60))
+    found = [labels for _, labels in drawn if PLANE not in labels]
+    assert len(found) > 20
+    return found
+
+
 def test_a_changed_view_has_the_things_of_one_frame_and_the_surroundings_of_either():
     one, seen = shot(*parted()), set()
     for seed in range(200):
@@ -152,16 +161,11 @@ def test_things_stand_before_other_surroundings_that_keep_their_looks_in_every_f
 
 def test_things_are_hidden_where_the_surroundings_are_nearer():
     """An enemy at depth 10 before a wall whose left half is at 5 and whose right half is at 15."""
-    one, behind = shot(*parted()), filled(90, WALL)
+    behind = filled(90, WALL)
     behind.depth[:, :30], behind.depth[:, 30:] = 5, 15
-    elsewhere = 0
-    for seed in range(60):
-        _, found = views.changed_view(np.random.default_rng(seed), one, behind)
-        if PLANE not in found:
-            elsewhere += 1
-            np.testing.assert_array_equal(found[:, :30], WALL)
-            np.testing.assert_array_equal(found[:, 30:40], ENEMY)
-    assert elsewhere > 20
+    for found in elsewhere(behind):
+        np.testing.assert_array_equal(found[:, :30], WALL)
+        np.testing.assert_array_equal(found[:, 30:40], ENEMY)
 
 
 def test_floors_hide_nothing():
@@ -184,30 +188,21 @@ def test_surroundings_gain_the_things_of_all_frames_and_lose_their_own():
 
 def test_things_of_other_frames_stand_there_as_well():
     """The enemy at depth 10 hides the kit at 15, and stands before it at both sides."""
-    kit, elsewhere = LABEL_CLASSES.index("kit"), 0
-    for seed in range(60):
-        third = filled(30, kit, 15)
-        third.labels[:, 50:] = WALL
-        _, found = views.changed_view(np.random.default_rng(seed), shot(*parted()), filled(90, WALL), others=[third])
-        if PLANE not in found:
-            elsewhere += 1
-            np.testing.assert_array_equal(found[:, :20], kit)
-            np.testing.assert_array_equal(found[:, 20:40], ENEMY)
-            np.testing.assert_array_equal(found[:, 40:50], kit)
-            np.testing.assert_array_equal(found[:, 50:], WALL)
-    assert elsewhere > 20
+    kit = LABEL_CLASSES.index("kit")
+    third = filled(30, kit, 15)
+    third.labels[:, 50:] = WALL
+    for found in elsewhere(filled(90, WALL), others=[third]):
+        np.testing.assert_array_equal(found[:, :20], kit)
+        np.testing.assert_array_equal(found[:, 20:40], ENEMY)
+        np.testing.assert_array_equal(found[:, 40:50], kit)
+        np.testing.assert_array_equal(found[:, 50:], WALL)
 
 
 def test_decorations_of_a_third_frame_stand_among_the_things_by_their_depth():
     """At depth 15 they are before the wall at 20 and behind the enemy at 10; at depth 5 they hide it."""
     for depth, before in ((15, ENEMY), (5, SCENERY)):
-        third, elsewhere = filled(30, SCENERY, depth), 0
-        for seed in range(60):
-            _, found = views.changed_view(np.random.default_rng(seed), shot(*parted()), filled(90, WALL), third)
-            if PLANE not in found:
-                elsewhere += 1
-                assert set(np.unique(found)) == {SCENERY, before}
-        assert elsewhere > 20
+        for found in elsewhere(filled(90, WALL), filled(30, SCENERY, depth)):
+            assert set(np.unique(found)) == {SCENERY, before}
 
 
 def test_a_view_that_is_moved_takes_its_labels_along():

@@ -11,7 +11,6 @@ import pytest
 from benchmarks.reference import RECORDS, read_reference
 from gvz.core.env_config import EnvConfig
 from gvz.env import DoomEnv
-from gvz.evaluation.play import play_episode
 from gvz.evaluation.players import CLASSES
 from gvz.evaluation.simple import player_env
 from gvz.observation import label_class
@@ -20,6 +19,7 @@ from gvz.scenarios.find_ammunition import DECOYS
 from gvz.scenarios.find_the_key import ROOM_SPOTS
 from gvz.tasks import parse_task, scenario_named
 from gvz.wad.udmf import parse_textmap
+from tests.episodes import evaluated
 from tests.scenarios.measure import Player
 
 FIRST_ENEMY = 1000
@@ -179,8 +179,7 @@ def test_a_script_that_sees_kills_often_and_a_blind_sweep_hardly_ever():
     """Three episodes each of base seed 1: 14, 16 and 8 against 0, 0 and 0 (2026-11-23)."""
     scores = {}
     for name in ("scripted", "sweep"):
-        with closing(DoomEnv("find_ammunition/default", player_env(name, EnvConfig()))) as env:
-            rows = [play_episode(env, CLASSES[name](), episode, 1) for episode in range(3)]
+        rows = evaluated("find_ammunition/default", name)
         scores[name] = sum(row["score"] for row in rows) / 3
         for row in rows:
             assert row["score"] == row["kills"] == row["player_kills"] <= 24

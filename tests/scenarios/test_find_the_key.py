@@ -7,17 +7,15 @@ from math import hypot
 import numpy as np
 import pytest
 
-from gvz.core.env_config import LABEL_CLASSES, EnvConfig
+from gvz.core.env_config import LABEL_CLASSES
 from gvz.env import DoomEnv
-from gvz.evaluation.play import play_episode
-from gvz.evaluation.players import CLASSES
-from gvz.evaluation.simple import player_env
 from gvz.observation import CLASS_GREYS, label_class
 from gvz.scenarios.base import Task
 from gvz.scenarios.compiler import map_source
 from gvz.scenarios.looks import _walls, open_places
 from gvz.tasks import parse_task, scenario_named
 from gvz.wad.udmf import parse_textmap
+from tests.episodes import evaluated
 from tests.scenarios.measure import Player
 
 DECOYS = {"RedCard", "YellowCard", "RedSkull", "YellowSkull"}
@@ -159,9 +157,7 @@ def test_a_script_that_sees_leaves_often_and_a_blind_sweep_hardly_ever():
     """Three episodes each of base seed 1: 8, 8 and 9 against 1, 1 and 0 (2026-11-22)."""
     scores = {}
     for name in ("scripted", "sweep"):
-        env = DoomEnv("find_the_key/default", player_env(name, EnvConfig()))
-        rows = [play_episode(env, CLASSES[name](), episode, 1) for episode in range(3)]
-        env.close()
+        rows = evaluated("find_the_key/default", name)
         scores[name] = sum(row["score"] for row in rows) / 3
         for row in rows:
             assert row["reward_components"]["left"] == row["score"]

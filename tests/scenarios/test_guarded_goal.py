@@ -2,20 +2,16 @@
 
 import math
 import random
-from contextlib import closing
 from math import dist
 from typing import Any
 
 import pytest
 
-from gvz.core.env_config import EnvConfig
-from gvz.env import DoomEnv
-from gvz.evaluation.play import play_episode
-from gvz.evaluation.players import ScriptedPlayer, SweepPlayer
-from gvz.evaluation.simple import player_env
+from gvz.evaluation.players import ScriptedPlayer
 from gvz.observation import label_class
 from gvz.scenarios.guarded_goal import ROOM_SPOTS
 from gvz.tasks import scenario_named
+from tests.episodes import evaluated
 from tests.scenarios.measure import Player
 
 GUARDS = {"default": ("DoomImp", 40), "sergeants": ("ShotgunGuy", 40), "flying_guards": ("Cacodemon", 62)}
@@ -192,25 +188,20 @@ class HastyPlayer(ScriptedPlayer):
             self._sight.labels = [thing for thing in self._sight.labels if thing not in guards]
 
 
-def rows_of(player: Any, name: str, episodes: int, task: str = "default") -> list[dict[str, Any]]:
-    """Evaluation episodes of base seed 1."""
-    with closing(DoomEnv(f"guarded_goal/{task}", player_env(name, EnvConfig()))) as env:
-        return [play_episode(env, player, episode, 1) for episode in range(episodes)]
-
-
 def total(rows: list[dict[str, Any]], column: str) -> float:
     return sum(row[column] for row in rows)
 
 
 @pytest.mark.engine
 def test_a_script_that_shoots_all_guards_reaches_goals_and_a_blind_sweep_hardly_any():
-    patient, blind = rows_of(ScriptedPlayer(), "scripted", 6), rows_of(SweepPlayer(), "sweep", 3)
+    task = "guarded_goal/default"
+    patient, blind = evaluated(task, "scripted", 6), evaluated(task, "sweep")
     for row in patient + blind:
         assert row["reward_components"]["goal"] == row["score"]
         assert row["normalized_score"] == pytest.approx(100 * row["score"] / 14)
         assert row["terminated"] or row["length_frames"] == 1050
     assert total(patient, "score") / 6 > 4 > 1 > total(blind, "score") / 3
-    hasty = rows_of(HastyPlayer(), "scripted", 6)
+    hasty = evaluated(task, "scripted", 6, HastyPlayer)
     assert total(hasty, "terminated") >= 3 > 1 >= total(patient, "terminated")
     assert total(hasty, "score") < total(patient, "score")
 
@@ -218,7 +209,7 @@ def test_a_script_that_shoots_all_guards_reaches_goals_and_a_blind_sweep_hardly_
 @pytest.mark.engine
 def test_drawn_rooms_can_be_played():
     """Walls may stand where a guard would; goals are reached and guards are killed all the same."""
-    rows = rows_of(ScriptedPlayer(), "scripted", 4, "procedural-train-4")
+    rows = evaluated("guarded_goal/procedural-train-4", "scripted", 4)
     assert total(rows, "score") > 4
     assert total(rows, "player_kills") > 12
 

@@ -1,19 +1,14 @@
 """Rockets: what a running engine shows, against what the scenario's file says."""
 
 import itertools
-from contextlib import closing
 from math import cos, radians, sin
 
 import pytest
 
-from gvz.core.env_config import EnvConfig
-from gvz.env import DoomEnv
-from gvz.evaluation.play import play_episode
-from gvz.evaluation.players import CLASSES
-from gvz.evaluation.simple import player_env
 from gvz.observation import label_class
 from gvz.scenarios.compiler import map_source
 from gvz.tasks import parse_task, scenario_named
+from tests.episodes import evaluated
 
 MIDDLE = 608
 """of the square room, map units"""
@@ -81,8 +76,7 @@ def test_a_script_that_sees_kills_most_and_a_blind_sweep_few():
     """Three episodes each of base seed 1: 28 and 6 on average (2026-11-23)."""
     scores, at_once = {}, []
     for name in ("scripted", "sweep"):
-        with closing(DoomEnv("rockets/default", player_env(name, EnvConfig()))) as env:
-            rows = [play_episode(env, CLASSES[name](), episode, 1) for episode in range(3)]
+        rows = evaluated("rockets/default", name)
         scores[name] = sum(row["score"] for row in rows) / 3
         for row in rows:
             assert row["reward_components"]["kill"] == row["kills"] == row["score"]

@@ -143,8 +143,7 @@ def test_blocks_are_copies(reader: RingReader, writer: RingWriter):
 
 
 def test_reserving_in_a_full_ring_is_a_bug(reader: RingReader, writer: RingWriter):
-    for number in range(reader.capacity):
-        write(writer, number)
+    write(writer, *range(reader.capacity))
     with pytest.raises(AssertionError, match="0 records are free; wait_for_space first"):
         writer.reserve(1)
 
@@ -158,8 +157,7 @@ def test_a_reservation_that_wraps_is_a_bug(reader: RingReader, writer: RingWrite
 
 @pytest.mark.usefixtures("reader")
 def test_a_full_ring_makes_the_writer_wait_and_says_for_whom(writer: RingWriter):
-    for number in range(CAPACITY - 2):
-        write(writer, number)
+    write(writer, *range(CAPACITY - 2))
     assert writer.wait_for_space(2, timeout_s=0.0)
     with pytest.raises(
         WaitTimeoutError, match=r"waited 0\.\d s for the learner to read; 2 of 8 records are free, 3 are"
@@ -168,8 +166,7 @@ def test_a_full_ring_makes_the_writer_wait_and_says_for_whom(writer: RingWriter)
 
 
 def test_waiting_ends_when_the_reader_reads_and_is_counted(reader: RingReader, writer: RingWriter):
-    for number in range(CAPACITY):
-        write(writer, number)
+    write(writer, *range(CAPACITY))
 
     def read_later():
         wait_until(lambda: reader.writer_status().state == WriterState.WAITING_FOR_SPACE, "the writer's wait")
@@ -186,16 +183,14 @@ def test_waiting_ends_when_the_reader_reads_and_is_counted(reader: RingReader, w
 
 @pytest.mark.usefixtures("reader")
 def test_waiting_can_be_cancelled(writer: RingWriter):
-    for number in range(CAPACITY):
-        write(writer, number)
+    write(writer, *range(CAPACITY))
     assert not writer.wait_for_space(1, timeout_s=10.0, cancelled=lambda: True)
 
 
 def test_time_in_which_the_writer_was_stopped_is_no_time_of_waiting(
     reader: RingReader, writer: RingWriter, monkeypatch: pytest.MonkeyPatch
 ):
-    for number in range(CAPACITY):
-        write(writer, number)
+    write(writer, *range(CAPACITY))
     pause, looks = make_pause(monkeypatch), []
 
     def stopped_once() -> bool:
@@ -262,8 +257,7 @@ def steps_of(ring: RingReader) -> np.ndarray:
 
 @pytest.mark.parametrize(("slot", "wrong"), [(2, 1), (1, 2), (0, 8), (3, 2**64 - 1)])
 def test_a_lost_repeated_or_torn_record_is_found(reader: RingReader, writer: RingWriter, slot: int, wrong: int):
-    for number in range(5):
-        write(writer, number)
+    write(writer, *range(5))
     steps_of(reader)["sequence"][slot] = wrong
     with pytest.raises(TransportError, match=f"got record {wrong} where {slot} should be; records were lost"):
         reader.read(5)
@@ -312,8 +306,7 @@ def test_impossible_indices_are_found(published: int, consumed: int):
 
 
 def test_a_damaged_count_of_waiting_does_not_end_the_writer(writer: RingWriter, reader: RingReader):
-    for number in range(CAPACITY):
-        write(writer, number)
+    write(writer, *range(CAPACITY))
     words_of(reader)[4] = 2**64 - 1
     with pytest.raises(WaitTimeoutError, match="for the learner to read"):
         writer.wait_for_space(1, timeout_s=0.01)

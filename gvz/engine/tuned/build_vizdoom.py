@@ -166,16 +166,8 @@ def install() -> None:
     check_installed()
     check_tools()
     print(f"building vizdoom {TUNED_VERSION}: some five minutes on two cores", flush=True)
-    command = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "--disable-pip-version-check",
-        "--verbose",
-        "--no-deps",
-        str(HERE),
-    ]
+    options = ["--disable-pip-version-check", "--verbose", "--no-deps"]
+    command = [sys.executable, "-m", "pip", "install", *options, str(HERE)]
     last: deque[str] = deque(maxlen=30)
     shown = 0
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as pip:
