@@ -176,7 +176,8 @@ def test_death_terminates_with_the_frame_of_its_moment(shared: DoomEnv):
     red, _, blue = (observation.astype(int) - steps[-2][0]).mean((0, 1))
     assert red > blue, "the screen turns red"
     assert 4 * (len(steps) - 1) < info["episode_frames"] <= 4 * len(steps)
-    scenario = dataclasses.replace(shared.task.scenario, timeouts={"thesis": info["episode_frames"]})
+    timeouts = {**shared.task.scenario.timeouts, "thesis": info["episode_frames"]}
+    scenario = dataclasses.replace(shared.task.scenario, timeouts=timeouts)
     with closing(DoomEnv(dataclasses.replace(shared.task, scenario=scenario))) as env:
         env.reset(seed=1)
         assert idle_to_the_end(env)[-1][2:4] == (True, False), "also in the frame of the time-out"

@@ -259,7 +259,7 @@ def parameter_queue(_directory: Path) -> Target:
     def run(data: bytes) -> bool:
         segment.payload[:] = image
         segment.payload[: min(len(data), len(image))] = data[: len(image)]
-        reader = BroadcastReader(segment, NUM_PARAMS, 3, LAYOUT)
+        reader = BroadcastReader(segment, NUM_PARAMS, LAYOUT)
         patience, broadcast._READ_TIMEOUT_S = broadcast._READ_TIMEOUT_S, 0.001  # a damaged ticket is waited for in vain
         try:
             for _ in range(2):
