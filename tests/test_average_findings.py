@@ -7,7 +7,18 @@ import pytest
 
 from gvz.reports.scores import Scores, estimate
 from gvz.tasks import TaskSet, scenario_named
-from tests.score_tables import PAGE, SUMMARY, WORDS, in_words, last_updates, scores_of, task_sets
+from tests.score_tables import (
+    PAGE,
+    ROOT,
+    SUMMARY,
+    WORDS,
+    in_words,
+    last_updates,
+    metrics_of,
+    score_cells,
+    scores_of,
+    task_sets,
+)
 
 RUNS: dict[str, tuple[str, str, TaskSet]] = {
     "Rainbow": ("general_train4", "rainbow_segmented+train4_network", "train4"),
@@ -22,11 +33,24 @@ def pair(agent: str, scenario: str) -> tuple[Scores, Scores]:
     """Scores of the same runs with averaged parameters and with the last ones, on the same episodes."""
     folder, name, training = RUNS[agent]
     averaged, last = scores_of(folder, name, scenario), scores_of("last_parameters", name + LAST, scenario)
+    check_pair(averaged, last, task_sets(scenario, training)[:2])
+    return averaged, last
+
+
+def long_pair(scenario: str) -> tuple[Scores, Scores]:
+    """The `pair` of PPO's long run."""
+    averaged, last = (
+        scores_of("general_on_policy_average", f"ppo_segmented+average{what}", scenario) for what in ("", LAST)
+    )
+    check_pair(averaged, last, task_sets(scenario)[:2])
+    return averaged, last
+
+
+def check_pair(averaged: Scores, last: Scores, sets: list[list[str]]) -> None:
     assert averaged.runs.keys() == last.runs.keys()
-    for tasks in task_sets(scenario, training)[:2]:
+    for tasks in sets:
         for seed in last.runs:
             assert all(len(averaged.runs[seed][task]) == len(last.runs[seed][task]) for task in tasks)
-    return averaged, last
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
@@ -39,15 +63,20 @@ def test_the_findings_say_what_averaged_parameters_have(agent: str, scenario: st
         assert f"| {title} | {agent} | {parameters} | {cells} |" in PAGE
 
 
+def gains_of(averaged: Scores, last: Scores, tasks: list[str]) -> Scores:
+    """What the average gives in each episode."""
+    gained = {
+        seed: {task: by_task[task] - last.runs[seed][task] for task in tasks} for seed, by_task in averaged.runs.items()
+    }
+    return replace(averaged, runs=gained)
+
+
 def gain_of_average(agent: str, scenario: str) -> tuple[str, list[str]]:
     """What the average gives on the gate tasks: with its interval, and by run."""
-    averaged, last = pair(agent, scenario)
     gate = task_sets(scenario)[1]
-    gained = {
-        seed: {task: by_task[task] - last.runs[seed][task] for task in gate} for seed, by_task in averaged.runs.items()
-    }
-    by_run = [f"{np.mean([*gained[seed].values()]):.1f}" for seed in sorted(gained)]
-    return estimate(replace(averaged, runs=gained), gate).text, by_run
+    gained = gains_of(*pair(agent, scenario), gate)
+    by_run = [f"{np.mean([*gained.runs[seed].values()]):.1f}" for seed in sorted(gained.runs)]
+    return estimate(gained, gate).text, by_run
 
 
 def test_the_findings_say_how_many_gradient_steps_the_runs_had():
@@ -73,3 +102,26 @@ def test_the_findings_say_what_each_run_gains(agent: str):
 def test_the_summary_says_what_averaged_parameters_give():
     gains = " | | | ".join(gain_of_average("Rainbow", scenario)[0] for scenario in SCENARIOS)
     assert f"in evaluation, beside segmented frames and four tasks | {gains} | yes |" in SUMMARY
+
+
+def test_the_findings_say_what_averaged_parameters_give_after_six_times_the_time():
+    scenario = "defend_the_center"
+    averaged, last = long_pair(scenario)
+    sets = task_sets(scenario)[:2]
+    gained = " | ".join(estimate(gains_of(averaged, last, tasks), tasks).text for tasks in sets)
+    lasts = " | ".join(estimate(last, tasks).text for tasks in sets)
+    assert f"| averaged | {score_cells(averaged, scenario)} |" in PAGE
+    assert f"| last | {lasts} | | |" in PAGE
+    assert f"| averaged minus last | {gained} | | |" in PAGE
+
+
+def test_the_findings_say_how_many_gradient_steps_the_long_run_had():
+    ours, earlier = (
+        metrics_of(ROOT / "results" / folder)[-1]["num_updates"]
+        for folder in (
+            "general_on_policy_average/runs/ppo_segmented+average/defend_the_center/train8/seed_2222",
+            "general_on_policy/runs/ppo_segmented/defend_the_center/train8/seed_1111",
+        )
+    )
+    assert f"one seed (2222), {ours:,} gradient steps" in WORDS
+    assert f"seed 1111 had {earlier:,} in this processor time" in WORDS

@@ -203,6 +203,7 @@ def test_the_guide_says_how_long_experiments_train_at_the_measured_rates():
         ("general_compositions_long", None, 50),
         ("general", None, 100),
         ("general_on_policy", None, 100),
+        ("general_on_policy_average", None, 100),
         ("gates", "gate", 20),
     ],
 )
