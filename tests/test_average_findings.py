@@ -18,6 +18,7 @@ from tests.score_tables import (
     score_cells,
     scores_of,
     task_sets,
+    training_episodes,
 )
 
 RUNS: dict[str, tuple[str, str, TaskSet]] = {
@@ -125,3 +126,18 @@ def test_the_findings_say_how_many_gradient_steps_the_long_run_had():
     )
     assert f"one seed (2222), {ours:,} gradient steps" in WORDS
     assert f"seed 1111 had {earlier:,} in this processor time" in WORDS
+
+
+def test_the_findings_say_how_ppo_s_second_seed_learned():
+    run = ROOT / "results/general_on_policy_average/runs/ppo_segmented+average/defend_the_center/train8/seed_2222"
+    first, *others = (
+        f"{np.mean([row['normalized_score'] for row in training_episodes(run, low_s, high_s)]):.1f} in "
+        f"{what}{low_s:,} to {high_s:,}"
+        for low_s, high_s, what in (
+            (300, 600, "the seconds "),
+            (900, 1_500, ""),
+            (2_400, 3_000, ""),
+            (4_800, 5_400, ""),
+        )
+    )
+    assert f"its training episodes have {in_words([first, *others])}." in WORDS

@@ -138,17 +138,25 @@ def test_a_run_goes_through_every_fault_of_its_actors_and_engines_and_loses_noth
     assert "actor 1 gave no sign of life for " in await_fault(run, before, "stuck", 1)["message"]
     seconds["actor stopped"] = time.monotonic() - start
 
-    before, start = len(faults(run)), time.monotonic()
-    starting: list[psutil.Process] = []
-    while not starting:  # of the process that takes the place of the stopped one
-        assert time.monotonic() - start < 600
-        pid, _ = writer(process, 1)
-        starting = [] if pid == stopped_actor.pid else engines(psutil.Process(pid))
-    starting[0].send_signal(signal.SIGSEGV)
-    (early,) = wait_until(lambda: [row for row in faults(run)[before:] if row["actor"] == 1], "the fault", TIMEOUT_S)
+    late = 0  # engines that had given their first frame before they were found, on a busy machine
+    while True:
+        before, start = len(faults(run)), time.monotonic()
+        starting: list[psutil.Process] = []
+        while not starting:  # of the process that takes the place of the stopped one
+            assert time.monotonic() - start < 600
+            pid, _ = writer(process, 1)
+            starting = [] if pid == stopped_actor.pid else engines(psutil.Process(pid))
+        starting[0].send_signal(signal.SIGSEGV)
+        wait_until(lambda before=before: any(row["actor"] == 1 for row in faults(run)[before:]), "it", TIMEOUT_S)
+        told = next(row for row in faults(run)[before:] if row["actor"] == 1)
+        if told["kind"] != "engine_crash" or late == 10:
+            break
+        late += 1
+        stopped_actor = actor(process, 1)
+        stopped_actor.kill()
+        await_fault(run, before, "died", 1)
     # an engine that dies before its first frame takes its client along: ViZDoom reads a null pointer
-    messages = {"died": "actor 1 was ended by SIGSEGV", "engine_crash": "the engine died "}
-    assert messages[early["kind"]] in early["message"]
+    assert (told["kind"], "actor 1 was ended by SIGSEGV" in told["message"]) == ("died", True)
     seconds["engine killed at its start"] = time.monotonic() - start
     actor(process, 1)
 
@@ -157,15 +165,16 @@ def test_a_run_goes_through_every_fault_of_its_actors_and_engines_and_loses_noth
     assert code == 0, err
     print(*(f"{what}: {s:.1f} s" for what, s in seconds.items()), sep="\n")
     assert max(seconds.values()) < 120, seconds
-    wanted = Counter({("exception", 0): 1, ("died", 0): 1, ("died", 1): 1, ("engine_crash", 0): 2, ("stuck", 1): 1})
-    wanted[early["kind"], 1] += 1
+    wanted = Counter({("exception", 0): 1, ("died", 0): 1, ("died", 1): 2, ("engine_crash", 0): 2, ("stuck", 1): 1})
+    wanted.update({("engine_crash", 1): late, ("died", 1): late})
     assert Counter((row["kind"], row["actor"]) for row in rows(run, "faults.jsonl")) == wanted
 
     streams = check_streams(run, num_lanes=4, num_tasks=4)
     assert rows(run, "metrics.jsonl")[-1]["num_updates"] == 600
     cut = [row for row in streams.rows if row["cut"]]
-    crashes = [number for number in (0, 1) for _ in range(wanted["engine_crash", number])]
-    assert sorted(row["lane"] // 2 for row in cut) == crashes, "an episode whose engine died is recorded as cut"
+    assert sorted(row["lane"] // 2 for row in cut) == [0, 0, *[1] * late], (
+        "an episode whose engine died is recorded as cut"
+    )
     assert all(row["truncated"] and not row["terminated"] for row in cut)
     ends = Counter(row["actor"] for row in rows(run, "faults.jsonl") if row["kind"] in ("died", "stuck"))
     for lane, missing in enumerate(streams.unrecorded):
