@@ -14,7 +14,6 @@ from tests.score_tables import (
     WORDS,
     in_words,
     last_updates,
-    metrics_of,
     score_cells,
     scores_of,
     task_sets,
@@ -105,27 +104,28 @@ def test_the_summary_says_what_averaged_parameters_give():
     assert f"in evaluation, beside segmented frames and four tasks | {gains} | yes |" in SUMMARY
 
 
-def test_the_findings_say_what_averaged_parameters_give_after_six_times_the_time():
-    scenario = "defend_the_center"
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_the_findings_say_what_averaged_parameters_give_after_six_times_the_time(scenario: str):
+    title = scenario_named(scenario).title
     averaged, last = long_pair(scenario)
     sets = task_sets(scenario)[:2]
     gained = " | ".join(estimate(gains_of(averaged, last, tasks), tasks).text for tasks in sets)
     lasts = " | ".join(estimate(last, tasks).text for tasks in sets)
-    assert f"| averaged | {score_cells(averaged, scenario)} |" in PAGE
-    assert f"| last | {lasts} | | |" in PAGE
-    assert f"| averaged minus last | {gained} | | |" in PAGE
+    assert f"| {title} | averaged | {score_cells(averaged, scenario)} |" in PAGE
+    assert f"| {title} | last | {lasts} | | |" in PAGE
+    assert f"| {title} | averaged minus last | {gained} | | |" in PAGE
 
 
-def test_the_findings_say_how_many_gradient_steps_the_long_run_had():
+def test_the_findings_say_how_many_gradient_steps_the_long_runs_had():
     ours, earlier = (
-        metrics_of(ROOT / "results" / folder)[-1]["num_updates"]
-        for folder in (
-            "general_on_policy_average/runs/ppo_segmented+average/defend_the_center/train8/seed_2222",
-            "general_on_policy/runs/ppo_segmented/defend_the_center/train8/seed_1111",
+        [last_updates(f"{folder}/runs/{name}/{scenario}/train8/*")[0] for scenario in SCENARIOS]
+        for folder, name in (
+            ("general_on_policy_average", "ppo_segmented+average"),
+            ("general_on_policy", "ppo_segmented"),
         )
     )
-    assert f"one seed (2222), {ours:,} gradient steps" in WORDS
-    assert f"seed 1111 had {earlier:,} in this processor time" in WORDS
+    assert f"one seed (2222), {in_words([f'{n:,}' for n in ours])} gradient steps" in WORDS
+    assert f"seed 1111 had {in_words([f'{n:,}' for n in earlier])} in this processor time" in WORDS
 
 
 def test_the_findings_say_how_ppo_s_second_seed_learned():
@@ -141,3 +141,16 @@ def test_the_findings_say_how_ppo_s_second_seed_learned():
         )
     )
     assert f"its training episodes have {in_words([first, *others])}." in WORDS
+
+
+def test_the_findings_say_what_ppo_s_first_seed_has_without_an_average():
+    (defend, *_), (training, gate, test, _) = (
+        [
+            score.split()[0]
+            for score in score_cells(scores_of("general_on_policy", "ppo_segmented", scenario), scenario).split(" | ")
+        ]
+        for scenario in SCENARIOS
+    )
+    assert f"seed 1111 have {defend} on the training tasks, so the" in WORDS
+    seek = f"{training} on the training tasks and {gate} on the gate tasks, and {test} on the test tasks."
+    assert f"seed 1111 have {seek}" in WORDS

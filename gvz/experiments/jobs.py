@@ -25,7 +25,7 @@ class Command:
     """train or evaluate"""
     arguments: tuple[str, ...]
     total: int
-    """of the job when it is done"""
+    """what `Job.done_count` gives when the job is done; episodes that the plan does not ask for are among them"""
     unit: str = "updates"
     """what `total` counts"""
 
@@ -68,16 +68,17 @@ class RunJob:
             goal, unit = round(limit_s), "processor seconds"
             trained = f"{now.num_updates:,} updates in {now.processor_s:,.0f}/{limit_s:,.0f} {unit}"
         text = f"{trained}, {played:,}/{total:,} episodes"
-        directory, following = str(inventory.run_directory(self.results, self.run)), None
+        directory, following = inventory.run_directory(self.results, self.run), None
         if not now.trained:
-            arguments = ("-m", "gvz.launch", *training_flags(self.run, self.scale), "--run-dir", directory)
+            arguments = ("-m", "gvz.launch", *training_flags(self.run, self.scale), "--run-dir", str(directory))
             following = Command(step="train", arguments=arguments, total=goal, unit=unit)
         elif now.missing:
-            which = (directory, "--checkpoints", *map(str, now.missing))
+            which = (str(directory), "--checkpoints", *map(str, now.missing))
             own = self.run.run_config.own_files._asdict().items()
             files = [text for name, file in own if file is not None for text in (f"--{name}", str(file))]
             arguments = ("-m", "gvz.cli", "evaluate", *which, *files, *_episodes(self.evaluation))
-            following = Command(step="evaluate", arguments=arguments, total=total, unit="episodes")
+            goal = inventory.count_rows(directory / EVALUATION_RECORDS) + sum(now.missing.values())
+            following = Command(step="evaluate", arguments=arguments, total=goal, unit="episodes")
         return Outlook(next=following, begun=now.num_updates > 0, text=text)
 
     def other_settings(self) -> list[str]:
@@ -98,7 +99,7 @@ class RunJob:
         return found
 
     def done_count(self, step: str) -> int:
-        """How much of `Command.total` is done: gradient steps, processor seconds or episodes of a job at work."""
+        """How much of `Command.total` is done: gradient steps, processor seconds or episodes in the records."""
         directory = inventory.run_directory(self.results, self.run)
         if step == "train":
             by_time = self.run.max_processor_s is not None
@@ -124,12 +125,13 @@ class PlayerJob:
         total = len(self.evaluation.tasks) * self.evaluation.episodes
         arguments = ("-m", "gvz.cli", "evaluate", "--player", self.player, "--out", str(self._file))
         arguments = (*arguments, *_episodes(self.evaluation))
-        following = Command(step="evaluate", arguments=arguments, total=total, unit="episodes")
+        goal = inventory.count_rows(self._file) + missing
+        following = Command(step="evaluate", arguments=arguments, total=goal, unit="episodes")
         text = f"{total - missing:,}/{total:,} episodes"
         return Outlook(next=following if missing else None, begun=missing < total, text=text)
 
     def done_count(self, step: str) -> int:
-        """Episodes played, of a job at work."""
+        """Episodes in the records."""
         return inventory.count_rows(self._file)
 
     @property

@@ -165,3 +165,15 @@ def test_a_player_plays_into_its_own_file(tmp_path):
         "--tasks defend_the_center/default --episodes 2"
     )
     assert not job.outlook().begun
+
+
+def test_progress_counts_episodes_that_the_plan_does_not_ask_for_on_both_sides(tmp_path):
+    """As those of another scenario, played before."""
+    file = progress.player_file(tmp_path, "idle")
+    file.parent.mkdir()
+    row = '{"schema": 1, "task": "%s/default", "episode": %d}\n'
+    file.write_text("".join(row % ("seek_and_kill", n) for n in range(5)) + row % ("defend_the_center", 0))
+    job = PlayerJob(results=tmp_path, player="idle", evaluation=EVALUATION)
+    outlook = job.outlook()
+    assert outlook.next is not None
+    assert (outlook.text, job.done_count("evaluate"), outlook.next.total) == ("1/2 episodes", 6, 7)
