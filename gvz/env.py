@@ -1,6 +1,7 @@
 """A task as a Gymnasium environment: observation, actions, reward, time-out, seeds, crashes of the engine."""
 
 import dataclasses
+import os
 import re
 import time
 from collections.abc import Mapping, Sequence
@@ -69,6 +70,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
     - Seeds: `reset(seed=n)` seeds the sequence of episodes. Each episode has its own seed, `info["episode_seed"]`, and
       `reset(options={"episode_seed": m})` replays that episode alone. It also chooses the map, where maps are drawn.
     - Threads: `reset`, `step` and `close` raise AlreadyPendingCallError while another thread is in one of them.
+    - Forks: a fork of the process has no episode. Its first `reset` starts an engine of its own.
     """
 
     metadata = {  # noqa: RUF012  Gymnasium's; an instance's has the pictures per second of its own frame skip
@@ -179,7 +181,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         super().reset(seed=seed)
         self._playing = False  # if this call is interrupted, there is no episode to go on with
         self._episode_seed = int(self.np_random.integers(EPISODE_SEEDS)) if given is None else given
-        if self._recycle_episodes and self._engine_episodes >= self._recycle_episodes:
+        forked = self._engine is not None and self._engine.owner_pid != os.getpid()
+        if forked or 0 < self._recycle_episodes <= self._engine_episodes:
             self._stop_engine()
         engine, crash = self._begin()
         self._engine_episodes += 1
@@ -207,8 +210,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             EngineError: the engine crashed too often in a row.
         """
         engine = self._engine
-        if engine is None or not self._playing:
-            raise ResetNeeded("DoomEnv.step: no episode is running; call reset first")
+        if engine is None or not self._playing or engine.owner_pid != os.getpid():
+            raise ResetNeeded("DoomEnv.step: no episode is running in this process; call reset first")
         if isinstance(self.action_space, MultiDiscrete):
             held = np.asarray(action)
             if not self.action_space.contains(held):
