@@ -119,7 +119,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         scenario = self.task.scenario
         self._compiled = compile_task(self.task, config.profile)
         self._timeout_frames = scenario.timeout_frames(config.profile)
-        self._upper_bound = scenario.upper_bound(config.profile)
+        self._upper_bound = float(scenario.upper_bound(config.profile))
         self._rewarder = scenario.make_rewarder(dict(config.reward_weights), config.profile)
         self.action_meanings = action_buttons(scenario, config.action_set)
         self._actions = [[button in held for button in scenario.buttons] for held in self.action_meanings]
