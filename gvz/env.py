@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import re
 import time
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -29,7 +28,7 @@ from gvz.observation import (
 from gvz.one_thread import one_thread
 from gvz.scenarios.base import BOOKKEEPING, Task
 from gvz.scenarios.checks import ALWAYS_READ
-from gvz.scenarios.compiler import compile_task, task_content
+from gvz.scenarios.compiler import compile_task
 from gvz.segmentation import segmented_frame, segmenter_of
 from gvz.tasks import parse_task
 from gvz.viewer import Window
@@ -44,8 +43,6 @@ _WEAPON_UP_TIC = 10
 """tic at which the weapon is ready: episodes with a weapon start there, as LevDoom's do"""
 _COUNTED = {"kills": "KILLCOUNT", "goals": "GOALS"}
 """metric -> the variable that counts it"""
-_FUZZY = re.compile("fuzzy|spectre|blursphere|type=58,", re.IGNORECASE)
-"""what draws something with the fuzz effect: a render style, Doom's spectre (thing 58), what hides the agent"""
 _MAX_CRASHES = 3
 """crashes in a row, without a complete episode in between, after which the environment raises an error"""
 
@@ -146,9 +143,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         else:
             self.action_space = Discrete(len(self.action_meanings))
         self.observation_space = observation_space(config)
-        fuzzy = _FUZZY.search(f"{task_content(self.task, config.profile)} {scenario.script}") is not None
-        if recycle_episodes is None or (fuzzy and recycle_episodes > 0):
-            recycle_episodes = int(fuzzy)
+        if recycle_episodes is None or (self._compiled.has_fuzz and recycle_episodes > 0):
+            recycle_episodes = int(self._compiled.has_fuzz)
         self._recycle_episodes = recycle_episodes
         self._window: Window | None = None
         self._show_at_s = 0.0
