@@ -55,7 +55,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
       `labels` [H, W, 1] (numbers of gvz.LABEL_CLASSES) and `automap` [H, W, C] (the whole map).
     - Actions: `action_meanings`, each held for `config.frame_skip` game tics.
     - Reward: the sum of `info["reward_components"]`.
-    - Termination: the agent died; the final observation shows this moment. (The buffers are those before it.)
+    - Termination: the agent died; the final observation shows this moment. (Buffers, frames of classes and `sight` are
+      those before it.)
     - Truncation: the time-out, with its true final observation; or a crash of the engine (`info["engine_crash"]`): then
       the last observation is repeated and the reward is 0.
     - Info, each step: task (its id), score (at most upper_bound), normalized_score (percent of upper_bound),
@@ -300,24 +301,22 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         self._frames = engine.tic() - self._start_tic
 
     def _observe(self, engine: Engine) -> Observation:
-        if self._engine_config.labels or self.config.buffers:
+        config = self.config
+        if self._engine_config.labels or config.buffers:
             self._state = engine.state() or self._state
-        if self.config.frames == "classes":
+        if self._segmenter is not None:
+            size = config.frame_width, config.frame_height
+            observation = segmented_frame(self._segmenter(engine.screen), *size, config.segmenter_temperature)
+        elif config.frames == "classes":
             assert self._state is not None
-            self._observation = observe_classes(self._state, self.config)
-            return self._observation
-        if self.config.frames == "segmented":
-            assert self._segmenter is not None
-            config = self.config
-            self._observation = segmented_frame(
-                self._segmenter(engine.screen), config.frame_width, config.frame_height, config.segmenter_temperature
-            )
-            return self._observation
-        self._observation = observe_screen(engine.screen, self.config)
-        if self.config.buffers:
-            assert self._state is not None
-            self._observation = {"screen": self._observation, **observe_buffers(self._state, self.config)}
-        return self._observation
+            observation = observe_classes(self._state, config)
+        else:
+            observation = observe_screen(engine.screen, config)
+            if config.buffers:
+                assert self._state is not None
+                observation = {"screen": observation, **observe_buffers(self._state, config)}
+        self._observation = observation
+        return observation
 
     def _crashed(self, error: EngineError) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """The engine died: the episode is truncated after the last decision."""
