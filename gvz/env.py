@@ -243,7 +243,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         return np.array(choice_mask(self.task.scenario, self.config.action_set))
 
     def render(self) -> np.ndarray | None:
-        """The last rendered screen, uint8 [render_height, render_width, 3]; None in mode human."""
+        """The last rendered screen, uint8 [render_height, render_width, 3]; None without render mode rgb_array."""
         if self.render_mode != "rgb_array":
             return None
         if self._screen is None:
