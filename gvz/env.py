@@ -1,7 +1,7 @@
 """A task as a Gymnasium environment: observation, actions, reward, time-out, seeds, crashes of the engine."""
 
 import dataclasses
-import re
+import os
 import time
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -28,7 +28,7 @@ from gvz.observation import (
 from gvz.one_thread import one_thread
 from gvz.scenarios.base import BOOKKEEPING, Task
 from gvz.scenarios.checks import ALWAYS_READ
-from gvz.scenarios.compiler import compile_task, task_content
+from gvz.scenarios.compiler import compile_task
 from gvz.segmentation import segmented_frame, segmenter_of
 from gvz.tasks import parse_task
 from gvz.viewer import Window
@@ -43,8 +43,6 @@ _WEAPON_UP_TIC = 10
 """tic at which the weapon is ready: episodes with a weapon start there, as LevDoom's do"""
 _COUNTED = {"kills": "KILLCOUNT", "goals": "GOALS"}
 """metric -> the variable that counts it"""
-_FUZZY = re.compile("fuzzy|spectre|blursphere|type=58,", re.IGNORECASE)
-"""what draws something with the fuzz effect: a render style, Doom's spectre (thing 58), what hides the agent"""
 _MAX_CRASHES = 3
 """crashes in a row, without a complete episode in between, after which the environment raises an error"""
 
@@ -57,7 +55,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
       `labels` [H, W, 1] (numbers of gvz.LABEL_CLASSES) and `automap` [H, W, C] (the whole map).
     - Actions: `action_meanings`, each held for `config.frame_skip` game tics.
     - Reward: the sum of `info["reward_components"]`.
-    - Termination: the agent died; the final observation shows this moment. (The buffers are those before it.)
+    - Termination: the agent died; the final observation shows this moment. (Buffers, frames of classes and `sight` are
+      those before it.)
     - Truncation: the time-out, with its true final observation; or a crash of the engine (`info["engine_crash"]`): then
       the last observation is repeated and the reward is 0.
     - Info, each step: task (its id), score (at most upper_bound), normalized_score (percent of upper_bound),
@@ -69,6 +68,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
     - Seeds: `reset(seed=n)` seeds the sequence of episodes. Each episode has its own seed, `info["episode_seed"]`, and
       `reset(options={"episode_seed": m})` replays that episode alone. It also chooses the map, where maps are drawn.
     - Threads: `reset`, `step` and `close` raise AlreadyPendingCallError while another thread is in one of them.
+    - Forks: a fork of the process has no episode. Its first `reset` starts an engine of its own.
     """
 
     metadata = {  # noqa: RUF012  Gymnasium's; an instance's has the pictures per second of its own frame skip
@@ -117,7 +117,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         scenario = self.task.scenario
         self._compiled = compile_task(self.task, config.profile)
         self._timeout_frames = scenario.timeout_frames(config.profile)
-        self._upper_bound = scenario.upper_bound(config.profile)
+        self._upper_bound = float(scenario.upper_bound(config.profile))
         self._rewarder = scenario.make_rewarder(dict(config.reward_weights), config.profile)
         self.action_meanings = action_buttons(scenario, config.action_set)
         self._actions = [[button in held for button in scenario.buttons] for held in self.action_meanings]
@@ -144,9 +144,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         else:
             self.action_space = Discrete(len(self.action_meanings))
         self.observation_space = observation_space(config)
-        fuzzy = _FUZZY.search(f"{task_content(self.task, config.profile)} {scenario.script}") is not None
-        if recycle_episodes is None or (fuzzy and recycle_episodes > 0):
-            recycle_episodes = int(fuzzy)
+        if recycle_episodes is None or (self._compiled.has_fuzz and recycle_episodes > 0):
+            recycle_episodes = int(self._compiled.has_fuzz)
         self._recycle_episodes = recycle_episodes
         self._window: Window | None = None
         self._show_at_s = 0.0
@@ -179,7 +178,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         super().reset(seed=seed)
         self._playing = False  # if this call is interrupted, there is no episode to go on with
         self._episode_seed = int(self.np_random.integers(EPISODE_SEEDS)) if given is None else given
-        if self._recycle_episodes and self._engine_episodes >= self._recycle_episodes:
+        forked = self._engine is not None and self._engine.owner_pid != os.getpid()
+        if forked or 0 < self._recycle_episodes <= self._engine_episodes:
             self._stop_engine()
         engine, crash = self._begin()
         self._engine_episodes += 1
@@ -207,8 +207,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             EngineError: the engine crashed too often in a row.
         """
         engine = self._engine
-        if engine is None or not self._playing:
-            raise ResetNeeded("DoomEnv.step: no episode is running; call reset first")
+        if engine is None or not self._playing or engine.owner_pid != os.getpid():
+            raise ResetNeeded("DoomEnv.step: no episode is running in this process; call reset first")
         if isinstance(self.action_space, MultiDiscrete):
             held = np.asarray(action)
             if not self.action_space.contains(held):
@@ -243,7 +243,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         return np.array(choice_mask(self.task.scenario, self.config.action_set))
 
     def render(self) -> np.ndarray | None:
-        """The last rendered screen, uint8 [render_height, render_width, 3]; None in mode human."""
+        """The last rendered screen, uint8 [render_height, render_width, 3]; None without render mode rgb_array."""
         if self.render_mode != "rgb_array":
             return None
         if self._screen is None:
@@ -301,24 +301,22 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         self._frames = engine.tic() - self._start_tic
 
     def _observe(self, engine: Engine) -> Observation:
-        if self._engine_config.labels or self.config.buffers:
+        config = self.config
+        if self._engine_config.labels or config.buffers:
             self._state = engine.state() or self._state
-        if self.config.frames == "classes":
+        if self._segmenter is not None:
+            size = config.frame_width, config.frame_height
+            observation = segmented_frame(self._segmenter(engine.screen), *size, config.segmenter_temperature)
+        elif config.frames == "classes":
             assert self._state is not None
-            self._observation = observe_classes(self._state, self.config)
-            return self._observation
-        if self.config.frames == "segmented":
-            assert self._segmenter is not None
-            config = self.config
-            self._observation = segmented_frame(
-                self._segmenter(engine.screen), config.frame_width, config.frame_height, config.segmenter_temperature
-            )
-            return self._observation
-        self._observation = observe_screen(engine.screen, self.config)
-        if self.config.buffers:
-            assert self._state is not None
-            self._observation = {"screen": self._observation, **observe_buffers(self._state, self.config)}
-        return self._observation
+            observation = observe_classes(self._state, config)
+        else:
+            observation = observe_screen(engine.screen, config)
+            if config.buffers:
+                assert self._state is not None
+                observation = {"screen": observation, **observe_buffers(self._state, config)}
+        self._observation = observation
+        return observation
 
     def _crashed(self, error: EngineError) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """The engine died: the episode is truncated after the last decision."""

@@ -11,6 +11,7 @@ from gvz.core.env_config import EPISODE_SEEDS, EnvConfig, given_episode_seed, ty
 from gvz.core.errors import ConfigError, TaskError
 from gvz.env import Action, DoomEnv
 from gvz.observation import Observation
+from gvz.one_thread import one_thread
 from gvz.scenarios.base import Task
 from gvz.tasks import parse_task
 
@@ -92,6 +93,7 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         """The buttons that each action holds in the present episode's task."""
         return self._game.action_meanings
 
+    @one_thread
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
@@ -136,6 +138,7 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             raise TaskError(f"reset: got task {name!r}, want one of {', '.join(self._games)}")
         return self._games[name]
 
+    @one_thread
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """As DoomEnv's."""
         return self._game.step(action)
@@ -152,6 +155,7 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         """As DoomEnv's."""
         return self._game.render()
 
+    @one_thread
     def close(self) -> None:
         """Ends all engines. Can be repeated."""
         while self._running:

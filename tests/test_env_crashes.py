@@ -2,11 +2,13 @@
 Calls that are interrupted.
 """
 
+import itertools
 import shutil
 import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from gymnasium.error import AlreadyPendingCallError, ResetNeeded
 from gvz.core.errors import EngineError
 from gvz.engine.engine import Engine
 from gvz.env import DoomEnv
+from gvz.multi_task import MultiTaskEnv
 from tests.episodes import TURN, fingerprint, idle_to_the_end
 
 pytestmark = pytest.mark.engine
@@ -136,8 +139,16 @@ def test_a_working_directory_that_was_removed_is_an_error():
     assert done.stdout.startswith("the working directory was removed; change to another"), done.stderr
 
 
-def test_a_call_beside_that_of_another_thread_is_refused_and_breaks_nothing(monkeypatch):
-    env = DoomEnv("defend_the_center/default")
+def of_two_tasks() -> MultiTaskEnv:
+    """Every episode is of another task than the one before."""
+    tasks = ("defend_the_center/default", "defend_the_center/gore")
+    names = itertools.cycle(tasks)
+    return MultiTaskEnv(tasks, sampler=lambda _: next(names))
+
+
+@pytest.mark.parametrize("make", [partial(DoomEnv, "defend_the_center/default"), of_two_tasks])
+def test_a_call_beside_that_of_another_thread_is_refused_and_breaks_nothing(make, monkeypatch):
+    env = make()
     env.reset(seed=1)
     advance, entered, go_on = Engine.advance, threading.Event(), threading.Event()
 
@@ -157,6 +168,49 @@ def test_a_call_beside_that_of_another_thread_is_refused_and_breaks_nothing(monk
         assert not step.result()[4]["engine_crash"]
     env.step(TURN)
     env.close()
+    with pytest.raises(ResetNeeded):
+        env.step(TURN)
+
+
+FORK = """
+import os, warnings
+import pytest
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
+import gvz
+
+warnings.simplefilter("ignore")  # Python 3.12 warns of any fork beside threads
+task = "defend_the_center/default"
+env, envs = gvz.make(task), gvz.make_vec(task)
+first, _ = env.reset(seed=1)
+envs.reset(seed=1)
+env.step(1)
+if child := os.fork():
+    assert os.waitpid(child, 0)[1] == 0
+    assert env.step(1)[4]["episode_frames"] == 8
+    assert envs.step([1])[4]["episode_frames"] == [4]
+    env.close()
+    envs.close()
+else:
+    code = 1
+    try:
+        with pytest.raises(ResetNeeded, match="no episode is running in this process"):
+            env.step(1)
+        with pytest.raises(ClosedEnvironmentError, match="a fork"):
+            envs.step([1])
+        again, info = env.reset(seed=1)
+        assert (again == first).all() and not info["engine_crash"]
+        assert env.step(1)[4]["episode_frames"] == 4
+        env.close()
+        envs.close()
+        code = 0
+    finally:
+        os._exit(code)
+"""
+
+
+def test_a_fork_does_not_play_its_parents_games():
+    done = subprocess.run([sys.executable, "-c", FORK], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_close_may_be_repeated_and_reset_starts_anew():

@@ -29,12 +29,8 @@ class Tasks:
         width = max(len(" ".join(row["sets"])) for row in [*rows, {"sets": ["sets"]}])
         print(f"level  {'sets':{width}}  task")
         for row in rows:
-            attributes = "+".join(row["attributes"])
-            said = not attributes or row["task"].endswith(f"/{attributes}")
-            print(
-                f"{row['level']:5}  {' '.join(row['sets']):{width}}  {row['task']}"
-                + ("" if said else f" = {attributes}")
-            )
+            spelled_out = " = " + "+".join(row["attributes"]) if row["task"].endswith("/complete") else ""
+            print(f"{row['level']:5}  {' '.join(row['sets']):{width}}  {row['task']}{spelled_out}")
         return 0
 
 

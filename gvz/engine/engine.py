@@ -82,6 +82,7 @@ class Engine:
 
     Attributes:
         pid: process id of the engine.
+        owner_pid: that of the process that started it. A fork of this process has the object, but not the engine.
         instance_id: ViZDoom's name for it, part of the names of its shared memory.
         screen: u8[H W 3], RGB, read-only: the engine's own buffer in shared memory, no copy. It changes with
             every call; after the player's death it shows the moment of it, where `state` has nothing.
@@ -104,7 +105,8 @@ class Engine:
         self._overdue = False
         game, directory, self.log = _start(config)
         self._game, self._directory = game, directory
-        self._end = weakref.finalize(self, engine_process.end_if_ours, game, directory, os.getpid())
+        self.owner_pid = os.getpid()
+        self._end = weakref.finalize(self, engine_process.end_if_ours, game, directory, self.owner_pid)
         instance = janitor.read_instance(directory)
         assert instance is not None, "an engine that answered has written its instance file"
         self.pid, self._process_start, self.instance_id = instance

@@ -37,6 +37,8 @@ from gvz.wad.udmf import UdmfMap, is_inside, make_thing, parse_textmap, write_te
 
 _NUMBER = re.compile(r"(?<![\w.-])(?:[0-9]+\.[0-9]+|[0-9]{7,})(?![\w.])")
 """a fixed-point number or a large integer in a script"""
+_FUZZ = re.compile("fuzzy|spectre|blursphere|type = 58;", re.IGNORECASE)
+"""what draws something with the fuzz effect: a render style, Doom's spectre (thing 58), what hides the agent"""
 _MARK = 23117
 """what stands for a number while a script is compiled: a fixed-point one near this, or an integer of the same bits"""
 
@@ -50,6 +52,8 @@ class CompiledTask:
     wad_path: Path
     map_magic: int
     """the value that the MAP_MAGIC variable of this file's map has"""
+    has_fuzz: bool
+    """something may be drawn with the fuzz effect"""
 
     def map_of(self, episode_seed: int) -> tuple[bytes | None, int]:
         """(The WAD of an episode's own map, None for that of `wad_path`; the value of the map's MAP_MAGIC).
@@ -86,7 +90,8 @@ def compile_task(task: Task, profile: Profile = "thesis") -> CompiledTask:
     """
     source = map_source(task, profile)
     path = _cached(build_wad(source))
-    return CompiledTask(task=task, profile=profile, wad_path=path, map_magic=source.map_magic)
+    has_fuzz = _FUZZ.search(f"{source.textmap}\0{source.script}\0{source.decorate}") is not None
+    return CompiledTask(task=task, profile=profile, wad_path=path, map_magic=source.map_magic, has_fuzz=has_fuzz)
 
 
 @lru_cache(maxsize=1000)

@@ -89,7 +89,7 @@ class Crew:
     def __init__(self, specs: Sequence[VectorSpec], frames: Frames):
         """Starts the processes; does not wait for them."""
         self._frames = frames
-        self._owner_pid = os.getpid()
+        self.owner_pid = os.getpid()
         self._outcomes: deque[Outcome] = deque()
         self._last_infos: dict[int, dict[str, Any]] = {}
         self._final_infos: dict[int, dict[str, Any]] = {}
@@ -167,7 +167,7 @@ class Crew:
 
     def close(self) -> None:
         """Ends workers and engines. Can be repeated; does nothing in a fork of the process that made this."""
-        if os.getpid() != self._owner_pid:
+        if os.getpid() != self.owner_pid:
             return
         workers, self._workers = self._workers, []
         try:

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import os
 import weakref
 from collections.abc import Generator, Sequence
 from typing import Any, Literal
@@ -341,6 +342,8 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
     def _require_open(self, call: str) -> None:
         if self.closed:
             raise ClosedEnvironmentError(f"{call}: the vector environment was closed")
+        if self._crew.owner_pid != os.getpid():
+            raise ClosedEnvironmentError(f"{call}: a fork has no vector environment of its parent's; make one here")
 
     def _require_begun(self, call: str, games: np.ndarray) -> None:
         if not self._begun[games].all():

@@ -13,6 +13,7 @@ from gvz.scenarios.base import Attribute, Content, Scenario, Task, Thing
 from gvz.scenarios.compiler import map_source
 from gvz.tasks import all_scenarios, named_tasks
 from gvz.wad.acs.lexer import tokenize
+from gvz.wad.udmf import UdmfMap, make_thing
 from tests.episodes import fingerprint
 from tests.scenarios.measure import Player
 
@@ -103,6 +104,17 @@ def test_an_attribute_of_ones_own_with_spectres_replays_its_episodes(content: Co
     """The engine's fuzz effect continues from episode to episode, so each needs a fresh engine."""
     centre = all_scenarios()["defend_the_center"]
     ghosts = Attribute(name="ghosts", groups=("ghosts",), content=content)
-    task = Task(dataclasses.replace(centre, attributes=(*centre.attributes, ghosts)), ("ghosts",))
+    assert_replayed(Task(dataclasses.replace(centre, attributes=(*centre.attributes, ghosts)), ("ghosts",)))
+
+
+@pytest.mark.engine
+def test_a_map_of_ones_own_with_a_spectre_replays_its_episodes():
+    def draw_spectre(drawn: UdmfMap) -> None:
+        drawn.things.append(make_thing(58, 300, 300))
+
+    assert_replayed(Task(dataclasses.replace(all_scenarios()["defend_the_center"], draw_map=draw_spectre)))
+
+
+def assert_replayed(task: Task) -> None:
     with closing(DoomEnv(task)) as env:
         assert fingerprint(env, 7) == fingerprint(env, 7)

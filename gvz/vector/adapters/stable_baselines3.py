@@ -63,12 +63,12 @@ class Sb3VecEnv(VecEnv):
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Observations u8[N, 84, 84, C], rewards f32[N], whether episodes are over bool[N], and N infos."""
         observations, rewards, terminated, truncated, infos = self.envs.recv()
-        over, never = terminated | truncated, np.zeros(self.num_envs, bool)
+        over = terminated | truncated
         of_game: list[dict[str, Any]] = [{"score": score} for score in infos["score"].tolist()]
         for i in over.nonzero()[0]:
             of_game[i] = {
                 "score": float(infos["final_info"]["score"][i]),
-                "engine_crash": bool(infos["final_info"].get("engine_crash", never)[i]),
+                "engine_crash": bool(infos["final_info"]["engine_crash"][i]),
                 "terminal_observation": infos["final_obs"][i],
                 "TimeLimit.truncated": bool(truncated[i]),
             }

@@ -90,5 +90,5 @@ class TianshouVectorEnv:
 
 
 def _info(game: int, infos: dict[str, Any], row: int) -> dict[str, Any]:
-    crashed = "engine_crash" in infos and bool(infos["engine_crash"][row])
-    return {"env_id": int(game), "score": float(infos["score"][row]), "engine_crash": crashed}
+    score, crashed = infos["score"][row], infos["engine_crash"][row]
+    return {"env_id": int(game), "score": float(score), "engine_crash": bool(crashed)}
