@@ -37,7 +37,7 @@ REPLAY = ReplaySpec(
     num_newest=0,
 )
 LEARNER = LearnerConfig(batch_size=B, total_updates=10, target_period_updates=3, learning_rate=1e-3, max_grad_norm=0.5)
-REPLAY_CONFIG = ReplayConfig()
+REPLAY_CONFIG = ReplayConfig(importance_sampling_exponent=0.3, importance_sampling_exponent_end=0.8)
 ONES = np.ones(TASKS, np.float32)
 NAMES = ("easy", "hard")
 
@@ -194,7 +194,7 @@ class Float64Learner:
 
     def update(self) -> dict[str, np.ndarray]:
         """One update; returns what the metrics are made of."""
-        beta = 0.4 + 0.6 * self.num_updates / 10  # annealed linearly over total_updates
+        beta = 0.3 + 0.5 * self.num_updates / 10  # annealed linearly over total_updates
         importance = (1 / (100 * self.probability)) ** beta  # eq. 4.13; any number of transitions gives the same
         importance /= importance.max()
         q_tm1 = (self.phi_tm1 * self.w[self.a_tm1]).sum(1)
