@@ -282,6 +282,13 @@ def test_metrics_of_agents_are_of_the_steps_that_were_taken(name: str, tmp_path:
         np.testing.assert_allclose(metrics[key], value, rtol=1e-4, atol=1e-5, err_msg=key)
 
 
+def test_samples_are_counted_on_where_float32_no_longer_tells_one_more():
+    state = fresh_state(PQN_)
+    state = replace(state, metrics=replace(state.metrics, task_samples=jnp.full(2, 2.0**24)))
+    state = compiled(PQN_)(state, made_up_windows(1), np.int32(1))
+    assert (np.asarray(state.metrics.task_samples) > 2.0**24).all()
+
+
 @dataclass(frozen=True)
 class Counts(LinearPQN):
     """Records which steps it is given: the number that stands in the extras."""

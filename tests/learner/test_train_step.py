@@ -378,6 +378,13 @@ def test_a_non_finite_gradient_of_a_finite_loss_is_caught_too(tmp_path: Path):
         train_step.read_metrics(state, NAMES, tmp_path)
 
 
+def test_samples_are_counted_on_where_float32_no_longer_tells_one_more():
+    state = fresh_state()
+    state = replace(state, metrics=replace(state.metrics, task_samples=jnp.full(TASKS, 2.0**24)))
+    state, _ = compiled()(state, fresh_replay(), ONES)
+    assert (np.asarray(state.metrics.task_samples) > 2.0**24).all()
+
+
 def test_metrics_without_updates_and_without_samples_have_no_entries_of_them(tmp_path: Path):
     metrics, _ = train_step.read_metrics(fresh_state(), NAMES, tmp_path)
     assert metrics["loss"] == 0.0
