@@ -18,7 +18,7 @@ from gvz.core.control_groups import num_cores
 from gvz.core.errors import ConfigError, GvzError
 from gvz.core.libraries import require_learner
 from gvz.core.stop import StopRequest, exit_at_once, say, told_of_delay
-from gvz.run.config import RunConfig, with_agent
+from gvz.run.config import RunConfig, with_agent, without_effect
 from gvz.run.config_files import load_config
 from gvz.run.rundir import RunDir, move_aside, refuse_other_contents
 
@@ -106,7 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             refuse_other_contents(directory)
             with RunDir(Path(directory), in_another=launch.run.group.own_id > 0) as run:
                 config = resumed_config(run, launch.run)
-                for note in run.check_resumable(config):
+                for note in (*run.check_resumable(config), *(f"warning: {text}" for text in without_effect(config))):
                     say(note)
                 if (cores := num_cores()) < len(os.sched_getaffinity(0)):
                     os.environ.setdefault("NPROC", str(cores))  # else XLA has a thread for each core of the machine

@@ -17,18 +17,24 @@ _Kept = Annotated[float | None, Range(0.0, 0.99999)]
 """share of itself that a moving average keeps. With 1 it never changes; near 1, float32 rounds its changes to 0."""
 
 
+def unused(prefix: str, config: Any, other: str, *names: str) -> list[str]:
+    """A line for each of these fields that is not at its default: `other` leaves it without effect."""
+    because = f"which has no effect with {prefix}.{other} {getattr(config, other)}"
+    return [
+        f"{prefix}.{field.name}: got {got}, {because}; want {field.default}, or another {prefix}.{other}"
+        for field in dataclasses.fields(config)
+        if field.name in names and (got := getattr(config, field.name)) != field.default
+    ]
+
+
 def refuse_unused(prefix: str, config: Any, other: str, *names: str) -> None:
-    """Raises ConfigError for the first of these fields that is not at its default: `other` leaves it without effect.
+    """Raises ConfigError for the first of `unused`.
 
     Not for what a configuration has at hand for a part that another one, made of it by one field, switches on or off,
-    such as `noisy_sigma`.
+    such as `noisy_sigma`. A run only says so (`gvz.run.config.without_effect`).
     """
-    for field in dataclasses.fields(config):
-        if field.name in names and (got := getattr(config, field.name)) != field.default:
-            because = f"which has no effect with {prefix}.{other} {getattr(config, other)}"
-            raise ConfigError(
-                f"{prefix}.{field.name}: got {got}, {because}; want {field.default}, or another {prefix}.{other}"
-            )
+    for text in unused(prefix, config, other, *names):
+        raise ConfigError(text)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

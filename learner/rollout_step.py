@@ -13,7 +13,7 @@ from learner.agents.base import OnPolicyAgent, Params, SampleLosses, Samples, Ta
 from learner.config import OnPolicyConfig
 from learner.rollouts import RolloutSpec, steps_of
 from learner.store import Store
-from learner.train_step import LearnerState, averaged, gradient_step, no_non_finite, no_sums
+from learner.train_step import LearnerState, averaged, gradient_step, no_non_finite, no_sums, of_each_task
 
 
 @jax.tree_util.register_dataclass
@@ -149,12 +149,15 @@ def _add_metrics(
             return jnp.maximum(sums.agent[name], jnp.where(weight > 0, values, -jnp.inf).max())
         return sums.agent[name] + _mean(values, weight)
 
+    def per_task(sums: Float[Array, " Z"], values: Float[Array, " B"]) -> Float[Array, " Z"]:
+        return sums + of_each_task(values, batch.obs.task, len(sums))
+
     return MetricSums(
         num_updates=sums.num_updates + 1,
         loss=sums.loss + loss,
         grad_norm=sums.grad_norm + grad_norm,
         grad_norm_max=jnp.maximum(sums.grad_norm_max, grad_norm),
         agent={name: added(name, values) for name, values in losses.metrics.items()},
-        task_samples=sums.task_samples.at[batch.obs.task].add(weight),
-        task_loss=sums.task_loss.at[batch.obs.task].add(weight * losses.loss),
+        task_samples=per_task(sums.task_samples, weight),
+        task_loss=per_task(sums.task_loss, weight * losses.loss),
     )

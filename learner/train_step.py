@@ -257,6 +257,11 @@ def no_sums(sums: T) -> T:
     return jax.tree_util.tree_map_with_path(start, sums)
 
 
+def of_each_task(values: Float[Array, " B"] | float, task: Int[Array, " B"], num_tasks: int) -> Float[Array, " Z"]:
+    """The sum of a batch's values by task. Where a batch is added sample by sample, a count ends at 2^24 in float32."""
+    return jnp.where(task[None, :] == jnp.arange(num_tasks)[:, None], values, 0.0).sum(axis=1)
+
+
 def gradient_step(
     state: LearnerState,
     optimizer: optax.GradientTransformation,
@@ -343,9 +348,7 @@ def _add_metrics(
         return across.mean(values.mean())
 
     def per_task(sums: Float[Array, " Z"], values: Float[Array, " B"] | float) -> Float[Array, " Z"]:
-        if across.alone:
-            return sums.at[task].add(values)
-        return sums + across.sum(jnp.zeros_like(sums).at[task].add(values))
+        return sums + across.sum(of_each_task(values, task, len(sums)))
 
     return MetricSums(
         num_updates=sums.num_updates + 1,

@@ -25,6 +25,7 @@ from learner.config import (
     ReplayConfig,
     ValueConfig,
     change_agent,
+    unused,
 )
 
 MIN_CLUSTER_SLOTS = 128
@@ -338,6 +339,26 @@ def off_policy(config: RunConfig) -> tuple[LearnerConfig, ReplayConfig]:
     if not isinstance(learner, LearnerConfig) or replay is None:
         raise _unfit(config, "learns from a replay", "learner=LearnerConfig(...), replay=ReplayConfig(...)")
     return learner, replay
+
+
+def without_effect(config: RunConfig) -> list[str]:
+    """A line for each setting that is not at its default and that another one leaves without effect.
+
+    A config file may have it at hand, so it is no error. Nothing is said of an agent in a file of its own.
+    """
+    agent, learner, found = config.agent, config.learner, list[str]()
+    if isinstance(learner, LearnerConfig) and learner.target_ema is not None:
+        found += unused("learner", learner, "target_ema", "target_period_updates")
+    if agent.name.endswith(".py") or not isinstance(agent, ValueConfig):
+        return found
+    if not agent.augmentations and not (isinstance(agent, RainbowConfig) and agent.sight_augmentations):
+        found += unused("agent", agent, "augmentations", "augmentation_strength", "augmentation_clean_share")
+    if isinstance(agent, RainbowConfig):
+        idle = ("noisy_sigma",) if agent.noisy == "off" else ("epsilon_start", "epsilon_end", "epsilon_decay_steps")
+        found += unused("agent", agent, "noisy", *idle)
+        if not agent.has_atoms:
+            found += unused("agent", agent, "num_quantiles" if agent.distributional else "distributional", "num_atoms")
+    return found
 
 
 def _unfit(config: RunConfig, agent: str, wanted: str) -> ConfigError:

@@ -7,7 +7,9 @@ import pytest
 
 from gvz.core.errors import ConfigError
 from learner import augment
+from learner.agents.configs.dqn import DQNConfig
 from learner.augment import AUGMENTATIONS, SHIFT_PIXELS
+from learner.observation import Observation
 
 H, W, S = 12, 16, 3
 KINDS = [*((name, 3) for name in AUGMENTATIONS), ("random_conv", 1)]
@@ -92,6 +94,15 @@ def test_strength_and_share_are_traced_and_all_work_together():
     np.testing.assert_array_equal(augmented_by(names, jax.random.key(0), frames, 1, 0.0, 0.0), frames)
     np.testing.assert_array_equal(augmented_by(names, jax.random.key(0), frames, 1, 1.0, 1.0), frames)
     assert np.abs(strong - np.asarray(frames)).mean() > np.abs(gentle - np.asarray(frames)).mean() > 0
+
+
+def test_an_observation_has_the_strength_and_the_clean_share_of_the_configuration():
+    config = DQNConfig(stack_size=S, augmentation_strength=0.5, augmentation_clean_share=0.25)
+    frames, nothing = stacks(20, 3), jnp.zeros((20, 0))
+    obs = Observation(frames=frames, vector=nothing, actions=nothing.astype(int), task=jnp.zeros(20, int))
+    key, names = jax.random.key(1), ("contrast",)
+    found = augment.with_augmented_frames(config, names, key, obs).frames
+    np.testing.assert_array_equal(found, augmented_by(names, key, jnp.asarray(frames), 3, 0.5, 0.25))
 
 
 def test_an_unknown_name_is_refused_with_the_nearest():

@@ -149,6 +149,8 @@ def test_staleness_is_the_distribution_over_decisions():
         ({"task": 3}, "ingest: record 7: got task 3, want less than 3; actors and learner were started with different"),
         ({"reward": math.nan}, "ingest: record 7 of lane 0: got the reward nan, want a finite one"),
         ({"reward": -math.inf}, "ingest: record 7 of lane 0: got the reward -inf, want a finite one"),
+        ({"vector": (0.0, math.inf)}, r"ingest: record 7 of lane 0: got the vector \[ 0\. inf\], want a finite one"),
+        ({"extras": (math.nan,)}, r"ingest: record 7 of lane 0: got the extras \[nan\], want a finite one"),
         ({"first": False}, "ingest: record 7 of lane 0 neither begins an episode nor continues one; records before it"),
         (
             {"params_version": 6},
@@ -162,9 +164,10 @@ def test_staleness_is_the_distribution_over_decisions():
 )
 def test_a_record_of_another_run_or_stream_is_refused(changes, message):
     good = replace(some_records(1)[0], terminated=False, truncated=False)
-    block = step_block([replace(good, **changes)], sequence=7)
+    record = replace(good, **changes)
+    spec = replace(SPEC, num_variables=len(record.vector), num_extras=len(record.extras))
     with pytest.raises(TransportError, match=message):
-        list(Ingest(SPEC).arrays([block], params_version=5))
+        list(Ingest(spec).arrays([step_block([record], sequence=7)], params_version=5))
 
 
 def test_a_stream_goes_on_across_blocks_and_ends_with_its_last_record():

@@ -1,5 +1,6 @@
-"""The learner of a replay as a run uses it: whose parameters evaluation and actors get, and weights of tasks."""
+"""The learner of a replay as a run uses it: whose parameters evaluation and actors get, weights of tasks, epsilon."""
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax
@@ -11,8 +12,16 @@ from tests.learner.sharded import TASKS, LinearQ, parts_of, records, saved
 from tests.oracles import step_block
 
 
-def make_learner(tmp_path: Path, restored: Restored | None = None, **config) -> OffPolicyLearner:
-    parts = parts_of(1, agent=LinearQ(), **config)
+@dataclass(frozen=True)
+class Exploring(LinearQ):
+    def epsilon(self, env_steps):
+        return 0.5 - env_steps / 1000
+
+
+def make_learner(
+    tmp_path: Path, restored: Restored | None = None, num_updates_per_call: int = 1, **config
+) -> OffPolicyLearner:
+    parts = replace(parts_of(1, agent=Exploring(), **config), num_updates_per_call=num_updates_per_call)
     learner = parts.make(jax.random.key(5), TASKS, tmp_path, restored)
     if restored is None:
         learner.add([step_block(records(400))], 0)
@@ -41,3 +50,14 @@ def test_scores_of_episodes_weigh_the_losses_of_tasks_also_after_a_resume(tmp_pa
         easy, hard = (found[f"learner/sample_share/{task}"] * found[f"learner/loss/{task}"] for task in TASKS)
         assert min(easy, hard) > 0
         np.testing.assert_allclose(found["learner/loss"], easy + 2 * hard, rtol=1e-4)
+
+
+def test_warm_up_is_by_chance_and_the_agents_epsilon_begins_at_its_end(tmp_path: Path):
+    learner = make_learner(tmp_path, warmup_steps=200)
+    assert [learner.epsilon(env_steps) for env_steps in (0, 199, 200, 300)] == [1.0, 1.0, 0.5, 0.4]
+
+
+def test_the_last_call_does_no_more_gradient_steps_than_the_run_has(tmp_path: Path):
+    learner = make_learner(tmp_path, num_updates_per_call=4, total_updates=6)
+    assert [learner.update() for _ in range(2)] == [4, 2]
+    assert int(learner.arrays()["learner"].num_updates) == 6

@@ -135,11 +135,20 @@ def test_pqn_records_the_largest_value_among_the_allowed():
     np.testing.assert_allclose(extras[:, 0], q.max(1), rtol=1e-5)
 
 
+SMALL_PQN = PQNConfig(conv_channels=(4,), conv_kernels=(4,), conv_strides=(2,), hidden_units=8)
+
+
+def test_a_fresh_pqn_gives_every_state_and_action_the_initial_value():
+    agent = make_agent(replace(SMALL_PQN, initial_value=2.5), SPEC)
+    found = jax.jit(agent.evaluate)(jax.jit(agent.init)(jax.random.key(0)), observation())
+    np.testing.assert_allclose(found.q_values, 2.5, atol=2e-6)
+
+
 def test_pqn_normalizes_its_hidden_layer():
     def layers(config: PQNConfig) -> set[str]:
         return set(jax.eval_shape(make_agent(config, SPEC).init, jax.random.key(0))["params"])
 
-    config = PQNConfig(conv_channels=(4,), conv_kernels=(4,), conv_strides=(2,), hidden_units=8)
+    config = SMALL_PQN
     assert layers(config) - layers(replace(config, layer_norm=False)) == {"q_norm"}
     assert "norm_0" in layers(config), "its encoder's convolutions, too"
 

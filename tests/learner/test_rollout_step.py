@@ -282,6 +282,13 @@ def test_metrics_of_agents_are_of_the_steps_that_were_taken(name: str, tmp_path:
         np.testing.assert_allclose(metrics[key], value, rtol=1e-4, atol=1e-5, err_msg=key)
 
 
+def test_samples_are_counted_on_where_float32_no_longer_tells_one_more():
+    state = fresh_state(PQN_)
+    state = replace(state, metrics=replace(state.metrics, task_samples=jnp.full(2, 2.0**24)))
+    state = compiled(PQN_)(state, made_up_windows(1), np.int32(1))
+    assert (np.asarray(state.metrics.task_samples) > 2.0**24).all()
+
+
 @dataclass(frozen=True)
 class Counts(LinearPQN):
     """Records which steps it is given: the number that stands in the extras."""
@@ -337,14 +344,17 @@ def test_a_rollout_in_minibatches_is_learnt_from_in_another_order_each_time():
 
 
 def test_the_last_rollout_is_learnt_from_until_the_run_has_its_gradient_steps(monkeypatch, tmp_path: Path):
-    """4 steps, and 3 for each rollout."""
+    """4 steps, and 3 for each rollout. Actors then get the last parameters, evaluation their average."""
     parts = OnPolicyParts(agent=PQN_, config=replace(CONFIG, total_updates=4), spec=rollout_spec(1))
     learner = parts.make(jax.random.key(0), NAMES, tmp_path)
     rollout = Rollout(made_up_windows(1), np.zeros(1, np.int64))
     monkeypatch.setattr(learner, "can_update", lambda: True)
     monkeypatch.setattr(learner._rollouts, "take", lambda _: rollout)
     assert [learner.update() for _ in range(3)] == [3, 1, 0]
-    assert int(learner.arrays()["learner"].num_updates) == 4
+    state = learner.arrays()["learner"]
+    assert int(state.num_updates) == 4
+    jax.tree.map(np.testing.assert_array_equal, learner.params, state.average_params)
+    np.testing.assert_array_equal(learner.acting_params(), state.params["w"].ravel())
 
 
 def test_the_state_is_donated():

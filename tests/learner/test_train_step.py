@@ -37,7 +37,7 @@ REPLAY = ReplaySpec(
     num_newest=0,
 )
 LEARNER = LearnerConfig(batch_size=B, total_updates=10, target_period_updates=3, learning_rate=1e-3, max_grad_norm=0.5)
-REPLAY_CONFIG = ReplayConfig()
+REPLAY_CONFIG = ReplayConfig(importance_sampling_exponent=0.3, importance_sampling_exponent_end=0.8)
 ONES = np.ones(TASKS, np.float32)
 NAMES = ("easy", "hard")
 
@@ -194,7 +194,7 @@ class Float64Learner:
 
     def update(self) -> dict[str, np.ndarray]:
         """One update; returns what the metrics are made of."""
-        beta = 0.4 + 0.6 * self.num_updates / 10  # annealed linearly over total_updates
+        beta = 0.3 + 0.5 * self.num_updates / 10  # annealed linearly over total_updates
         importance = (1 / (100 * self.probability)) ** beta  # eq. 4.13; any number of transitions gives the same
         importance /= importance.max()
         q_tm1 = (self.phi_tm1 * self.w[self.a_tm1]).sum(1)
@@ -210,7 +210,7 @@ class Float64Learner:
         k = self.num_updates
         self.mean = 0.9 * self.mean + 0.1 * clipped  # Kingma and Ba 2015, Algorithm 1
         self.square = 0.999 * self.square + 0.001 * clipped**2
-        step = (self.mean / (1 - 0.9**k)) / (np.sqrt(self.square / (1 - 0.999**k)) + 1e-7)
+        step = (self.mean / (1 - 0.9**k)) / (np.sqrt(self.square / (1 - 0.999**k)) + self.config.adam_eps)
         self.w = self.w - 0.1 * (step + self.config.weight_decay * self.w)  # Loshchilov and Hutter 2019, Algorithm 2
         if (ema := self.config.target_ema) is not None:
             self.target = ema * self.target + (1 - ema) * self.w
@@ -228,7 +228,8 @@ class Float64Learner:
 @pytest.mark.parametrize("changes", [{}, {"target_ema": 0.7, "average_ema": 0.9, "weight_decay": 0.2}])
 def test_updates_are_those_of_the_equations_in_float64(tmp_path: Path, changes: dict):
     """Batch, n-step return, importance and task weights, Huber loss, clipping, Adam, target, priorities, metrics."""
-    task_weights, agent, config = np.float32([1.0, 2.5]), LinearQ(), replace(LEARNER, learning_rate=0.1, **changes)
+    task_weights, agent = np.float32([1.0, 2.5]), LinearQ()
+    config = replace(LEARNER, learning_rate=0.1, adam_eps=0.01, **changes)
     state, updates = fresh_state(agent, config), 7
     oracle, seen = Float64Learner(np.asarray(state.params["w"]), task_weights, config), []
     slots, priorities = np.array(list(DRAWN)), np.float32(list(DRAWN.values()))
@@ -284,12 +285,15 @@ def test_one_call_of_many_updates_equals_many_calls_of_one():
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
 
 
-def test_the_same_seed_gives_the_same_bits():
+def test_the_same_seed_gives_the_same_bits_and_every_update_has_a_key_of_its_own():
     runs = []
     for _ in range(2):
         state, stored = fresh_state(), fresh_replay()
+        keys = [raw(state.key)[0].tolist()]
         for _ in range(3):
             state, stored = compiled()(state, stored, ONES)
+            keys.append(raw(state.key)[0].tolist())
+        assert len(set(map(tuple, keys))) == 4
         runs.append(raw((state, stored)))
     for one, other in zip(*runs, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -372,6 +376,13 @@ def test_a_non_finite_gradient_of_a_finite_loss_is_caught_too(tmp_path: Path):
     assert float(state.params["w"]) == 0.0
     with pytest.raises(NonFiniteError, match=r"update 1: 0 of 8 losses .*, but the gradient is not finite; 1 updates"):
         train_step.read_metrics(state, NAMES, tmp_path)
+
+
+def test_samples_are_counted_on_where_float32_no_longer_tells_one_more():
+    state = fresh_state()
+    state = replace(state, metrics=replace(state.metrics, task_samples=jnp.full(TASKS, 2.0**24)))
+    state, _ = compiled()(state, fresh_replay(), ONES)
+    assert (np.asarray(state.metrics.task_samples) > 2.0**24).all()
 
 
 def test_metrics_without_updates_and_without_samples_have_no_entries_of_them(tmp_path: Path):

@@ -15,7 +15,7 @@ from gvz.actions import UNIFIED_V1
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError, TaskError
 from gvz.launch import main, parse, resumed_config
-from gvz.run.config import RunConfig, with_agent
+from gvz.run.config import RunConfig, with_agent, without_effect
 from gvz.run.config_files import CONFIG_SCHEMA, config_from_dict, config_to_dict, configs_directory, load_config
 from gvz.run.resume import differences
 from gvz.run.rundir import RunDir
@@ -92,6 +92,41 @@ def test_numbers_that_the_learner_cannot_count_to_are_refused_at_once():
     ):
         with pytest.raises(ConfigError, match=r"learner\.\w+_updates: got 2147483648, want 1\.\."):
             make()
+
+
+@pytest.mark.parametrize(
+    ("flags", "setting", "other"),
+    [
+        ("--agent.epsilon-end 0.1", "agent.epsilon_end: got 0.1", "agent.noisy factorized"),
+        ("--agent.noisy off --agent.epsilon-end 0.1", None, None),
+        ("--agent.noisy off --agent.noisy-sigma 0.1", "agent.noisy_sigma: got 0.1", "agent.noisy off"),
+        ("--agent.num-quantiles 5 --agent.num-atoms 9", "agent.num_atoms: got 9", "agent.num_quantiles 5"),
+        ("--agent.no-distributional --agent.num-atoms 9", "agent.num_atoms: got 9", "agent.distributional False"),
+        ("--agent.augmentation-strength 0.5", "agent.augmentation_strength: got 0.5", "agent.augmentations ()"),
+        ("--agent.augmentation-strength 0.5 --agent.augmentations shift", None, None),
+        ("--agent.augmentation-strength 0.5 --agent.sight-weight 1 --agent.sight-augmentations gamma", None, None),
+        (
+            "--learner.target-ema 0.99 --learner.target-period-updates 5",
+            "learner.target_period_updates: got 5",
+            "learner.target_ema 0.99",
+        ),
+        ("--learner.target-period-updates 5", None, None),
+        ("--agent.name dqn --agent.epsilon-end 0.1", None, None),
+    ],
+)
+def test_a_run_says_which_settings_have_no_effect(flags, setting, other, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr("gvz.run.train.train", lambda *_: 0)
+    assert main([*flags.split(), "--run-dir", str(tmp_path)]) == 0
+    said = capfd.readouterr().err
+    if setting is None:
+        assert said == ""
+    else:
+        assert said.count("\n") == 1
+        assert said.startswith(f"warning: {setting}, which has no effect with {other}; want ")
+
+
+def test_every_setting_of_a_ready_config_has_an_effect():
+    assert {name: found for name in ALL_CONFIGS if (found := without_effect(load_config(name)))} == {}
 
 
 @pytest.mark.parametrize("field", ["augmentations", "sight_augmentations"])
