@@ -34,10 +34,12 @@ def joint_sections(results: Results, out: Path) -> list[Section]:
         rows.append(
             (words(agent), *(estimate(*group) for group in groups), estimate_groups(groups, mean_over_scenarios))
         )
+    all_shown = len(shown) == len(test)
     table = Table(
         id="joint",
-        caption="Test tasks of each scenario, percent of the upper bound, and the mean over scenarios (P_norm).",
-        columns=("agent", *(scenario_named(name).title for name in shown), "P_norm"),
+        caption="Test tasks of each scenario, percent of the upper bound, and the mean over scenarios"
+        + (" (P_norm)." if all_shown else "."),
+        columns=("agent", *(scenario_named(name).title for name in shown), "P_norm" if all_shown else "mean"),
         rows=tuple(rows),
         notes=("- : not evaluated on all test tasks of all these scenarios.",),
     )

@@ -22,10 +22,15 @@ def test_an_agent_of_two_scenarios_has_the_mean_of_their_means(tmp_path):
     write_rows(tmp_path / "rows.jsonl", rows)
     (section,) = joint_sections(read_results([tmp_path]), tmp_path)
     (table,) = section.blocks[0].tables
-    assert table.columns == ("agent", "Health Gathering", "Seek and Kill", "P_norm")
+    assert "P_norm" not in table.caption, "it is of all scenarios"
+    assert table.columns == ("agent", "Health Gathering", "Seek and Kill", "mean")
     assert [[cell.text for cell in row] for row in table.rows] == [
         ["random", "40.0 [40.0, 40.0]", "10.0 [10.0, 10.0]", "25.0 [25.0, 25.0]"]
     ]
+    rows += [evaluation_row("idle", task.id, 0, 0.0) for task in named_tasks(split="test")]
+    write_rows(tmp_path / "rows.jsonl", rows)
+    (section,) = joint_sections(read_results([tmp_path]), tmp_path)
+    assert section.blocks[0].tables[0].columns[-1] == "P_norm"
 
 
 def test_levels_are_means_over_the_scenarios_and_have_a_figure(tmp_path):
