@@ -60,6 +60,19 @@ def test_one_scenario_needs_no_such_section(tmp_path):
     assert joint_sections(read_results([tmp_path]), tmp_path) == []
 
 
+def test_a_seed_that_is_missing_in_one_scenario_is_told_of(tmp_path):
+    rows = [
+        evaluation_row(f"{scenario}/{seed}", task.id, 0, 50.0, run="r", run_seed=seed, num_updates=9, params=scenario)
+        for scenario, seeds in (("health_gathering", (1, 2)), ("seek_and_kill", (2,)))
+        for seed in seeds
+        for task in named_tasks(scenario, split="test")
+    ]
+    write_rows(tmp_path / "rows.jsonl", rows)
+    (section,) = joint_sections(read_results([tmp_path]), tmp_path)
+    ((_, *cells),) = section.blocks[0].tables[0].rows
+    assert [cell.note for cell in cells] == ["", "1 of 2 seeds", "1 of 2 seeds"]
+
+
 @pytest.mark.parametrize("one_run_plays_all", [True, False])
 @pytest.mark.parametrize("num_earlier", [0, 7])
 def test_a_run_that_plays_all_scenarios_is_redrawn_with_all_its_scores(tmp_path, one_run_plays_all, num_earlier):
