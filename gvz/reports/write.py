@@ -118,7 +118,8 @@ def to_csv(table: Table) -> str:
 
     A missing cell is empty; a published number has no interval.
     """
-    numeric = [any(row[n].estimate for row in table.rows) for n in range(len(table.columns))]
+    columns = [[row[n] for row in table.rows] for n in range(len(table.columns))]
+    numeric = [any(cell.estimate for cell in cells) or {c.kind for c in cells} == {"missing"} for cells in columns]
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     head = []

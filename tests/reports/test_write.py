@@ -41,6 +41,13 @@ def test_csv_has_value_interval_and_note_in_columns_of_their_own():
     assert (third["level 0"], third["level 0 note"]) == ("", "0 of 3 seeds")
 
 
+def test_a_column_of_csv_without_any_number_is_four_columns_too():
+    table = dataclasses.replace(TABLE, rows=TABLE.rows[2:])
+    assert to_csv(table).splitlines()[0] == "scenario,level 0,level 0 low,level 0 high,level 0 note"
+    (row,) = csv.DictReader(io.StringIO(to_csv(table)))
+    assert (row["level 0"], row["level 0 note"]) == ("", "0 of 3 seeds")
+
+
 def test_latex_escapes_and_sets_published_numbers_in_italics():
     text = to_latex(TABLE)
     assert r"\caption{100\% of \textless{}this\textgreater{} \& that\_}" in text
