@@ -136,12 +136,18 @@ def collect_evaluations(paths: Iterable[Path | str]) -> tuple[pl.DataFrame, list
             "two players have this name, or two versions of one; give each a name of its own"
         )
     together = together.unique(("run_dir", *_IDENTITY), keep="first", maintain_order=True)
-    policies = together.drop_nulls("params").group_by("run_dir", "player", "num_updates", maintain_order=True)
-    for run_dir, player, _, num_policies in policies.agg(pl.col("params").n_unique()).iter_rows():
+    one_policy = (
+        "run_dir",
+        "player",
+        "num_updates",
+        "scenario",
+    )  # runs of several scenarios may have one name and seed
+    policies = together.drop_nulls("params").group_by(one_policy, maintain_order=True)
+    for run_dir, player, _, scenario, num_policies in policies.agg(pl.col("params").n_unique()).iter_rows():
         if num_policies > 1:
             problems.append(
-                f"{run_dir}: {player} has episodes of {num_policies} policies (`params`), which are put together as if "
-                "they were of one; leave out the records of the others"
+                f"{run_dir}: {player} has episodes of {num_policies} policies (`params`) in {scenario}, which are put "
+                "together as if they were of one; leave out the records of the others"
             )
     # a tuned engine plays the games of the one it is made of
     released = together["vizdoom"].str.split("+").list.first()
@@ -154,7 +160,9 @@ def collect_evaluations(paths: Iterable[Path | str]) -> tuple[pl.DataFrame, list
 
 
 def _at_home(rows: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
-    """Gives rows outside run directories the directory of their run; says of which runs there are several."""
+    """Gives rows outside run directories the directory of their run, or if that is not there, the first one that holds
+    rows of it; says of which runs there are several.
+    """
     astray = rows.filter(pl.col("trained_on").is_null())["run_dir"].drop_nulls().unique()
     outside = pl.col("run_dir").is_in([one for one in astray if not (Path(one) / "config.json").is_file()])
     known = rows.drop_nulls("trained_on").group_by("run", "run_seed", maintain_order=True)
@@ -168,8 +176,10 @@ def _at_home(rows: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
         for run_dir, run, seed, num in several.unique(maintain_order=True).iter_rows()
     ]
     found = outside & (num_homes == 1)
+    homeless = outside & num_homes.is_null() & pl.col("params").is_not_null()
+    first = pl.col("run_dir").first().over("run", "run_seed", "scenario")
     rows = rows.with_columns(
-        run_dir=pl.when(found).then(pl.col("home").list.first()).otherwise("run_dir"),
+        run_dir=pl.when(found).then(pl.col("home").list.first()).when(homeless).then(first).otherwise("run_dir"),
         trained_on=pl.when(found).then("their_tasks").otherwise("trained_on"),
     )
     return rows.drop("home", "their_tasks"), problems

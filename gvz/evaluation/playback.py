@@ -5,7 +5,6 @@ and one that draws a large picture and takes the same actions, tic by tic. The e
 the two games differ at a tic, that is an error.
 """
 
-import dataclasses
 from collections.abc import Generator
 from contextlib import closing
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from gvz.core.env_config import EnvConfig
 from gvz.core.errors import EngineError
 from gvz.env import DoomEnv
 from gvz.evaluation.play import Episode, PlayerSpec, Row, Tally, episode_seed
@@ -63,8 +63,12 @@ def perform(player_spec: PlayerSpec, episode: Episode) -> Generator[Moment, None
     """
     seed = episode_seed(*episode)
     player = player_spec.make_player()
-    large = dataclasses.replace(
-        player_spec.env, frame_skip=1, render_width=SCREEN_WIDTH, render_height=SCREEN_HEIGHT, buffers=()
+    large = EnvConfig(
+        profile=player_spec.env.profile,
+        action_set=player_spec.env.action_set,
+        frame_skip=1,
+        render_width=SCREEN_WIDTH,
+        render_height=SCREEN_HEIGHT,
     )
     with (
         closing(DoomEnv(episode.task, player_spec.env, recycle_episodes=player_spec.recycle_episodes)) as env,

@@ -161,7 +161,12 @@ def with_agents(episodes: pl.DataFrame, agents: dict[str, str]) -> pl.DataFrame:
     final = (age <= (num_checkpoints / 4).ceil()).over(ONE_RUN).fill_null(value=True)
     seen = pl.format(" ({})", "observes").fill_null("")  # of a player of one's own that has other than the screen
     agent = pl.concat_str(pl.coalesce(named, "player"), seen)
-    return episodes.with_columns(agent=agent, final=final).with_columns(agent=pl.concat_str("agent", *_other_rules()))
+    beside = pl.col("run").is_null() & pl.col("run").is_not_null().any().over("agent")  # a run has this player's name
+    return (
+        episodes.with_columns(agent=agent, final=final)
+        .with_columns(agent=pl.when(beside).then(pl.format("{} (player)", "agent")).otherwise("agent"))
+        .with_columns(agent=pl.concat_str("agent", *_other_rules()))
+    )
 
 
 def _other_rules() -> list[pl.Expr]:

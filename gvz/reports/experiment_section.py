@@ -25,7 +25,7 @@ from gvz.reports.draw import draw_curves
 from gvz.reports.results import PlannedExperiment, Results
 from gvz.reports.runs import TRAINING_SETS
 from gvz.reports.scores import Scores, estimate, estimate_groups, pick
-from gvz.tasks import LEVELS, parse_task, scenario_named
+from gvz.tasks import LEVELS, parse_task, scenario_named, scenarios
 
 MAX_ID_LENGTH = 100
 """characters of a name in a file's name, which has at most 255"""
@@ -126,7 +126,8 @@ def result_table(results: Results, asked: PlannedExperiment, *, trained: bool = 
             for who, found in published.items()
             if found.keys() >= set(experiment.scenarios)
         }
-        rows += _rows("P_norm: mean over scenarios", averages, numbers)
+        is_norm = {*experiment.scenarios} == scenarios().keys() and not experiment.compares_training
+        rows += _rows("P_norm: " * is_norm + "mean over scenarios", averages, numbers)
     others = " Rows in italics are published numbers; no number of ours uses them." if published else ""
     over = " on the tasks of training" if trained else _over(experiment)
     return Table(

@@ -4,6 +4,7 @@ import base64
 import csv
 import io
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import jinja2
@@ -19,6 +20,9 @@ _LATEX = {
     **{c: f"\\{c}" for c in "&%$#_{}"},
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
 }
 
 
@@ -93,15 +97,20 @@ def to_markdown(document: Document) -> str:
 
 
 def _markdown_table(table: Table) -> str:
-    def line(cells: list[str]) -> str:
-        return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+    def line(cells: Iterable[str]) -> str:
+        return f"| {' | '.join(cells)} |"
 
     def text(cell: Cell) -> str:
-        shown = f"*{cell.text}*" if cell.kind == "theirs" else cell.text
+        shown = f"*{_markdown(cell.text)}*" if cell.kind == "theirs" else _markdown(cell.text)
         return f"{shown} ({cell.note})" if cell.note else shown
 
-    rows = [line([text(cell) for cell in row]) for row in table.rows]
-    return "\n".join([line(list(table.columns)), "|" + "---|" * len(table.columns), *rows])
+    rows = [line(map(text, row)) for row in table.rows]
+    return "\n".join([line(map(_markdown, table.columns)), "|" + "---|" * len(table.columns), *rows])
+
+
+def _markdown(text: str) -> str:
+    """A name as it is: a player's may hold what would be a tag, another row or another column."""
+    return re.sub(r"([\\`*<|])", r"\\\1", " ".join(text.split()))
 
 
 def to_csv(table: Table) -> str:
@@ -109,7 +118,8 @@ def to_csv(table: Table) -> str:
 
     A missing cell is empty; a published number has no interval.
     """
-    numeric = [any(row[n].estimate for row in table.rows) for n in range(len(table.columns))]
+    columns = [[row[n] for row in table.rows] for n in range(len(table.columns))]
+    numeric = [any(cell.estimate for cell in cells) or {c.kind for c in cells} == {"missing"} for cells in columns]
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     head = []

@@ -127,11 +127,21 @@ def test_two_players_of_one_name_are_told_of(tmp_path):
     assert problem.startswith("human: 1 of its episodes were found with several results"), "the score is at its bound"
 
 
-def test_two_policies_of_one_name_are_told_of(tmp_path):
+@pytest.mark.parametrize("second", ["a", "b"])
+def test_two_policies_of_one_name_are_told_of_unless_they_are_of_two_scenarios(tmp_path, second):
     policy = {"player": "r/seed_1@9", "run": "r", "run_seed": 1, "num_updates": 9}
-    (tmp_path / "mine.jsonl").write_text(line(**policy, params="abc") + line(**policy, params="def"))
-    _, (problem,) = collect_evaluations([tmp_path])
-    assert problem.startswith(f"{tmp_path}: r/seed_1@9 has episodes of 2 policies (`params`)")
+    one, other = tmp_path / "a" / "one.jsonl", tmp_path / second / "other.jsonl"
+    for file in (one, other):
+        file.parent.mkdir(exist_ok=True)
+    one.write_text(line(**policy, params="abc"))
+    other.write_text(line(**policy, params="def"))
+    frame, (problem,) = collect_evaluations([tmp_path])
+    assert problem.startswith(
+        f"{tmp_path / 'a'}: r/seed_1@9 has episodes of 2 policies (`params`) in defend_the_center"
+    )
+    assert set(frame["run_dir"]) == {str(tmp_path / "a")}
+    other.write_text(line(**policy, params="def", task="seek_and_kill/default"))
+    assert collect_evaluations([tmp_path])[1] == []
 
 
 def test_records_of_training_and_discarded_ones_are_left_alone(tmp_path):

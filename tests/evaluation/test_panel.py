@@ -7,7 +7,7 @@ import pytest
 
 from gvz.actions import action_buttons, action_mask
 from gvz.core.env_config import EnvConfig
-from gvz.evaluation.panel import ACCENT, BAR, GOOD, HEAD_HEIGHT, HEIGHT, WIDTH, Panel
+from gvz.evaluation.panel import ACCENT, BAR, FOOT_HEIGHT, GOOD, HEAD_HEIGHT, HEIGHT, WIDTH, Panel
 from gvz.evaluation.playback import SCREEN_HEIGHT, SCREEN_WIDTH, Moment
 from gvz.evaluation.trained import Values
 from gvz.tasks import named_tasks, parse_task, scenarios
@@ -121,18 +121,22 @@ def test_the_timeline_has_the_value_of_a_policy_and_not_its_probabilities():
         ]
         return draw(*moments)[foot, :SCREEN_WIDTH]
 
-    falling, rising = line(2.0, 1.0), line(1.0, 2.0)
-    assert count(falling, ACCENT) > 100
-    assert (falling != rising).any()
+    for values, direction in (((2.0, 1.0), 1), ((1.0, 2.0), -1)):
+        rows, columns = np.nonzero((line(*values) == ACCENT).all(axis=-1))
+        assert len(rows) > 100
+        assert rows.max() < FOOT_HEIGHT / 2, "rewards stand below"
+        assert np.corrcoef(rows, columns)[0, 1] * direction > 0.9
 
 
-def test_the_tallest_bar_of_the_distribution_is_the_likeliest_return():
+def test_the_tallest_bar_of_the_distribution_is_the_likeliest_return_and_a_line_the_mean():
     tops = []
     for atom in (5, 45):
-        picture = draw(dataclasses.replace(START, action=0, values=values([1.0, 1.0, 1.0, 1.0, 1.0], atom)))
-        below_actions = slice(HEAD_HEIGHT + 22 + 5 * 24 + 12, None)
-        at = np.argwhere((picture[below_actions, SIDE] == BAR).all(axis=-1))
+        picture = draw(dataclasses.replace(START, action=0, values=values([0.2 * atom - 5.0] * 5, atom)))
+        below_actions = picture[HEAD_HEIGHT + 22 + 5 * 24 + 12 :, SIDE]
+        at, line = (np.argwhere((below_actions == colour).all(axis=-1)) for colour in (BAR, ACCENT))
         tops.append(at[at[:, 0].argmin(), 1] / (WIDTH - SCREEN_WIDTH))
+        (bar, mean) = (found[found[:, 0] == at[:, 0].min() + 5, 1] for found in (np.concatenate([at, line]), line))
+        assert (bar.min() + bar.max()) / 2 == pytest.approx(mean.mean(), abs=1.5)
     assert tops == pytest.approx([5 / 51, 45 / 51], abs=0.06)
 
 
@@ -142,11 +146,19 @@ def test_without_values_there_are_neither_bars_nor_a_distribution():
     assert 20 < count(picture, ACCENT, columns=SIDE) < 100, "the mark at the held action"
 
 
+def test_the_foot_says_the_score_and_its_share_of_the_bound(monkeypatch):
+    said = []
+    monkeypatch.setattr(Panel, "_text", lambda *text: said.append(text[2]))
+    draw(dataclasses.replace(START, score=5.0, frames=70))
+    assert {"5", "of 20 kills", "25.0 %    tic 70 of 1200"} <= set(said)
+
+
 def test_a_reward_stays_on_the_timeline():
     rewarded = dataclasses.replace(START, frames=100, reward=1.0, reward_components={"kill": 1.0})
     later = dataclasses.replace(rewarded, frames=900, decided=True)
     foot = slice(HEAD_HEIGHT + SCREEN_HEIGHT, HEIGHT)
-    assert count(draw(START, rewarded, later), GOOD, foot) == count(draw(START, rewarded), GOOD, foot) > 10
+    upper = slice(foot.start, foot.start + FOOT_HEIGHT // 2 + 1)
+    assert count(draw(START, rewarded, later), GOOD, foot) == count(draw(START, rewarded), GOOD, upper) > 10
     assert count(draw(START, later), GOOD, foot, slice(0, SCREEN_WIDTH // 2)) == 0
 
 

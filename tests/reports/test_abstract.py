@@ -148,6 +148,14 @@ def test_a_player_of_ones_own_is_not_called_one_that_does_not_learn(tmp_path):
     assert sentence == f"2 evaluation episodes on 1 task, {beside}"
 
 
+def test_a_player_that_has_the_name_of_a_run_is_no_further_seed_of_it(tmp_path):
+    task = "defend_the_center/default"
+    trained = evaluation_row("ppo/seed_1@9", task, 0, 10.0, run="ppo", run_seed=1, num_updates=9)
+    write_rows(tmp_path / "rows.jsonl", [trained, evaluation_row("ppo", task, 0, 90.0)])
+    shown = read_results([tmp_path]).episodes.select("agent", "normalized_score").rows()
+    assert shown == [("ppo", 10.0), ("ppo (player)", 90.0)]
+
+
 def test_few_episodes_are_a_caveat_however_many_checkpoints_played_them(tmp_path):
     rows = [
         evaluation_row(f"r/1@{updates}", "defend_the_center/gore", n, 50.0, run="r", run_seed=1, num_updates=updates)

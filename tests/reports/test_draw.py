@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from gvz.evaluation.statistics import Estimate
 from gvz.reports.document import Figure
@@ -30,6 +31,13 @@ def test_no_two_agents_look_alike(tmp_path):
     for figure in figures:
         looks = _looks(figure)
         assert len(looks) == len(set(looks)) == len(AGENTS), figure.id
+
+
+def test_a_histogram_shows_shares_of_an_agents_episodes(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(Axes, "stairs", lambda *values, **_: drawn.append(values[1]))
+    draw_histogram(tmp_path, "histogram", "scores", {"a": np.array([0.0, 50.0, 100.0, 100.0])}, "scores")
+    assert (drawn[0][0], drawn[0][-1], drawn[0].sum()) == (25.0, 50.0, 100.0)
 
 
 def test_a_very_long_name_is_wrapped_and_its_file_can_be_written(tmp_path, recwarn):

@@ -22,10 +22,15 @@ def test_an_agent_of_two_scenarios_has_the_mean_of_their_means(tmp_path):
     write_rows(tmp_path / "rows.jsonl", rows)
     (section,) = joint_sections(read_results([tmp_path]), tmp_path)
     (table,) = section.blocks[0].tables
-    assert table.columns == ("agent", "Health Gathering", "Seek and Kill", "P_norm")
+    assert "P_norm" not in table.caption, "it is of all scenarios"
+    assert table.columns == ("agent", "Health Gathering", "Seek and Kill", "mean")
     assert [[cell.text for cell in row] for row in table.rows] == [
         ["random", "40.0 [40.0, 40.0]", "10.0 [10.0, 10.0]", "25.0 [25.0, 25.0]"]
     ]
+    rows += [evaluation_row("idle", task.id, 0, 0.0) for task in named_tasks(split="test")]
+    write_rows(tmp_path / "rows.jsonl", rows)
+    (section,) = joint_sections(read_results([tmp_path]), tmp_path)
+    assert section.blocks[0].tables[0].columns[-1] == "P_norm"
 
 
 def test_levels_are_means_over_the_scenarios_and_have_a_figure(tmp_path):
@@ -53,6 +58,19 @@ def test_one_scenario_needs_no_such_section(tmp_path):
     tasks = named_tasks("health_gathering", split="test")
     write_rows(tmp_path / "rows.jsonl", [evaluation_row("random", task.id, 0, 40.0) for task in tasks])
     assert joint_sections(read_results([tmp_path]), tmp_path) == []
+
+
+def test_a_seed_that_is_missing_in_one_scenario_is_told_of(tmp_path):
+    rows = [
+        evaluation_row(f"{scenario}/{seed}", task.id, 0, 50.0, run="r", run_seed=seed, num_updates=9, params=scenario)
+        for scenario, seeds in (("health_gathering", (1, 2)), ("seek_and_kill", (2,)))
+        for seed in seeds
+        for task in named_tasks(scenario, split="test")
+    ]
+    write_rows(tmp_path / "rows.jsonl", rows)
+    (section,) = joint_sections(read_results([tmp_path]), tmp_path)
+    ((_, *cells),) = section.blocks[0].tables[0].rows
+    assert [cell.note for cell in cells] == ["", "1 of 2 seeds", "1 of 2 seeds"]
 
 
 @pytest.mark.parametrize("one_run_plays_all", [True, False])

@@ -18,7 +18,7 @@ TABLE = Table(
     rows=(
         (words("Seek | Kill"), ours(Estimate(value=12.34567, low=10.0, high=14.0), "2 of 3 seeds")),
         (words("Seek | Kill"), theirs(59.69, 2)),
-        (words("Dodge"), missing("0 of 3 seeds")),
+        (words("*<b>*\n`Dodge`"), missing("0 of 3 seeds")),
     ),
     notes=("mind the_gap",),
 )
@@ -41,11 +41,18 @@ def test_csv_has_value_interval_and_note_in_columns_of_their_own():
     assert (third["level 0"], third["level 0 note"]) == ("", "0 of 3 seeds")
 
 
+def test_a_column_of_csv_without_any_number_is_four_columns_too():
+    table = dataclasses.replace(TABLE, rows=TABLE.rows[2:])
+    assert to_csv(table).splitlines()[0] == "scenario,level 0,level 0 low,level 0 high,level 0 note"
+    (row,) = csv.DictReader(io.StringIO(to_csv(table)))
+    assert (row["level 0"], row["level 0 note"]) == ("", "0 of 3 seeds")
+
+
 def test_latex_escapes_and_sets_published_numbers_in_italics():
     text = to_latex(TABLE)
-    assert r"\caption{100\% of <this> \& that\_}" in text
-    assert r"Seek | Kill & 12.3 [10.0, 14.0] (2 of 3 seeds) \\" in text
-    assert r"Seek | Kill & \textit{59.69} \\" in text
+    assert r"\caption{100\% of \textless{}this\textgreater{} \& that\_}" in text
+    assert r"Seek \textbar{} Kill & 12.3 [10.0, 14.0] (2 of 3 seeds) \\" in text
+    assert r"Seek \textbar{} Kill & \textit{59.69} \\" in text
     assert r"\par mind the\_gap" in text
     assert text.count(r"\\") == 4
 
@@ -54,6 +61,7 @@ def test_markdown_has_tables_figures_and_links(tmp_path):
     text = to_markdown(document(tmp_path))
     assert r"| Seek \| Kill | 12.3 [10.0, 14.0] (2 of 3 seeds) |" in text
     assert r"| Seek \| Kill | *59.69* |" in text
+    assert r"| \*\<b>\* \`Dodge\` | - (0 of 3 seeds) |" in text
     assert "![A figure](figures/f.png)" in text
     assert "[rows.jsonl](../rows.jsonl)" in text
     assert "> **Mind:** mind" in text
