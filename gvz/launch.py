@@ -5,7 +5,6 @@ and errors are quick.
 """
 
 import dataclasses
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from typing import Annotated
 
 import tyro
 
-from gvz.core.control_groups import num_cores
+from gvz.core.control_groups import keep_xla_to_quota
 from gvz.core.errors import ConfigError, GvzError
 from gvz.core.libraries import require_learner
 from gvz.core.stop import StopRequest, exit_at_once, say, told_of_delay
@@ -108,8 +107,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 config = resumed_config(run, launch.run)
                 for note in run.check_resumable(config):
                     say(note)
-                if (cores := num_cores()) < len(os.sched_getaffinity(0)):
-                    os.environ.setdefault("NPROC", str(cores))  # else XLA has a thread for each core of the machine
+                keep_xla_to_quota()
                 stop.importing = True
                 from gvz.run.train import train  # imports jax, so only after the input is checked
 
