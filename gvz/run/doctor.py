@@ -12,15 +12,16 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from gvz.core import janitor
 from gvz.core.cache import cache_directory
 from gvz.core.control_groups import num_cores
+from gvz.core.errors import GvzError
 from gvz.engine.tuned import TUNED, describe_engine
 from gvz.engine.tuned.build_vizdoom import TUNED_VERSION
 from gvz.run.footprint import ACTOR_MEMORY_BYTES, ENGINE_SHM_BYTES, LEARNER_MEMORY_BYTES, format_bytes
@@ -216,6 +217,15 @@ CHECKS: tuple[Callable[[], Finding], ...] = (
     check_video,
 )
 """each after those that it depends on"""
+
+
+def findings(checks: Iterable[Callable[..., Finding]], *arguments: Any) -> Generator[Finding]:
+    """What checks find, one after the other. One that cannot be made is bad, and the next ones are made."""
+    for check in checks:
+        try:
+            yield check(*arguments)
+        except (GvzError, OSError) as error:
+            yield Finding(check.__name__.removeprefix("check_"), "bad", str(error))
 
 
 def show(findings: Iterable[Finding], *, json_lines: bool) -> int:
