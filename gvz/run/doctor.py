@@ -45,6 +45,8 @@ print(f"10 decisions of defend_the_center/default, started and ended in {time.mo
 """
 _DEVICES = """
 import jax, jax.numpy as jnp
+from learner.sharding import devices
+devices(1)
 assert float(jnp.ones(8).sum()) == 8.0
 print(jax.default_backend(), "|", ", ".join(d.device_kind for d in jax.devices()))
 """
@@ -245,8 +247,11 @@ def show(findings: Iterable[Finding], *, json_lines: bool) -> int:
 def _try(name: str, code: str, remedy: str) -> Finding:
     """Runs code in a process of its own, whose last line is the finding."""
     command = [sys.executable, "-c", code]
+    environment = {**os.environ, "JAX_TRACEBACK_FILTERING": "off"}  # else its last line is about the traceback
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_TRY_TIMEOUT_S, check=False)
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=_TRY_TIMEOUT_S, env=environment, check=False
+        )
     except subprocess.TimeoutExpired:
         return Finding(name, "bad", f"no answer within {_TRY_TIMEOUT_S} s", remedy)
     finally:
