@@ -16,10 +16,12 @@ import json
 import logging
 import os
 import shutil
+import sys
 import threading
 from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -88,10 +90,24 @@ def _files(directory: Path) -> list[Path]:
     return sorted(p for p in directory.rglob("*") if p.is_file() and p.name != "manifest.json")
 
 
+@cache
+def _quiet() -> None:
+    """Orbax warns, at every save, of what is meant to be so, and logs the traceback of each error that it raises. It
+    closes its event loop at the first error, and tensorstore's threads then show a traceback for every other array.
+    """
+    logging.getLogger("absl").setLevel(logging.CRITICAL)
+    shown_before = sys.unraisablehook
+
+    def show(dropped: "sys.UnraisableHookArgs") -> None:
+        if not (dropped.exc_type is RuntimeError and str(dropped.exc_value) == "Event loop is closed"):
+            shown_before(dropped)
+
+    sys.unraisablehook = show
+
+
 def _checkpointer() -> ocp.Checkpointer:
     """Orbax, but for its copy of every array it is given: ours are snapshots."""
-    # orbax warns, at every save, of what is meant to be so, and logs the traceback of each error that it raises
-    logging.getLogger("absl").setLevel(logging.CRITICAL)
+    _quiet()
     handler = ocp.type_handlers.NumpyHandler(deepcopy_host_arrays=False)
     registry = ocp.type_handlers.create_type_handler_registry((np.ndarray, handler))
     alone = ocp.options.MultiprocessingOptions()

@@ -262,8 +262,6 @@ def random_example(step: int, num_bytes: int = 300_000):
     return {"noise": noise, "params": np.full(4, step, np.float32)}
 
 
-# a write that fails leaves tensorstore's other writes behind, which then find orbax's event loop closed
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_full_disk_is_reported_once_leaves_nothing_and_the_next_save_is_whole(tmp_path, caplog):
     saver = checkpoint.Checkpointer(tmp_path, keep=2)
     for step in (1, 2, 3):
