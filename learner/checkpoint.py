@@ -15,6 +15,7 @@ import hashlib
 import json
 import logging
 import os
+import re
 import shutil
 import sys
 import threading
@@ -48,6 +49,8 @@ WRITE_TIMEOUT_S = 1800.0
 
 _JOIN_S = 0.1
 """a wait for the thread looks at its clock so often"""
+
+_SPECIFICATION = re.compile(r" \[(tensorstore_spec|os_error_code)=.*", re.DOTALL)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -167,9 +170,12 @@ def write(
             fsync(directory.parent)
     except Exception as error:  # orbax and tensorstore raise many unrelated classes for one full disk
         shutil.rmtree(writing, ignore_errors=True)
-        raise CheckpointError(
-            f"checkpoint {directory} could not be written: {type(error).__name__}: {error}"
-        ) from error
+        raise CheckpointError(f"checkpoint {directory} could not be written: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    """Without what tensorstore puts behind it: a specification of a thousand characters."""
+    return f"{type(error).__name__}: {_SPECIFICATION.sub('', str(error))}"
 
 
 def verify(directory: Path) -> dict[str, Any]:
@@ -225,7 +231,7 @@ def read(directory: Path, template: Any) -> tuple[Any, dict[str, Any]]:
             found = checkpointer.restore((directory / "arrays").absolute(), blocks)
         host = msgpack.unpackb((directory / "host.msgpack").read_bytes())
     except Exception as error:  # as for writing
-        raise CheckpointError(f"{directory} cannot be read: {type(error).__name__}: {error}") from error
+        raise CheckpointError(f"{directory} cannot be read: {_reason(error)}") from error
     if _leaf_specs(found) != _leaf_specs(blocks) or not isinstance(host, dict):
         raise CheckpointError(f"{directory}: its arrays or its host state are not what the manifest says: damaged")
     for name, block in blocks.items():
