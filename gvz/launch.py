@@ -8,7 +8,6 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 import tyro
@@ -103,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if launch.fresh and (moved := move_aside(directory)) is not None:
                 say(f"moved the old run to {moved}")
             refuse_other_contents(directory)
-            with RunDir(Path(directory), in_another=launch.run.group.own_id > 0) as run:
+            with RunDir(directory, in_another=launch.run.group.own_id > 0) as run:
                 config = resumed_config(run, launch.run)
                 for note in run.check_resumable(config):
                     say(note)
