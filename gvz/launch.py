@@ -5,16 +5,14 @@ and errors are quick.
 """
 
 import dataclasses
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from gvz.core.control_groups import num_cores
+from gvz.core.control_groups import keep_xla_to_quota
 from gvz.core.errors import ConfigError, GvzError
 from gvz.core.libraries import require_learner
 from gvz.core.stop import StopRequest, exit_at_once, say, told_of_delay
@@ -104,12 +102,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if launch.fresh and (moved := move_aside(directory)) is not None:
                 say(f"moved the old run to {moved}")
             refuse_other_contents(directory)
-            with RunDir(Path(directory), in_another=launch.run.group.own_id > 0) as run:
+            with RunDir(directory, in_another=launch.run.group.own_id > 0) as run:
                 config = resumed_config(run, launch.run)
                 for note in (*run.check_resumable(config), *(f"warning: {text}" for text in without_effect(config))):
                     say(note)
-                if (cores := num_cores()) < len(os.sched_getaffinity(0)):
-                    os.environ.setdefault("NPROC", str(cores))  # else XLA has a thread for each core of the machine
+                keep_xla_to_quota()
                 stop.importing = True
                 from gvz.run.train import train  # imports jax, so only after the input is checked
 

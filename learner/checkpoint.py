@@ -15,11 +15,14 @@ import hashlib
 import json
 import logging
 import os
+import re
 import shutil
+import sys
 import threading
 from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +49,8 @@ WRITE_TIMEOUT_S = 1800.0
 
 _JOIN_S = 0.1
 """a wait for the thread looks at its clock so often"""
+
+_SPECIFICATION = re.compile(r" \[(tensorstore_spec|os_error_code)=.*", re.DOTALL)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -88,10 +93,24 @@ def _files(directory: Path) -> list[Path]:
     return sorted(p for p in directory.rglob("*") if p.is_file() and p.name != "manifest.json")
 
 
+@cache
+def _quiet() -> None:
+    """Orbax warns, at every save, of what is meant to be so, and logs the traceback of each error that it raises. It
+    closes its event loop at the first error, and tensorstore's threads then show a traceback for every other array.
+    """
+    logging.getLogger("absl").setLevel(logging.CRITICAL)
+    shown_before = sys.unraisablehook
+
+    def show(dropped: "sys.UnraisableHookArgs") -> None:
+        if not (dropped.exc_type is RuntimeError and str(dropped.exc_value) == "Event loop is closed"):
+            shown_before(dropped)
+
+    sys.unraisablehook = show
+
+
 def _checkpointer() -> ocp.Checkpointer:
     """Orbax, but for its copy of every array it is given: ours are snapshots."""
-    # orbax warns, at every save, of what is meant to be so, and logs the traceback of each error that it raises
-    logging.getLogger("absl").setLevel(logging.CRITICAL)
+    _quiet()
     handler = ocp.type_handlers.NumpyHandler(deepcopy_host_arrays=False)
     registry = ocp.type_handlers.create_type_handler_registry((np.ndarray, handler))
     alone = ocp.options.MultiprocessingOptions()
@@ -151,9 +170,12 @@ def write(
             fsync(directory.parent)
     except Exception as error:  # orbax and tensorstore raise many unrelated classes for one full disk
         shutil.rmtree(writing, ignore_errors=True)
-        raise CheckpointError(
-            f"checkpoint {directory} could not be written: {type(error).__name__}: {error}"
-        ) from error
+        raise CheckpointError(f"checkpoint {directory} could not be written: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    """Without what tensorstore puts behind it: a specification of a thousand characters."""
+    return f"{type(error).__name__}: {_SPECIFICATION.sub('', str(error))}"
 
 
 def verify(directory: Path) -> dict[str, Any]:
@@ -209,7 +231,7 @@ def read(directory: Path, template: Any) -> tuple[Any, dict[str, Any]]:
             found = checkpointer.restore((directory / "arrays").absolute(), blocks)
         host = msgpack.unpackb((directory / "host.msgpack").read_bytes())
     except Exception as error:  # as for writing
-        raise CheckpointError(f"{directory} cannot be read: {type(error).__name__}: {error}") from error
+        raise CheckpointError(f"{directory} cannot be read: {_reason(error)}") from error
     if _leaf_specs(found) != _leaf_specs(blocks) or not isinstance(host, dict):
         raise CheckpointError(f"{directory}: its arrays or its host state are not what the manifest says: damaged")
     for name, block in blocks.items():

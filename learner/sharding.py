@@ -9,6 +9,7 @@ another: records look the same whatever D is. What does not is made the same for
 trees are rebuilt of their leaves, and anchors are counted from slot 0 of all lanes.
 """
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -303,9 +304,16 @@ def devices(num_devices: int) -> list[Any]:
     """The first devices of this process.
 
     Raises:
-        ConfigError: there are fewer.
+        ConfigError: there are fewer, or none of the kind that JAX_PLATFORMS wants.
     """
-    present = jax.local_devices()
+    try:
+        present = jax.local_devices()
+    except (RuntimeError, AssertionError) as error:  # the latter has no text: JAX lacks the plugin for a GPU
+        why = str(error).partition("\n")[0] or "its package for them is not installed"
+        raise ConfigError(
+            f"JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS')}: JAX finds no such devices ({why}); unset it, or install "
+            "what they need (an NVIDIA GPU: `make install-cuda`, and a driver)"
+        ) from error
     if num_devices > len(present):
         raise ConfigError(
             f"learner.devices: got {num_devices}, but JAX sees {len(present)} ({present[0].platform}); lower it, or "

@@ -203,7 +203,6 @@ def test_a_bomb_goes_off_when_it_is_unpickled(tmp_path: Path):
     assert (tmp_path / "mark").exists()
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # orbax's reads after the first failure
 def test_a_checkpoint_full_of_pickles_is_refused_and_not_unpickled(tmp_path: Path):
     mark, bomb = tmp_path / "mark", pickle.dumps(Bomb(tmp_path / "mark"))
     tree = {"w": np.ones(3, np.float32)}

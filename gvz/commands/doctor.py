@@ -39,12 +39,12 @@ class Doctor:
                 done = line if line.startswith("left alone") else f"removed {line}"
                 print(done, file=sys.stderr if self.json else sys.stdout)
         if self.shared is None:
-            return doctor.show((check() for check in doctor.CHECKS), json_lines=self.json)
+            return doctor.show(doctor.findings(doctor.CHECKS), json_lines=self.json)
         shared_directory.require_directory(self.shared)
         if self.hold is not None:
             shared_directory.hold(self.shared, self.hold, lambda line: print(line, flush=True))
             return 0
-        return doctor.show((check(self.shared) for check in shared_directory.CHECKS), json_lines=self.json)
+        return doctor.show(doctor.findings(shared_directory.CHECKS, self.shared), json_lines=self.json)
 
 
 COMMAND = Doctor

@@ -13,6 +13,7 @@ from typing import Annotated, Literal, TypeVar
 
 import tyro
 
+from gvz.core.control_groups import keep_xla_to_quota
 from gvz.core.errors import ConfigError
 from gvz.core.files import written_whole
 
@@ -74,6 +75,7 @@ class TrainSegmenter:
         from gvz.tasks import named_tasks
 
         gate_tasks = named_tasks(self.scenario, split="gate")
+        keep_xla_to_quota()
         import jax
         import numpy as np
 

@@ -33,6 +33,12 @@ def num_cores() -> int:
     return min([len(os.sched_getaffinity(0)), *_quotas()])
 
 
+def keep_xla_to_quota() -> None:
+    """Before jax is imported: under a quota, XLA would have a thread for each core of the machine."""
+    if (cores := num_cores()) < len(os.sched_getaffinity(0)):
+        os.environ.setdefault("NPROC", str(cores))
+
+
 @cache
 def _quotas() -> tuple[int, ...]:
     """Cores that each quota is worth. Read once in a process: configurations ask again and again."""

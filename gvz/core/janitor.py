@@ -86,8 +86,11 @@ def runtime_dir() -> Path:
 
 
 def _temporary_place() -> str:
-    with uninterrupted():  # Python tries the directory with a file of its own, which would stay
-        return tempfile.gettempdir()
+    try:
+        with uninterrupted():  # Python tries the directory with a file of its own, which would stay
+            return tempfile.gettempdir()
+    except FileNotFoundError as error:
+        raise ResourceError(f"{error.strerror}; make room in one, or set TMPDIR to a writable directory") from error
 
 
 def make_directory(place: Path | None = None) -> Path:

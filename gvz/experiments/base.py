@@ -317,7 +317,7 @@ class Experiment:
 
 def budget_text(total_updates: int, max_processor_s: float | None) -> str:
     """What a run may take, in words."""
-    limit = "" if max_processor_s is None else f"{max_processor_s:,.4g} seconds of processor time, at most "
+    limit = "" if max_processor_s is None else f"{max_processor_s:,.10g} seconds of processor time, at most "
     return f"{limit}{total_updates:,} gradient steps"
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from gvz.core import records
-from gvz.core.errors import ConfigError
+from gvz.core.errors import ConfigError, TaskError
 from gvz.core.files import written_whole
 from gvz.evaluation.simple import SimplePlayerName
 from gvz.experiments.base import Experiment, TrainingRun, experiment_named
@@ -148,17 +148,15 @@ def read_plan(results: Path) -> Plan | None:
     try:
         saved = json.loads(file.read_text())
         if saved["schema"] != PLAN_SCHEMA:
-            raise ConfigError(f"{file}: schema {saved['schema']}, want {PLAN_SCHEMA}")
+            raise ConfigError(f"schema {saved['schema']}, want {PLAN_SCHEMA}")
         asked = dict(saved["experiments"])
         return Plan(
             asked={name: None if scenarios is None else tuple(scenarios) for name, scenarios in asked.items()},
             scale=saved["scale"],
         )
+    except (ConfigError, TaskError) as error:
+        raise ConfigError(f"{file}: {error}; change it there, or move the file aside") from error
     except (ValueError, KeyError, TypeError, OSError, RecursionError) as error:
-        if isinstance(error, ConfigError):
-            if str(error).startswith(str(file)):
-                raise
-            raise ConfigError(f"{file}: {error}; change it there, or move the file aside") from error
         raise ConfigError(f"{file} cannot be read: {error!r}; move it aside to make a new plan") from error
 
 

@@ -140,7 +140,7 @@ class Schedule:
             self._waiting.appendleft(job)
             return
         else:
-            ended = f"exit code {code}" if code else f"it ended as if all were done, but {outlook.next} is left"
+            ended = f"exit code {code}" if code else f"it ended as if all were done, but it has {outlook.text}"
             why = running.process.problem or ended
         log = inventory.log_file(job.results, job.id)
         self._failed.append(job)

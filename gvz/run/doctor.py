@@ -12,15 +12,16 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from gvz.core import janitor
 from gvz.core.cache import cache_directory
 from gvz.core.control_groups import num_cores
+from gvz.core.errors import GvzError
 from gvz.engine.tuned import TUNED, describe_engine
 from gvz.engine.tuned.build_vizdoom import TUNED_VERSION
 from gvz.run.footprint import ACTOR_MEMORY_BYTES, ENGINE_SHM_BYTES, LEARNER_MEMORY_BYTES, format_bytes
@@ -44,6 +45,8 @@ print(f"10 decisions of defend_the_center/default, started and ended in {time.mo
 """
 _DEVICES = """
 import jax, jax.numpy as jnp
+from learner.sharding import devices
+devices(1)
 assert float(jnp.ones(8).sum()) == 8.0
 print(jax.default_backend(), "|", ", ".join(d.device_kind for d in jax.devices()))
 """
@@ -218,6 +221,15 @@ CHECKS: tuple[Callable[[], Finding], ...] = (
 """each after those that it depends on"""
 
 
+def findings(checks: Iterable[Callable[..., Finding]], *arguments: Any) -> Generator[Finding]:
+    """What checks find, one after the other. One that cannot be made is bad, and the next ones are made."""
+    for check in checks:
+        try:
+            yield check(*arguments)
+        except (GvzError, OSError) as error:
+            yield Finding(check.__name__.removeprefix("check_"), "bad", str(error))
+
+
 def show(findings: Iterable[Finding], *, json_lines: bool) -> int:
     """Prints findings as they come; returns the exit code: 1 if one is bad."""
     bad = False
@@ -235,8 +247,11 @@ def show(findings: Iterable[Finding], *, json_lines: bool) -> int:
 def _try(name: str, code: str, remedy: str) -> Finding:
     """Runs code in a process of its own, whose last line is the finding."""
     command = [sys.executable, "-c", code]
+    environment = {**os.environ, "JAX_TRACEBACK_FILTERING": "off"}  # else its last line is about the traceback
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_TRY_TIMEOUT_S, check=False)
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=_TRY_TIMEOUT_S, env=environment, check=False
+        )
     except subprocess.TimeoutExpired:
         return Finding(name, "bad", f"no answer within {_TRY_TIMEOUT_S} s", remedy)
     finally:

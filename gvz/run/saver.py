@@ -12,8 +12,10 @@ from gvz.run.monitor import Counts
 from gvz.run.rundir import RunDir, disk_checked
 from learner.checkpoint import Checkpointer
 
-SAVE_RETRY_S, LONGEST_SAVE_RETRY_S = 60.0, 3600.0
-"""a failed checkpoint is tried again after this time, doubled each time, or at the next period"""
+SAVE_RETRY_S, LONGEST_SAVE_RETRY_S = 60, 3600
+"""a failed checkpoint is tried again after this time, doubled each time, or at the next period; whole numbers: a float
+has no 1,024th double
+"""
 _LAST_ATTEMPTS = 2
 
 

@@ -106,7 +106,7 @@ class Trainer:
                 self._saver.save_last(self._group, self._record_row)
             raise
         last = "writing the last checkpoint" if self._saver.behind else "no new gradient steps to save"
-        self._progress.say(f"{'done' if self.is_done() else 'stopping'}: {last}")
+        self._progress.say(f"{self._ending()}: {last}")
         self._saver.save_last(self._group, self._record_row)
         self._record_used_up_time()
 
@@ -129,6 +129,14 @@ class Trainer:
         config, counts = self._config, self._counts
         used_up = config.max_processor_s is not None and counts.processor_s >= config.max_processor_s
         return used_up or counts.updates >= config.learner.total_updates
+
+    def _ending(self) -> str:
+        limit_s, counts = self._config.max_processor_s, self._counts
+        if not self.is_done():
+            return "stopping"
+        if limit_s is None or counts.updates >= self._config.learner.total_updates:
+            return "done"
+        return f"done, with {counts.processor_s:,.0f} of {limit_s:,.0f} s of processor time (--max-processor-s) used up"
 
     def _collect(self) -> None:
         """Rings -> learner, as far as it allows."""

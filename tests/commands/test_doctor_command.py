@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import tempfile
 
 from gvz import cli
 from gvz.run import doctor
@@ -25,6 +26,30 @@ def test_a_bad_finding_gives_exit_code_1_and_its_remedy(capsys, monkeypatch, tmp
     out = capsys.readouterr().out
     assert out.startswith("bad   cache")
     assert "-> set GVZ_CACHE_DIR" in out
+
+
+def test_a_check_that_cannot_be_made_is_bad_and_the_next_ones_are_made(capsys, monkeypatch, tmp_path):
+    """Every place for temporary files is full or read-only: a line for each check, and no traceback."""
+    monkeypatch.delenv("GVZ_RUNTIME_DIR")
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: [str(tmp_path / "gone")])
+    checks = (doctor.check_temporary_directory, doctor.check_leftovers, doctor.check_python)
+    monkeypatch.setattr(doctor, "CHECKS", checks)
+    assert cli.main(["doctor"]) == 1
+    temporary, leftovers, python = capsys.readouterr().out.splitlines()
+    assert temporary.startswith("bad   temporary_directory ")
+    assert leftovers.startswith("bad   leftovers  No usable temporary directory found in ")
+    assert leftovers.endswith("; make room in one, or set TMPDIR to a writable directory")
+    assert python.startswith(("ok    python ", "note  python "))
+
+
+def test_a_shared_directory_that_nothing_can_be_made_in_is_bad(capsys):
+    assert cli.main(["doctor", "--shared", "/proc"]) == 1
+    assert [line.split()[:2] for line in capsys.readouterr().out.splitlines() if line.startswith("bad")] == [
+        ["bad", "locks"],
+        ["bad", "renames"],
+        ["bad", "fsync"],
+    ]
 
 
 def test_clean_removes_what_a_dead_run_left(capsys, monkeypatch, tmp_path):

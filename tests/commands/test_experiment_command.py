@@ -47,6 +47,7 @@ def test_list_names_every_experiment_with_its_question(capsys):
         assert f"{experiment.name}: {experiment.question}" in out
         assert f"{len(experiment.runs())} runs of {experiment.budget}" in out
     assert "12 runs of 1,200 seconds of processor time, at most 60,000 gradient steps" in out
+    assert "4 runs of 14,400 seconds of processor time, at most 500,000 gradient steps" in out
     assert "rainbow_4task+decisions_4, rainbow_4task+decisions_16" in out
     assert main(["experiment", "list", "--json"]) == 0
     rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]

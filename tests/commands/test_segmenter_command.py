@@ -1,6 +1,7 @@
 """gvz segmenter, as it is called."""
 
 import json
+import os
 import shutil
 
 import numpy as np
@@ -8,8 +9,10 @@ import pytest
 
 from gvz import cli
 from gvz.commands import segmenter
-from gvz.core.errors import EngineError
+from gvz.core import control_groups
+from gvz.core.errors import ConfigError, EngineError
 from gvz.env import DoomEnv
+from gvz.evaluation import segmentation
 from gvz.evaluation.segmentation import Labelled
 from gvz.segmentation import SEGMENTERS
 
@@ -37,6 +40,19 @@ def test_without_onnx_it_says_so_before_anything_is_played(refusal, tmp_path, mo
     monkeypatch.setattr(segmenter, "find_spec", lambda _: None)
     said = refusal("segmenter", "--scenario", "seek_and_kill", "--out", str(tmp_path / "n.onnx"))
     assert "pip install 'gvizdoom[segmenter]'" in said
+
+
+def test_under_a_quota_xla_has_no_thread_for_each_core_of_the_machine(refusal, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    monkeypatch.setattr(control_groups, "num_cores", lambda: 1)
+    monkeypatch.setenv("NPROC", "")
+    monkeypatch.delenv("NPROC")
+
+    def stopped(*_: object) -> None:
+        raise ConfigError(f"NPROC {os.environ.get('NPROC')}")
+
+    monkeypatch.setattr(segmentation, "training_tasks", stopped)
+    assert "NPROC 1" in refusal("segmenter", "--scenario", "seek_and_kill", "--out", str(tmp_path / "n.onnx"))
 
 
 @pytest.mark.engine

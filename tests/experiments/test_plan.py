@@ -81,10 +81,16 @@ def test_at_a_scale_that_takes_one_scenario_a_further_one_can_be_asked_for(tmp_p
     assert {run.scenario for run in plan.runs()} == {"defend_the_center", "seek_and_kill"}
 
 
-def test_a_plan_of_an_experiment_that_is_gone_is_named_with_its_file(tmp_path):
-    saved = {"schema": 2, "scale": 1.0, "experiments": {"gate_old": None, "gate_ammo": None}}
-    (tmp_path / "plan.json").write_text(json.dumps(saved))
-    with pytest.raises(ConfigError, match=r"plan\.json: unknown experiment 'gate_old'.*; change it there, or move"):
+@pytest.mark.parametrize(
+    ("experiments", "message"),
+    [
+        ({"gate_old": None, "gate_ammo": None}, "unknown experiment 'gate_old'"),
+        ({"gate_ammo": ["seek_and_kil"]}, "unknown scenario 'seek_and_kil'"),
+    ],
+)
+def test_a_plan_of_what_is_not_there_is_named_with_its_file(tmp_path, experiments, message):
+    (tmp_path / "plan.json").write_text(json.dumps({"schema": 2, "scale": 1.0, "experiments": experiments}))
+    with pytest.raises(ConfigError, match=rf"plan\.json: {message}.*; change it there, or move"):
         read_plan(tmp_path)
 
 

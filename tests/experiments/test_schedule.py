@@ -37,7 +37,8 @@ class Program:
         for step, code in (("first", self.first), ("second", self.second)):
             if code is not None and f"{step} done" not in done:
                 ending = f"\nopen({str(self.file)!r}, 'a').write('{step} done ')"
-                return Outlook(next=Command(step=step, arguments=("-c", code + ending), total=1), begun=True, text="")
+                command = Command(step=step, arguments=("-c", code + ending), total=1)
+                return Outlook(next=command, begun=True, text=f"no {step} part")
         return Outlook(next=None, begun=True, text="")
 
     def done_count(self, step: str) -> int:
@@ -98,7 +99,7 @@ def test_a_failure_sinks_no_other_job_and_is_named_with_its_log(tmp_path, capsys
     err = capsys.readouterr().err
     assert f"FAILED (first: exit code 3; log {tmp_path}/logs/bad/one.log): bad/one" in err
     assert "no luck today" in err
-    assert "it ended as if all were done, but" in err
+    assert "FAILED (first: it ended as if all were done, but it has no first part; log " in err
     assert "exit code 137" in err
     assert "3 jobs failed; the same command tries them again:" in err
     assert progress.job_state(tmp_path, "bad/one", done=False, begun=True) == "failed"

@@ -14,8 +14,6 @@ ALWAYS_TAKEN = {"decorate"}
 """text without classes is DECORATE text, too"""
 
 
-# where several arrays are damaged, orbax's reads of the others end after its loop has
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("name", TARGETS)
 def test_every_input_gives_a_named_error_or_a_right_answer(name: str, tmp_path: Path):
     target = make_target(name, tmp_path)

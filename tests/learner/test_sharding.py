@@ -57,6 +57,22 @@ def test_more_devices_than_there_are_are_refused_with_advice():
 
 
 @pytest.mark.parametrize(
+    ("error", "why"),
+    [
+        (RuntimeError("Unable to initialize backend 'cuda'\n..."), "Unable to initialize"),
+        (AssertionError(), "its package"),
+    ],
+)
+def test_devices_that_jax_does_not_find_are_an_error(monkeypatch, error, why):
+    def fail() -> None:
+        raise error
+
+    monkeypatch.setattr(jax, "local_devices", fail)
+    with pytest.raises(ConfigError, match=rf"^JAX_PLATFORMS=.*: JAX finds no such devices \({why}"):
+        sharding.devices(1)
+
+
+@pytest.mark.parametrize(
     ("devices", "changes", "message"),
     [
         (3, {}, r"want a divisor of actors\.num_actors times games_per_actor, which is 4: every device has an equal"),

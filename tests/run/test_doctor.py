@@ -67,6 +67,14 @@ def test_a_device_that_kills_the_process_is_bad(monkeypatch: pytest.MonkeyPatch)
     assert (finding.state, finding.found) == ("bad", "exit code -11: no message")
 
 
+def test_why_jax_fails_is_said(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("JAX_PLATFORMS", "abacus")
+    assert ": JAX_PLATFORMS=abacus: JAX finds no such devices (" in doctor.check_devices().found
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    monkeypatch.setattr(doctor, "_DEVICES", "import jax.numpy; jax.numpy.ones(2) + jax.numpy.ones(3)")
+    assert doctor.check_devices().found.startswith("exit code 1: TypeError: ")
+
+
 def test_one_that_does_not_answer_is_bad(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(doctor, "_TRY_TIMEOUT_S", 1)
     monkeypatch.setattr(doctor, "_DEVICES", "import time; time.sleep(60)")

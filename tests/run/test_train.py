@@ -20,7 +20,7 @@ from actors.config import ActorsConfig
 from benchmarks.last_parameters import main, write_last_parameters
 from gvz import launch
 from gvz.cluster.config import ClusterConfig
-from gvz.core import records
+from gvz.core import control_groups, records
 from gvz.core.durable import saved_steps
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError, ResumeError
@@ -118,15 +118,17 @@ def test_actors_find_the_networks_of_a_run_whose_directory_is_relative(tmp_path,
     assert segmenter_file("defend_the_center", env).is_file()
 
 
-def test_a_run_ends_when_its_processor_time_is_used_up_and_is_then_done_until_it_gets_more(tmp_path):
+def test_a_run_ends_when_its_processor_time_is_used_up_and_is_then_done_until_it_gets_more(tmp_path, capsys):
     limited = replace(DQN, max_processor_s=0.01)
     go_on(tmp_path, limited, 40)
     assert logged_updates(tmp_path) == [20], "it looks at its first row of metrics"
     (row,) = records.read(tmp_path / "metrics.jsonl")[0]
     assert row["run/processor_s"] >= 0.01
     assert [p.name for p in (tmp_path / "policies").iterdir()] == ["20"]
+    assert "s of processor time (--max-processor-s) used up: writing the last checkpoint" in capsys.readouterr().err
     go_on(tmp_path, limited, 40)
     assert logged_updates(tmp_path) == [20], "nothing is left to do"
+    assert "s of processor time (--max-processor-s) used up: no new gradient steps to save" in capsys.readouterr().err
     go_on(tmp_path, DQN, 40)
     assert logged_updates(tmp_path) == [20, 40]
     last = records.read(tmp_path / "metrics.jsonl")[0][-1]
@@ -347,7 +349,7 @@ def test_an_on_policy_run_learns_from_what_was_chosen_on_the_learners_device(tmp
 @pytest.mark.parametrize(("cores", "size"), [(1, "1"), (2, None)])
 def test_under_a_quota_xla_has_no_thread_for_each_core_of_the_machine(tmp_path, monkeypatch, cores, size):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
-    monkeypatch.setattr(launch, "num_cores", lambda: cores)
+    monkeypatch.setattr(control_groups, "num_cores", lambda: cores)
     monkeypatch.setenv("NPROC", "")
     monkeypatch.delenv("NPROC")
     found = []
