@@ -155,7 +155,7 @@ def read_plan(results: Path) -> Plan | None:
             scale=saved["scale"],
         )
     except (ConfigError, TaskError) as error:
-        raise ConfigError(f"{file}: {error}; change it there, or move the file aside") from error
+        raise ConfigError(f"{file}: {error}; mend it there, or move the file aside") from error
     except (ValueError, KeyError, TypeError, OSError, RecursionError) as error:
         raise ConfigError(f"{file} cannot be read: {error!r}; move it aside to make a new plan") from error
 

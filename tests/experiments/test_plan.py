@@ -90,7 +90,7 @@ def test_at_a_scale_that_takes_one_scenario_a_further_one_can_be_asked_for(tmp_p
 )
 def test_a_plan_of_what_is_not_there_is_named_with_its_file(tmp_path, experiments, message):
     (tmp_path / "plan.json").write_text(json.dumps({"schema": 2, "scale": 1.0, "experiments": experiments}))
-    with pytest.raises(ConfigError, match=rf"plan\.json: {message}.*; change it there, or move"):
+    with pytest.raises(ConfigError, match=rf"plan\.json: {message}.*; mend it there, or move"):
         read_plan(tmp_path)
 
 
