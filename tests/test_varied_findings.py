@@ -11,6 +11,7 @@ from tests.score_tables import (
     PAGE,
     ROOT,
     WORDS,
+    in_words,
     last_updates,
     mean_score,
     results_of,
@@ -163,3 +164,17 @@ def test_the_findings_say_what_a_network_gave_that_has_seen_varied_maps():
     assert f"{said} `default` has {of_default} instead of" in WORDS
     last = rows_of(folder / "metrics.jsonl.gz")[-1]
     assert f"with {last['num_updates']:,} gradient steps and 20 episodes a task" in WORDS
+
+
+def test_the_findings_say_what_the_networks_of_varied_maps_find():
+    unseen = json.loads((ROOT / "results" / "gates" / "segmenters" / "varied_networks.json").read_text())
+    steps = []
+    for name in SCENARIOS:
+        for called, key, directory in (("eight tasks", "eight_tasks", "."), ("varied maps", "varied", "varied")):
+            network = json.loads((ROOT / "gvz" / "segmenters" / directory / f"{name}.json").read_text())
+            gate = ", ".join(f"{found['enemy']:.2f}" for found in network["average_precision"].values())
+            of_unseen = unseen["average_precision"][f"{name}/varied"][key]["enemy"]
+            assert f"| {scenario_named(name).title} | {called} | {of_unseen:.2f} | {gate} |" in PAGE
+        steps.append(f"{network['gradient_steps']:,}")
+        assert (network["processor_s"] // 10, network["tints_and_patches"]) == (150, False)
+    assert f"made {in_words(steps)} gradient steps in the 1,500 seconds" in WORDS
