@@ -23,7 +23,7 @@ from gvz.cluster.config import ClusterConfig
 from gvz.core import control_groups, records
 from gvz.core.durable import saved_steps
 from gvz.core.env_config import EnvConfig
-from gvz.core.errors import ConfigError, ResumeError
+from gvz.core.errors import CheckpointError, ConfigError, ResumeError
 from gvz.core.stop import StopRequest
 from gvz.run import machine
 from gvz.run.config import CheckpointConfig, LogConfig, RunConfig
@@ -38,6 +38,7 @@ from learner.agents.configs.pqn import PQNConfig
 from learner.agents.configs.rainbow import RainbowConfig
 from learner.config import LearnerConfig, OnPolicyConfig, ReplayConfig
 from tests.e2e.command import arrays_of
+from tests.learner.test_checkpoint import forged
 from tests.tensorboard_events import read_events
 from tests.test_segmentation import write_network
 
@@ -182,6 +183,14 @@ def test_a_run_that_explores_by_epsilon_goes_on_bit_for_bit_between_two_publicat
     assert len({(row["lane"], row["task"]) for row in episodes}) > 2, "tasks of games change"
     assert logged_updates(tmp_path / "whole") == [20, 40, 60, 80]
     assert logged_updates(tmp_path / "cut") == [50, 60, 80]
+
+
+def test_a_host_state_that_no_run_can_go_on_from_is_named(tmp_path):
+    go_on(tmp_path, PLAIN, 4)
+    forged("host.msgpack", msgpack.packb({"records": {}}))(tmp_path / "checkpoints" / "4")
+    said = r"checkpoints/4: its host state is not one of a run \(KeyError\('counts'\)\); move it aside"
+    with pytest.raises(CheckpointError, match=said):
+        go_on(tmp_path, PLAIN, 8)
 
 
 def test_an_epsilon_may_be_a_number_of_jax_or_numpy(tmp_path):
