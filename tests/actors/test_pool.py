@@ -168,6 +168,7 @@ def test_closing_while_the_actors_start_leaves_nothing(tmp_path: Path):
 def test_more_games_than_records_can_name_are_refused(tmp_path: Path):
     with pytest.raises(ConfigError, match="got 98304 games, want at most 65536"):
         config(tmp_path, {}, num_actors=2**15, games_per_actor=3)
+    config(tmp_path, {}, tasks=("a", "b", "c", "d", "e"))  # fewer games than tasks, which they may draw
 
 
 @pytest.mark.parametrize(("asked", "games", "got"), [(256, 4, 256), (256, 6, 258), (8, 9, 18), (8, 4, 8)])

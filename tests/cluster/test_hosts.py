@@ -42,9 +42,11 @@ NUM_ACTORS = 4
 
 @pytest.fixture(scope="module")
 def nodes() -> Iterator[RayCluster]:
-    """A head without cores, and two nodes with two each. Games of this directory can be imported there."""
+    """A head without cores, and two nodes with two each. Games of this directory can be imported there. Ray waits half
+    a second, not five, for the end of a host that was stopped, before it sends SIGKILL.
+    """
     path = os.pathsep.join([str(ROOT), str(FAKE_GAMES)])
-    made = RayCluster(3, num_cores=2, PYTHONPATH=path)
+    made = RayCluster(3, num_cores=2, PYTHONPATH=path, RAY_kill_worker_timeout_milliseconds="500")
     yield made
     made.close()
 

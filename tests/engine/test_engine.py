@@ -226,19 +226,21 @@ def test_a_hung_engine_is_killed_and_raises(call: str):
 
 def test_an_engine_that_was_stopped_together_with_its_client_lives():
     code = (
-        "import dataclasses, time; engine = Engine(dataclasses.replace(config, step_timeout_s=1.0))\n"
-        "engine.new_episode(1); print(engine.pid, flush=True); end = time.monotonic() + 6\n"
-        "while time.monotonic() < end: engine.step([], 1)\n"
-        "engine.close()"
+        "import dataclasses, select, sys; engine = Engine(dataclasses.replace(config, step_timeout_s=1.0))\n"
+        "engine.new_episode(1); print(engine.pid, flush=True)\n"
+        "while not select.select([sys.stdin], [], [], 0)[0]: engine.step([], 1)\n"
+        "engine.step([], 1); engine.close()"
     )
-    with subprocess.Popen([sys.executable, "-c", HEAD + code], stdout=subprocess.PIPE, text=True) as client:
+    command = [sys.executable, "-c", HEAD + code]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as client:
         assert client.stdout is not None
         pid = int(client.stdout.readline())
-        for number in (signal.SIGSTOP, signal.SIGCONT):  # as a container is paused
+        for number, pause_s in ((signal.SIGSTOP, 1.5), (signal.SIGCONT, 0.0)):  # as a container is paused
             os.kill(client.pid, number)
             os.kill(pid, number)
-            time.sleep(2.5)
-        assert client.wait(60) == 0
+            time.sleep(pause_s)
+        client.communicate(timeout=60)  # closes its input
+        assert client.returncode == 0
 
 
 def test_the_terminals_ctrl_c_is_not_for_the_engine(engine: Engine):

@@ -3,28 +3,36 @@
 import dataclasses
 import json
 import re
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from gvz.experiments import inventory as progress
-from gvz.experiments.base import experiments
+from gvz.experiments.base import TrainingRun, experiments
 from gvz.experiments.jobs import PlayerJob, RunJob, training_flags
 from gvz.experiments.plan import Evaluation
 from gvz.experiments.scale import scaled
 from gvz.launch import parse
+from gvz.run.config import RunConfig
 from gvz.run.config_files import config_to_dict, load_config, with_settings
 
 ROOT = Path(__file__).parents[2]
 EVALUATION = Evaluation(tasks=("defend_the_center/default",), episodes=2)
 
 
+@cache
+def last_run(name: str, scale: float) -> tuple[TrainingRun, RunConfig]:
+    """An experiment's last run, and its flags as the trainer reads them."""
+    run = scaled(experiments()[name], scale).runs()[-1]
+    return run, parse(training_flags(run, scale)).run
+
+
 @pytest.mark.parametrize("scale", [1, 0.1, 0.001])
 @pytest.mark.parametrize("name", sorted(experiments()))
 def test_the_trainer_understands_every_experiment_at_every_scale(name, scale):
-    run = scaled(experiments()[name], scale).runs()[-1]
-    config = parse(training_flags(run, scale)).run
+    run, config = last_run(name, scale)
     assert tuple(task.id for task in config.table.tasks) == run.tasks
     assert (config.seed, config.learner.total_updates) == (run.seed, run.total_updates)
     assert config.max_processor_s == run.max_processor_s
@@ -39,12 +47,12 @@ def test_the_trainer_understands_every_experiment_at_every_scale(name, scale):
 @pytest.mark.parametrize("name", sorted(experiments()))
 def test_a_trained_run_with_other_settings_is_known(name, scale, tmp_path, monkeypatch):
     monkeypatch.setattr(progress, "run_progress", lambda *_: SimpleNamespace(trained=True))
-    run = scaled(experiments()[name], scale).runs()[-1]
+    run, config = last_run(name, scale)
     job = RunJob(results=tmp_path, run=run, evaluation=EVALUATION, scale=scale)
     assert job.other_settings() == [], "there is no run"
     file = progress.run_directory(tmp_path, run) / "config.json"
     (file.parent / "segmenters").mkdir(parents=True)  # as a run on segmented frames has it
-    file.write_text(json.dumps(config_to_dict(parse(training_flags(run, scale)).run)))
+    file.write_text(json.dumps(config_to_dict(config)))
     assert job.other_settings() == []
     saved = json.loads(file.read_text())
     saved["config"]["learner"]["learning_rate"] = 0.123

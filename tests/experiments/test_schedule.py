@@ -13,7 +13,7 @@ import pytest
 from gvz.core import records
 from gvz.core.errors import ConfigError, GvzError
 from gvz.experiments import inventory as progress
-from gvz.experiments import places
+from gvz.experiments import places, schedule
 from gvz.experiments.jobs import Command, Outlook
 from gvz.experiments.places import Machine, Slot, gpus, make_slots
 from gvz.experiments.schedule import run_jobs
@@ -21,6 +21,12 @@ from tests.waiting import wait_until
 
 CORES = tuple(sorted(os.sched_getaffinity(0)))
 SLOT = Slot(cores=CORES, environment={})
+
+
+@pytest.fixture(autouse=True)
+def quick_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Jobs of tests last less than the half second between two looks at them."""
+    monkeypatch.setattr(schedule, "POLL_S", 0.05)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,11 +183,11 @@ QUEUE = """
 import sys
 from pathlib import Path
 sys.path.insert(0, {directory!r})
-from test_schedule import SLOT, Machine, Program
-from gvz.experiments.schedule import run_jobs
+from test_schedule import SLOT, Machine, Program, schedule
+schedule.POLL_S = 0.05
 code = "import os, pathlib, time; pathlib.Path({results!r}, 'played').open('a').write('%s '); time.sleep(0.3)"
 jobs = [Program(id=f"job{{n}}", results=Path({results!r}), first=code % n, second="pass") for n in range(12)]
-sys.exit(run_jobs(jobs, Machine([SLOT])))
+sys.exit(schedule.run_jobs(jobs, Machine([SLOT])))
 """
 
 

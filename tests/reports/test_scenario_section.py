@@ -2,14 +2,26 @@
 
 import json
 
+import pytest
+
 from gvz.evaluation.statistics import SOLVED_EPISODES
 from gvz.experiments.plan import Plan
+from gvz.reports import draw
+from gvz.reports.document import Figure
 from gvz.reports.results import read_results
 from gvz.reports.scenario_section import scenario_sections
 from gvz.tasks import named_tasks
 from tests.reports.conftest import evaluation_row, write_rows
 
 DEFAULT, BLUE, RED = named_tasks("seek_and_kill")[:3]
+
+
+@pytest.fixture
+def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are drawn, but not written as three files each, which takes most of a section's time."""
+    monkeypatch.setattr(
+        draw, "_written", lambda _picture, _out, id, caption, **_: Figure(id=id, caption=caption, svg=b"")
+    )
 
 
 def test_own_kills_stand_below_the_scores_by_task_and_by_level(tmp_path):
@@ -33,6 +45,7 @@ def test_own_kills_stand_below_the_scores_by_task_and_by_level(tmp_path):
     ]
 
 
+@pytest.mark.usefixtures("no_files")
 def test_levels_are_means_of_named_tasks_alone(tmp_path):
     """Drawn and graded tasks have a level, too. An agent's further tasks change nothing of another's levels."""
     named = [task.id for task in named_tasks("dodge_projectiles")]
@@ -60,6 +73,7 @@ def test_own_kills_by_level_are_of_named_tasks_alone(tmp_path):
     assert last == ["mean of 2 tasks", "1", "6.0 [6.0, 6.0]", "6.0 [6.0, 6.0]"]
 
 
+@pytest.mark.usefixtures("no_files")
 def test_a_task_is_solved_where_the_newest_checkpoint_of_every_seed_survived(tmp_path):
     """Final are the last two of five. An older one changes nothing, whether it survived or not."""
     survivors = {"gore": {(1, 5), (2, 5)}, "default": {(1, 5)}, "stone_wall": {(1, 4), (2, 4)}}
@@ -90,6 +104,7 @@ def test_a_task_is_solved_where_the_newest_checkpoint_of_every_seed_survived(tmp
     assert {row[0].text for row in tasks.rows if row[2].note == "solved"} == {"gore"}
 
 
+@pytest.mark.usefixtures("no_files")
 def test_the_gap_of_an_agent_is_shown_in_each_of_its_scenarios(tmp_path, experiments_writer):
     """It has a run in each scenario, all of one name."""
     scenarios = ("defend_the_center", "seek_and_kill")
@@ -101,6 +116,7 @@ def test_the_gap_of_an_agent_is_shown_in_each_of_its_scenarios(tmp_path, experim
         assert [cell.text.split()[0] for cell in cells] == ["ppo_segmented", "20.0", "20.0"]
 
 
+@pytest.mark.usefixtures("no_files")
 def test_players_of_two_profiles_are_two_and_agents_keep_their_gap(tmp_path, experiments_writer, monkeypatch):
     plan = Plan.of("general_on_policy", scale=0.01, scenarios=("seek_and_kill",))
     experiments_writer(tmp_path, plan, lambda played: 70.0 if played.task in played.run.tasks else 50.0)

@@ -1,5 +1,7 @@
 """A run directory and the processes that use it one after another, or at once."""
 
+import json
+
 import pytest
 
 from gvz.core import records
@@ -71,6 +73,16 @@ def test_a_directory_that_holds_something_else_is_not_made_a_run(tmp_path, capsy
         ConfigError, match=r"--run-dir: .* holds segmenters, and no run \(no config\.json\); want an empty"
     ):
         refuse_other_contents(tmp_path)
+
+
+def test_fresh_begins_a_run_with_other_settings_beside_the_old_one(tmp_path, monkeypatch):
+    monkeypatch.setattr("gvz.run.train.train", lambda config, run, _: run.write_config(config) or 0)
+    path = tmp_path / "run"
+    for flags, code in (([], 0), (["--seed", "7"], 2), (["--seed", "7", "--fresh"], 0)):
+        assert main(["--config", "rainbow_quick", "--run-dir", str(path), *flags]) == code
+    (old,) = set(tmp_path.iterdir()) - {path}
+    seeds = [json.loads((one / "config.json").read_text())["config"]["seed"] for one in (old, path)]
+    assert seeds == [1111, 7]
 
 
 def test_links_to_another_disk_and_what_an_earlier_start_left_are_no_other_contents(tmp_path):

@@ -23,7 +23,7 @@ from gvz.cluster.config import ClusterConfig
 from gvz.core import control_groups, records
 from gvz.core.durable import saved_steps
 from gvz.core.env_config import EnvConfig
-from gvz.core.errors import ConfigError, ResumeError
+from gvz.core.errors import CheckpointError, ConfigError, ResumeError
 from gvz.core.stop import StopRequest
 from gvz.run import machine
 from gvz.run.config import CheckpointConfig, LogConfig, RunConfig
@@ -38,6 +38,7 @@ from learner.agents.configs.pqn import PQNConfig
 from learner.agents.configs.rainbow import RainbowConfig
 from learner.config import LearnerConfig, OnPolicyConfig, ReplayConfig
 from tests.e2e.command import arrays_of
+from tests.learner.test_checkpoint import forged
 from tests.tensorboard_events import read_events
 from tests.test_segmentation import write_network
 
@@ -60,6 +61,8 @@ DQN = RunConfig(
     learner=LearnerConfig(warmup_steps=60, env_steps_per_update=2.0, batch_size=8, publish_period_updates=100),
     log=LogConfig(period_updates=20, tensorboard=False),
 )
+PLAIN = replace(DQN, tasks=("defend_the_center/default",))
+"""without fuzzy enemies, for which each episode starts an engine"""
 
 
 def go_on(path: Path, config: RunConfig, total_updates: int) -> None:
@@ -72,7 +75,7 @@ def go_on(path: Path, config: RunConfig, total_updates: int) -> None:
 def test_a_run_keeps_the_network_of_its_segmented_frames_and_goes_on_with_it(tmp_path):
     network, path = write_network(tmp_path / "fresh.onnx"), tmp_path / "run"
     env = EnvConfig(frames="segmented", segmenter=str(network), frame_height=24, frame_width=32)
-    config = replace(DQN, env=env, learner=replace(DQN.learner, average_ema=0.9))
+    config = replace(PLAIN, env=env, learner=replace(PLAIN.learner, average_ema=0.9))
     first = network.read_bytes()
     go_on(path, config, 20)
     network.write_text("no network")
@@ -119,7 +122,7 @@ def test_actors_find_the_networks_of_a_run_whose_directory_is_relative(tmp_path,
 
 
 def test_a_run_ends_when_its_processor_time_is_used_up_and_is_then_done_until_it_gets_more(tmp_path, capsys):
-    limited = replace(DQN, max_processor_s=0.01)
+    limited = replace(PLAIN, max_processor_s=0.01)
     go_on(tmp_path, limited, 40)
     assert logged_updates(tmp_path) == [20], "it looks at its first row of metrics"
     (row,) = records.read(tmp_path / "metrics.jsonl")[0]
@@ -129,7 +132,7 @@ def test_a_run_ends_when_its_processor_time_is_used_up_and_is_then_done_until_it
     go_on(tmp_path, limited, 40)
     assert logged_updates(tmp_path) == [20], "nothing is left to do"
     assert "s of processor time (--max-processor-s) used up: no new gradient steps to save" in capsys.readouterr().err
-    go_on(tmp_path, DQN, 40)
+    go_on(tmp_path, PLAIN, 40)
     assert logged_updates(tmp_path) == [20, 40]
     last = records.read(tmp_path / "metrics.jsonl")[0][-1]
     assert last["run/processor_s"] > row["run/processor_s"], "the time of all starts together"
@@ -138,7 +141,7 @@ def test_a_run_ends_when_its_processor_time_is_used_up_and_is_then_done_until_it
 def test_a_run_has_used_up_its_processor_time_when_its_last_row_says_so(tmp_path, monkeypatch):
     clock = itertools.count(0.0)
     monkeypatch.setattr(machine, "processor_s", lambda: next(clock))  # a second passes between two looks
-    config = replace(DQN, checkpoint=CheckpointConfig(period_updates=20), max_processor_s=1.5)
+    config = replace(PLAIN, checkpoint=CheckpointConfig(period_updates=20), max_processor_s=1.5)
     file = tmp_path / "metrics.jsonl"
     go_on(tmp_path, config, 60)
     assert used_s(file) == [(20, 1.0), (40, 2.0)], "the checkpoint at 20 has the time of its row"
@@ -164,11 +167,9 @@ def logged_updates(path: Path) -> list[int]:
     return [row["num_updates"] for row in rows]
 
 
-@pytest.mark.parametrize(("curriculum", "games"), [("fixed", 2), ("uniform", 2), ("uniform", 1)])
-def test_a_run_that_explores_by_epsilon_goes_on_bit_for_bit_between_two_publications(tmp_path, curriculum, games):
+def test_a_run_that_explores_by_epsilon_goes_on_bit_for_bit_between_two_publications(tmp_path):
     """The cut lies after the last publication and in a fuzzy enemies' episode that is not its game's first."""
-    actors = replace(DQN.actors, games_per_actor=games)
-    config = replace(DQN, curriculum=CurriculumConfig(kind=curriculum), actors=actors)
+    config = replace(DQN, curriculum=CurriculumConfig(kind="uniform"))
     go_on(tmp_path / "whole", config, 80)
     rarely = replace(config, log=replace(DQN.log, period_updates=1_000))
     go_on(tmp_path / "cut", rarely, 50)
@@ -179,10 +180,17 @@ def test_a_run_that_explores_by_epsilon_goes_on_bit_for_bit_between_two_publicat
     assert [name for name in whole if not np.array_equal(whole[name], cut[name])] == []
     assert (tmp_path / "whole" / "episodes.jsonl").read_bytes() == (tmp_path / "cut" / "episodes.jsonl").read_bytes()
     episodes, _ = records.read(tmp_path / "whole" / "episodes.jsonl")
-    tasks_of_lanes = {(row["lane"], row["task"]) for row in episodes}
-    assert (len(tasks_of_lanes) > games) == (curriculum == "uniform")
+    assert len({(row["lane"], row["task"]) for row in episodes}) > 2, "tasks of games change"
     assert logged_updates(tmp_path / "whole") == [20, 40, 60, 80]
     assert logged_updates(tmp_path / "cut") == [50, 60, 80]
+
+
+def test_a_host_state_that_no_run_can_go_on_from_is_named(tmp_path):
+    go_on(tmp_path, PLAIN, 4)
+    forged("host.msgpack", msgpack.packb({"records": {}}))(tmp_path / "checkpoints" / "4")
+    said = r"checkpoints/4: its host state is not one of a run \(KeyError\('counts'\)\); move it aside"
+    with pytest.raises(CheckpointError, match=said):
+        go_on(tmp_path, PLAIN, 8)
 
 
 def test_an_epsilon_may_be_a_number_of_jax_or_numpy(tmp_path):
@@ -192,7 +200,7 @@ def test_an_epsilon_may_be_a_number_of_jax_or_numpy(tmp_path):
             return optax.linear_schedule(1.0, 0.0, 100)(env_steps)  # pyright: ignore
 
     agent = Scheduled(conv_channels=(4,), conv_kernels=(8,), conv_strides=(4,), hidden_units=16)
-    go_on(tmp_path, replace(DQN, agent=agent), 4)
+    go_on(tmp_path, replace(PLAIN, agent=agent), 4)
     assert saved_steps(tmp_path / "checkpoints") == [4]
 
 
@@ -204,7 +212,7 @@ def test_an_epsilon_that_is_no_probability_ends_a_run_which_is_saved_first(tmp_p
         def epsilon(self, env_steps: int) -> float:
             return max(smallest, 1.0 - env_steps / 100)
 
-    config = replace(DQN, agent=Falling(conv_channels=(4,), conv_kernels=(8,), conv_strides=(4,), hidden_units=16))
+    config = replace(PLAIN, agent=Falling(conv_channels=(4,), conv_kernels=(8,), conv_strides=(4,), hidden_units=16))
     said = r"agent\.name: the `epsilon` of 'dqn' gives -\d\.\d+ after \d+ decisions of the run; want 0\.\.1"
     with pytest.raises(ConfigError, match=said):
         go_on(tmp_path, config, 120)
@@ -231,6 +239,8 @@ def test_a_run_goes_on_bit_for_bit_within_a_stretch_of_noise(tmp_path):
     whole, cut = (arrays_of(tmp_path / name / "checkpoints" / "80") for name in ("whole", "cut"))
     assert [name for name in whole if not np.array_equal(whole[name], cut[name])] == []
     assert (tmp_path / "whole" / "episodes.jsonl").read_bytes() == (tmp_path / "cut" / "episodes.jsonl").read_bytes()
+    episodes, _ = records.read(tmp_path / "whole" / "episodes.jsonl")
+    assert len({(row["lane"], row["task"]) for row in episodes}) == 2, "games keep their tasks"
     assert len(np.unique(whole["['replay'].store.action"])) > 1
     assert 0 < whole["['replay'].store.sight"].mean() < 1, "the loss of sight had something to learn from"
 
@@ -292,7 +302,7 @@ def test_last_parameters_are_of_a_run_that_keeps_an_average(tmp_path, capsys):
 
 def test_tensorboard_shows_the_rows_of_the_records_after_every_kind_of_stop(tmp_path):
     """A stop between two rows, whose last row is set aside, and one at a row, which stays."""
-    config = replace(DQN, log=replace(DQN.log, tensorboard=True))
+    config = replace(PLAIN, log=replace(PLAIN.log, tensorboard=True))
     for updates in (50, 80, 100):
         go_on(tmp_path, config, updates)
     shown: set[int] = set()
@@ -308,12 +318,12 @@ def test_a_run_says_whether_its_end_has_anything_to_save(tmp_path, capsys):
     stopped = StopRequest()
     stopped.signal = signal.SIGINT
     with RunDir(tmp_path) as run:
-        assert train(DQN, run, stopped) == 130
+        assert train(PLAIN, run, stopped) == 130
     assert "stopping: no new gradient steps to save" in capsys.readouterr().err
     assert list((tmp_path / "checkpoints").iterdir()) == []
-    go_on(tmp_path, DQN, 20)
+    go_on(tmp_path, PLAIN, 20)
     assert "done: writing the last checkpoint" in capsys.readouterr().err
-    go_on(tmp_path, DQN, 20)
+    go_on(tmp_path, PLAIN, 20)
     assert "done: no new gradient steps to save" in capsys.readouterr().err
 
 
@@ -325,7 +335,7 @@ def test_a_signal_in_the_last_save_of_a_complete_run_leaves_it_complete(tmp_path
         save_last(self, *arguments)
 
     monkeypatch.setattr(Saver, "save_last", interrupted)
-    config = replace(DQN, learner=replace(DQN.learner, total_updates=20))
+    config = replace(PLAIN, learner=replace(PLAIN.learner, total_updates=20))
     with RunDir(tmp_path) as run, StopRequest() as stop:
         assert train(config, run, stop) == 0
         assert stop.requested
