@@ -85,7 +85,7 @@ def test_a_run_by_the_thesis_recipe_acts_at_random_in_warm_up_and_by_its_agent_f
     assert stats.chisquare(warm_up).pvalue > 0.001  # 0.13, the same on every machine: the keys draw integers
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_signal_saves_and_ends_everything(tmp_path, number, code):
     run = tmp_path / "run"
     process = launch(run, "--learner.total-updates", "1000000")
