@@ -145,6 +145,20 @@ def test_a_process_that_goes_is_known_at_once_and_one_that_is_done_may_go():
         groups[1]._link.check()
 
 
+def test_a_process_that_goes_in_the_middle_of_a_message_is_the_one_that_is_named():
+    address = "127.0.0.1", free_port("127.0.0.1")
+    the_relay = Relay(address, 2)
+    with socket.create_connection(address) as other:
+        other.sendall(relay.encode({"kind": "hello", "from": 1, "number": 0, "value": {}}))
+        first = link.Link(address, 0, 2, {})
+        other.sendall(b'{"kind": "propose", "fr')
+        other.shutdown(socket.SHUT_WR)
+        with pytest.raises(GroupError, match="learner process 1 of 2 is gone"):
+            first.wait_for_failure(30)
+    first.close()
+    the_relay.close()
+
+
 def test_a_silent_process_counts_as_gone(monkeypatch):
     monkeypatch.setattr(link, "BEAT_PERIOD_S", 0.1)
     monkeypatch.setattr(link, "SILENCE_TIMEOUT_S", 2.0)
@@ -181,6 +195,16 @@ def test_processes_that_differ_are_refused_on_both_sides_by_the_name_of_what_dif
     until_no_link_is_open()
     for group in joined(2, name="another"):
         group._opened.close()
+
+
+def test_processes_of_different_source_files_are_refused(monkeypatch):
+    """Two commits can have one version, and each process works out the new parameters by itself."""
+    digests = iter(("1a", "2b"))
+    monkeypatch.setattr("gvz.run.group.source_digest", lambda: next(digests))
+    found = joined(2)
+    assert {type(error) for error in found} == {ConfigError}
+    assert all("group: the version of the source files is" in str(error) for error in found)
+    until_no_link_is_open()
 
 
 def test_two_processes_with_one_number_and_strangers_are_turned_away(monkeypatch):
