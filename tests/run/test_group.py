@@ -1,8 +1,6 @@
 """Processes that act as one, here as threads without devices: what is agreed, refused, and noticed."""
 
 import contextlib
-import errno
-import os
 import socket
 import threading
 import time
@@ -22,7 +20,7 @@ from gvz.run.config import CheckpointConfig
 from gvz.run.config_files import config_from_dict, config_to_dict, load_config
 from gvz.run.group import Several
 from gvz.run.group_config import GroupConfig
-from gvz.run.relay import Forward, Relay, free_port
+from gvz.run.relay import Relay, free_port
 from learner.checkpoint import Restored
 from tests.waiting import wait_until
 
@@ -145,20 +143,6 @@ def test_a_process_that_goes_is_known_at_once_and_one_that_is_done_may_go():
         groups[1]._link.check()
 
 
-def test_a_process_that_goes_in_the_middle_of_a_message_is_the_one_that_is_named():
-    address = "127.0.0.1", free_port("127.0.0.1")
-    the_relay = Relay(address, 2)
-    with socket.create_connection(address) as other:
-        other.sendall(relay.encode({"kind": "hello", "from": 1, "number": 0, "value": {}}))
-        first = link.Link(address, 0, 2, {})
-        other.sendall(b'{"kind": "propose", "fr')
-        other.shutdown(socket.SHUT_WR)
-        with pytest.raises(GroupError, match="learner process 1 of 2 is gone"):
-            first.wait_for_failure(30)
-    first.close()
-    the_relay.close()
-
-
 def test_a_silent_process_counts_as_gone(monkeypatch):
     monkeypatch.setattr(link, "BEAT_PERIOD_S", 0.1)
     monkeypatch.setattr(link, "SILENCE_TIMEOUT_S", 2.0)
@@ -260,48 +244,6 @@ def test_a_process_that_cannot_reach_jax_in_process_0_says_so(monkeypatch):
     assert isinstance(second, WaitTimeoutError)
     assert str(second).startswith("group: waited 0 s for JAX's coordinator at 127.0.0.1:")
     assert str(second).endswith("(Connection refused); let learner processes reach all ports of each other's hosts")
-
-
-def test_jax_in_process_0_may_come_late():
-    address = "127.0.0.1", free_port("127.0.0.1")
-    waiting = threading.Thread(target=relay.wait_for_listener, args=(address, 30.0))
-    waiting.start()
-    waiting.join(0.3)
-    assert waiting.is_alive()
-    with socket.create_server(address):
-        waiting.join(30)
-    assert not waiting.is_alive()
-
-
-@pytest.mark.parametrize("number", [errno.ECONNABORTED, errno.EMFILE])
-def test_a_connection_that_cannot_be_taken_does_not_keep_later_ones_out(number, monkeypatch):
-    accept, failures = socket.socket.accept, iter([OSError(number, os.strerror(number))])
-
-    def first_fails(server: socket.socket) -> tuple[socket.socket, Any]:
-        for failure in failures:
-            raise failure
-        return accept(server)
-
-    monkeypatch.setattr(socket.socket, "accept", first_fails)
-    address = "127.0.0.1", free_port("127.0.0.1")
-    the_relay = Relay(address, 1)
-    link.Link(address, 0, 1, {}).close()
-    assert next(failures, None) is None
-    the_relay.close()
-
-
-def test_a_forwarded_connection_outlives_the_other_end():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        near = socket.create_connection(("127.0.0.1", Forward(server.getsockname()[:2]).port))
-        far, _ = server.accept()
-        near.sendall(b"out")
-        far.sendall(b"in")
-        assert (far.recv(3), near.recv(2)) == (b"out", b"in")
-        far.close()
-        near.settimeout(0.3)
-        with pytest.raises(TimeoutError):
-            near.recv(1)
-        near.close()
 
 
 @pytest.mark.parametrize(
