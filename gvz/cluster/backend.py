@@ -75,7 +75,7 @@ class Backend(Protocol):
         ...
 
     def wait(self, calls: Sequence[Call], timeout_s: float) -> list[Call]:
-        """Those that have ended, well or not; waits for one if there is none."""
+        """Those that have ended, well or not; may wait for others until the time is over."""
         ...
 
     def result(self, call: Call) -> Any:

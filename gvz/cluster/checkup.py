@@ -9,7 +9,7 @@ from pathlib import Path
 
 from gvz.cluster.nodes import Node, check_nodes, on_nodes
 from gvz.cluster.ray_jobs import JOB_SHM_BYTES
-from gvz.cluster.session import Session, connect, token_file
+from gvz.cluster.session import Session, connect, parse_address, token_file
 from gvz.core.errors import GvzError
 from gvz.run import shared_directory
 from gvz.run.doctor import Finding
@@ -85,8 +85,7 @@ def _ports(session: Session) -> Generator[Finding]:
     """Every node's way to the head, and to the ports of every other node's daemon."""
     import ray
 
-    host, _, port = session.address.rpartition(":")
-    wanted = [(host, int(port), "the head")]
+    wanted = [(*parse_address(session.address), "the head")]
     for node in ray.nodes():
         if node["Alive"]:
             ip = node["NodeManagerAddress"]

@@ -35,6 +35,7 @@ _LOOK_AGAIN_S = 1.0
 _LONGEST_PAUSE_S = 1.0
 """most of a round that counts as a host's silence"""
 _KEPT_VERSIONS = 1000
+_Answer = Callable[[SupervisedHost, Incarnation, Any], None]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -43,7 +44,7 @@ class _Asked:
 
     host: SupervisedHost
     life: Incarnation
-    answer: Callable[[SupervisedHost, Incarnation, Any], None]
+    answer: _Answer
 
 
 class Dispatcher:
@@ -59,7 +60,7 @@ class Dispatcher:
         self._forced: set[str] = set()  # machines on which a host was ended by force
         self._clock = AwakeClock(_LONGEST_PAUSE_S)
         self._enough_s = 0.0  # when enough hosts played last
-        self._last_failure = "none has been started"
+        self._last_failure = ""
         self._published: tuple[ArrayLike, ParamsHeader] | None = None
         self._published_s: dict[int, float] = {}
         self._sent: tuple[Any, ParamsHeader] | None = None
@@ -81,9 +82,13 @@ class Dispatcher:
                 break
             self._round()
         if (playing := self.num_playing) < self._config.min_hosts:
+            why = f"the last to fail: {self._last_failure}"
+            if not self._last_failure:
+                silent = (life.name for host in self._hosts if (life := host.incarnation) and life.playing_s is None)
+                why = f"no answer yet from {', '.join(silent)}; do other jobs hold the cores there?"
             raise ConfigError(
                 f"cluster.hosts: {playing} of {len(self._hosts)} hosts came to play within {timeout_s:.0f} s, want "
-                f"at least cluster.min_hosts {self._config.min_hosts}; the last to fail: {self._last_failure}"
+                f"at least cluster.min_hosts {self._config.min_hosts}; {why}"
             )
         self._greeting = False
 
@@ -222,11 +227,10 @@ class Dispatcher:
             while host.free_credits > 0:
                 with self.inbox.changed:
                     assigned, host.assigned = host.assigned, []
-                if not life.asked:
+                if not life.num_asked:
                     life.heard_s = self._clock.now_s
-                call = life.remote.next_batch(assigned)
-                life.asked.append(call)
-                self._call(host, life, call, self._take)
+                self._call(host, life, life.remote.next_batch(assigned), self._take)
+                life.num_asked += 1
             if self._sent is not None and not life.taking_params and life.params_version < self._sent[1].version:
                 life.taking_params, life.params_version = True, self._sent[1].version
                 life.params_asked_s = self._clock.now_s
@@ -281,7 +285,7 @@ class Dispatcher:
                 self._discard(host, "host_answer", str(error))
 
     def _take(self, host: SupervisedHost, life: Incarnation, answer: Any) -> None:
-        life.asked.popleft()
+        life.num_asked -= 1
         came = unpack(answer, host.pool.record_dtype, host.pool.frame_shape, self._config.batch_records)
         with self.inbox.changed:
             batches = host.in_order(came, self._run_id)
@@ -319,7 +323,7 @@ class Dispatcher:
             if silent_s > (start_s := host.pool.actors.start_timeout_s):
                 what = f"gave no answer for {silent_s:.0f} s (actors.start_timeout_s {start_s:g}) while it was started"
                 self._discard(host, "host_start", what)
-        elif life.asked and silent_s > limit_s:
+        elif life.num_asked and silent_s > limit_s:
             what = f"gave no sign of life for {silent_s:.1f} s (cluster.silence_timeout_s {limit_s:g})"
             self._discard(host, "host_silent", what)
         elif life.taking_params and taking_s > limit_s:
@@ -374,13 +378,7 @@ class Dispatcher:
         with self.inbox.changed:
             self.inbox.messages.append(Fault(actor=-1, lane=None, kind=kind, message=message, traceback=details))
 
-    def _call(
-        self,
-        host: SupervisedHost,
-        life: Incarnation,
-        call: Call,
-        answer: Callable[[SupervisedHost, Incarnation, Any], None],
-    ) -> None:
+    def _call(self, host: SupervisedHost, life: Incarnation, call: Call, answer: _Answer) -> None:
         self._calls[call] = _Asked(host=host, life=life, answer=answer)
 
     def _ended_well(self, calls: Sequence[Call], timeout_s: float) -> list[Call]:

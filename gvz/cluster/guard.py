@@ -10,12 +10,12 @@ import subprocess
 import sys
 from types import FrameType
 
-PASSED_ON = {signal.SIGINT, signal.SIGTERM}
+from gvz.core.stop import SIGNALS
 
 
 def main() -> int:
     """Starts the job and waits for its end."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, PASSED_ON)  # until there is somebody to pass them on to
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # until there is somebody to pass them on to
     command = [sys.executable, "-P", "-m", "gvz.experiments.child", str(os.getpid()), *sys.argv[1:]]
     job = subprocess.Popen(command, close_fds=False)  # the locks of its cores
 
@@ -23,9 +23,9 @@ def main() -> int:
         del frame
         job.send_signal(number)
 
-    for number in PASSED_ON:
+    for number in SIGNALS:
         signal.signal(number, pass_on)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, PASSED_ON)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     code = job.wait()
     return 128 - code if code < 0 else code
 

@@ -1,7 +1,7 @@
 """A host: the ordinary pool of actor processes on a machine that is not the learner's. It knows nothing of Ray.
 
 One thread, the pump, owns the pool for its whole life, because actors end with the thread that started them. It watches
-the actors, gathers their records and keeps one packed batch ready. It takes nothing out of the rings while that batch
+the actors, gathers their records and keeps those of one batch ready. It takes nothing out of the rings while that batch
 waits, so full rings hold the actors back, as on one machine. The other methods are called by threads of their own.
 """
 

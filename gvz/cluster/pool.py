@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import signal
 import time
 from typing import Any
 
@@ -144,9 +143,7 @@ def cluster_pool(config: PoolConfig, cluster: ClusterConfig, state: dict[str, An
     assert cluster.address is not None
     session = contextlib.ExitStack()
     try:
-        ours = signal.getsignal(signal.SIGTERM)
         session.enter_context(connect(cluster.address, public=cluster.public))
-        signal.signal(signal.SIGTERM, ours)  # Ray's handler would end the learner without a checkpoint
         from gvz.cluster.ray_hosts import RayBackend
 
         return ClusterPool(config, cluster, RayBackend(session), state)

@@ -11,7 +11,7 @@ from typing import Any
 
 from gvz.cluster.job_host import JobHost
 from gvz.cluster.nodes import on_nodes
-from gvz.cluster.session import connect
+from gvz.cluster.session import connect, parse_address
 from gvz.core.errors import ConfigError, GvzError
 from gvz.experiments.jobs import Command
 from gvz.experiments.places import memory_share
@@ -213,9 +213,8 @@ class ClusterPlaces:
     def _look(self) -> None:
         """Which nodes are alive. Ray would end this process if its head is gone, so that is asked first."""
         self._looked_s = now_s = time.monotonic()
-        host, _, port = self._address.rpartition(":")
         try:
-            socket.create_connection((host, int(port)), timeout=HEAD_TIMEOUT_S).close()
+            socket.create_connection(parse_address(self._address), timeout=HEAD_TIMEOUT_S).close()
         except OSError as error:
             if now_s - self._answered_s > HEAD_TIMEOUT_S:
                 raise GvzError(

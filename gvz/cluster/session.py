@@ -7,6 +7,7 @@ import logging
 import os
 import platform
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -41,7 +42,7 @@ class Session:
     """An open connection."""
 
     address: str
-    """IP:PORT of the head"""
+    """IP:PORT of the head, [IP]:PORT of IPv6"""
     nodes: tuple[Node, ...]
     """those that were alive when it opened, the head first"""
 
@@ -49,6 +50,7 @@ class Session:
 @contextlib.contextmanager
 def connect(address: str, *, shm_bytes: int = 0, public: bool = False, alike: bool = True) -> Generator[Session]:
     """Connects this process to a Ray cluster; the end of the block ends our tasks and actors there, and disconnects.
+    For the main thread.
 
     Sets Ray's environment variables for this process: authentication by token, no usage statistics.
 
@@ -73,12 +75,14 @@ def connect(address: str, *, shm_bytes: int = 0, public: bool = False, alike: bo
     require_token(os.environ)
     _require_answer(address, ip, port)
     os.environ.update(_OURS)
-    where = f"{ip}:{port}"
+    where = f"[{ip}]:{port}" if ":" in ip else f"{ip}:{port}"
     _check_cluster(address, _probe(address, where, "token"), _probe(address, where, "disabled"))
     import ray
 
+    ours = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(where, namespace=NAMESPACE, log_to_driver=False, logging_level=logging.CRITICAL)
+        signal.signal(signal.SIGTERM, ours)  # Ray's handler would end a command at once, with exit code 15
     except Exception as error:  # Ray's have no common class
         ray.shutdown()
         raise ConfigError(f"cluster {address}: Ray cannot connect: {_first_line(error)}") from error

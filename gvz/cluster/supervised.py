@@ -1,13 +1,12 @@
 """One host over its incarnations, as the learner knows it: what it plays, owes and has sent."""
 
 import dataclasses
-from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from actors.pool import LaneState, PoolConfig
-from gvz.cluster.backend import Call, Remote
+from gvz.cluster.backend import Remote
 from gvz.cluster.config import ClusterConfig
 from gvz.cluster.host import HostSpec
 from gvz.cluster.wire import Batch, BatchHeader
@@ -33,8 +32,8 @@ class Incarnation:
     """when it last answered, or was first asked"""
     playing_s: float | None = None
     """since when it plays"""
-    asked: deque[Call] = field(default_factory=deque[Call])
-    """calls for batches that are under way, the oldest first"""
+    num_asked: int = 0
+    """calls for batches that are under way"""
     next_batch: int = 0
     early: dict[int, Batch] = field(default_factory=dict[int, Batch])
     """number -> batch that came before one with a lower number"""
@@ -84,7 +83,7 @@ class SupervisedHost:
     def free_credits(self) -> int:
         """Batches that may be asked for now."""
         life = self.incarnation
-        asked = 0 if life is None else len(life.asked) + len(life.early)
+        asked = 0 if life is None else life.num_asked + len(life.early)
         return self._config.credits - asked - self.waiting_batches
 
     def spec(self, run_id: str, incarnation: int) -> HostSpec:
@@ -115,7 +114,7 @@ class SupervisedHost:
         got = (header.run_id, header.host, header.incarnation, header.number)
         want = (run_id, self.index, life.number, life.next_batch)
         ahead = header.number - life.next_batch
-        if got[:3] != want[:3] or not 0 <= ahead < self._config.credits or (ahead and not life.asked):
+        if got[:3] != want[:3] or not 0 <= ahead < self._config.credits or (ahead and not life.num_asked):
             raise TransportError(f"got batch {got} (run, host, incarnation, number), want {want}; a batch was lost")
         life.early[header.number] = batch
         found: list[Batch] = []
@@ -175,11 +174,18 @@ class SupervisedHost:
         if len(steps):
             if (got := int(steps["params_version"].max())) > newest:
                 raise TransportError(f"got actions of parameters version {got}, but it was given {newest}")
-            low, high = int(steps["lane"].min()), int(steps["lane"].max())
-            if not (low in lanes and high in lanes and int(steps["task"].max()) < tasks):
-                raise TransportError(f"got records of lanes {low}..{high}, want {lanes.start}..{lanes.stop - 1}")
-            if (np.diff(steps["lane"].astype(np.int32)) < 0).any():
+            for name, want in (("lane", lanes), ("task", range(tasks)), ("action", range(self.pool.num_actions))):
+                low, high = int(steps[name].min()), int(steps[name].max())
+                if not (low in want and high in want):
+                    raise TransportError(f"got records of {name} {low}..{high}, want {want.start}..{want.stop - 1}")
+            lane_steps = np.diff(steps["lane"].astype(np.int32))
+            if (lane_steps < 0).any():
                 raise TransportError("got records that are not sorted by lane")
+            ended = (steps["terminated"] | steps["truncated"]) != 0
+            continues = self._in_episode[steps["lane"] - lanes.start]
+            continues[1:] = np.where(lane_steps == 0, ~ended[:-1], continues[1:])
+            if (lost := steps["lane"][(steps["first"] == 0) & ~continues]).size:
+                raise TransportError(f"got a record of lane {lost[0]} that neither begins an episode nor continues one")
             for name in ("reward", "vector", "extras"):
                 if not np.isfinite(steps[name]).all():
                     raise TransportError(f"got a {name} that is not finite")

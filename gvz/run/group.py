@@ -15,6 +15,7 @@ from typing import Any
 
 import jax
 
+from gvz.cluster.nodes import source_digest
 from gvz.core.addresses import require_private, resolve
 from gvz.core.env_config import leaves
 from gvz.core.errors import ConfigError, GvzError, WaitTimeoutError
@@ -33,9 +34,10 @@ JAX_TIMEOUT_S = 120.0
 """for JAX in process 0 to listen, which takes a second on an idle core"""
 FAILURE_WAIT_S = 5.0
 """for the news that a process is gone, after an error that this may have caused"""
-_OWN = ("group.process_id", "run_dir", "name", "max_processor_s", "log.", "actors.")
+_OWN = ("group.process_id", "run_dir", "name", "log.", "actors.")
 """fields that may differ between processes"""
-_MUST_AGREE = ("python", "gvizdoom", "jax", "jaxlib")
+_MUST_AGREE = ("gvizdoom", "jax", "jaxlib", "flax", "optax")
+"""and Python, and our source files: each process works out the new parameters by itself"""
 _PRIVATE = "the group asks nobody who connects for a token; want an address of a private network"
 
 
@@ -94,7 +96,8 @@ class Several(Group):
         _check_own_address(coordinator[0])
         self._process, self._num_processes = group.own_id, group.num_processes
         say(f"learner process {self._process} of {self._num_processes}: waiting for the others at {host}:{port}")
-        hello: dict[str, Any] = {"config": _settings(config), "versions": machine.versions(_MUST_AGREE)}
+        versions = {**machine.versions(_MUST_AGREE), "the source files": source_digest()}
+        hello: dict[str, Any] = {"config": _settings(config), "versions": versions}
         with contextlib.ExitStack() as opened:
             if self._process == 0:
                 hello["port"] = self._listen(host, port, opened)

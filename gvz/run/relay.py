@@ -51,7 +51,7 @@ class Relay:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             process = self._join(connection, lines.readline(MAX_LINE_BYTES))
             connection.settimeout(None)
-            while line := lines.readline(MAX_LINE_BYTES):
+            while (line := lines.readline(MAX_LINE_BYTES)).endswith(b"\n"):  # else it went in the middle of one
                 self._hand_on(line)
         close(connection)
         if process is not None:

@@ -179,14 +179,16 @@ def check_other_machine(directory: Path) -> Finding:
     locked = records.is_locked(file)
     try:
         said = json.loads(file.read_text())
-        host, until_s = str(said["host"]), float(said["until_s"])
+        host, seconds = str(said["host"]), float(said["seconds"])
+        with tempfile.TemporaryFile(dir=directory) as now:  # by one clock: those of the machines may differ
+            is_held = os.fstat(now.fileno()).st_mtime < file.stat().st_mtime + seconds
     except (ValueError, KeyError, TypeError, OSError):
-        host, until_s = "", 0.0
+        host, is_held = "", False
     if locked:
         return Finding(
             name, "ok", f"{host or 'somebody'} holds a lock in it, which is refused on {socket.gethostname()}"
         )
-    if time.time() < until_s:
+    if is_held:
         return Finding(name, "bad", f"{host} holds a lock in it, which {socket.gethostname()} got, too", records.MOUNT)
     return Finding(name, "note", "locks between machines are not tested by one alone", how)
 
@@ -204,7 +206,7 @@ def hold(directory: Path, seconds: float, say: Callable[[str], None]) -> None:
                 f"--hold: somebody holds the lock in {directory} already; give the command without --hold"
             )
         stream.truncate(0)
-        stream.write(json.dumps({"host": socket.gethostname(), "until_s": time.time() + seconds}))
+        stream.write(json.dumps({"host": socket.gethostname(), "seconds": seconds}))
         stream.flush()
         os.fsync(stream.fileno())
         try:

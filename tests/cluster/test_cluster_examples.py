@@ -55,6 +55,25 @@ def test_the_head_of_a_ray_cluster_in_slurm_has_an_address_that_other_nodes_reac
     assert done.stdout == f"{head_ip}\n"
 
 
+def test_an_experiment_in_slurm_waits_until_the_head_is_a_node(tmp_path):
+    """Ray's head takes connections seconds before it is one, and until then `gvz` refuses this machine."""
+    loop = (EXAMPLES / "slurm_ray.sbatch").read_text().split("\nfor _ in", 1)[1].split("\ndone", 1)[0]
+    calls = tmp_path / "calls"
+    python = f"""echo "$@" >>{calls}
+case $(wc -l <{calls}) in
+  1) exit 1 ;;
+  2) echo '{{"nodes": ["127.0.0.10"]}}' ;;
+  3) echo '{{"nodes": ["127.0.0.10", "127.0.0.1"]}}' ;;
+esac"""
+    for name, does in (("sleep", "exit 0"), ("python", python)):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{does}\n")
+        (tmp_path / name).chmod(0o700)
+    script = f"set -euo pipefail\nhead_ip=127.0.0.1\naddress=$head_ip:1\nfor _ in{loop}\ndone"
+    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    subprocess.run(["bash", "-c", script], env=environment, check=True)
+    assert calls.read_text() == 3 * "-m gvz.cluster.probe 127.0.0.1:1\n"
+
+
 @pytest.mark.e2e
 @pytest.mark.engine
 @pytest.mark.slow

@@ -2,12 +2,14 @@
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import ModuleType
 
 import psutil
 import pytest
@@ -50,7 +52,7 @@ here = pathlib.Path({results!r}, str(os.getpid()))
 def saved(number, _):
     here.with_suffix(".saved").write_text(str(number))
     sys.exit(128 + number)
-signal.signal(signal.SIGINT, saved); signal.signal(signal.SIGTERM, saved)
+signal.signal(signal.SIGINT, saved); signal.signal(signal.SIGHUP, saved)
 here.with_suffix(".begun").touch()
 time.sleep(200)
 """
@@ -97,7 +99,7 @@ def test_jobs_spread_over_the_nodes_each_on_a_core_of_its_own_and_know_nothing_o
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize(("number", "code", "job_sees"), [(signal.SIGINT, 130, "2"), (signal.SIGKILL, -9, "15")])
+@pytest.mark.parametrize(("number", "code", "job_sees"), [(signal.SIGINT, 130, "2"), (signal.SIGKILL, -9, "1")])
 def test_a_signal_reaches_the_jobs_which_save_and_none_is_left(cluster, tmp_path, number, code, job_sees):
     driver = begin(cluster, tmp_path, SAVE, 3)
     try:
@@ -234,16 +236,25 @@ def test_a_job_takes_idle_cores_and_not_those_that_every_container_would_take(mo
     assert len(taken) > 1
 
 
-def test_a_head_that_is_gone_is_named(monkeypatch):
+@pytest.mark.parametrize("ip", ["127.0.0.1", "::1"])
+def test_a_head_that_is_gone_is_named(ip, monkeypatch):
     monkeypatch.setattr(ray_jobs, "HEAD_TIMEOUT_S", 0.1)
-    with socket.create_server(("127.0.0.1", 0)) as head:
-        address = f"127.0.0.1:{head.getsockname()[1]}"
-        places = ray_jobs.ClusterPlaces.__new__(ray_jobs.ClusterPlaces)  # connecting is the other tests' matter
-        places._address, places._answered_s, places._nodes = address, time.monotonic(), [(16.0, 0.0)]
+    family = socket.AF_INET6 if ":" in ip else socket.AF_INET
+    if family == socket.AF_INET6 and not Path("/proc/net/if_inet6").exists():
+        pytest.skip("this machine has no IPv6")
+    ray = ModuleType("ray")
+    monkeypatch.setattr(ray, "nodes", lambda: [{"Alive": True, "Resources": {"CPU": 2.0}}], raising=False)
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    places = ray_jobs.ClusterPlaces.__new__(ray_jobs.ClusterPlaces)  # connecting is the other tests' matter
+    places._share, places._answered_s = Share(), time.monotonic()
+    with socket.create_server((ip, 0), family=family) as head:
+        places._address = address = f"{f'[{ip}]' if ':' in ip else ip}:{head.getsockname()[1]}"
+        places._look()
+    assert places._nodes == [(2.0, 0.0)]
     places._look()  # for a moment, that may be the network
     assert places._nodes == []
     time.sleep(0.2)
-    with pytest.raises(GvzError, match=f"cluster {address}: its head is gone; the jobs save themselves"):
+    with pytest.raises(GvzError, match=f"cluster {re.escape(address)}: its head is gone; the jobs save themselves"):
         places._look()
 
 

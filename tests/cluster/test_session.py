@@ -1,9 +1,12 @@
 """Connecting to a Ray cluster: what stands against it is one line, with exit code 2, and soon."""
 
 import os
+import signal
 import socket
 import subprocess
 import sys
+from importlib.machinery import ModuleSpec
+from types import ModuleType
 
 import pytest
 
@@ -69,6 +72,31 @@ def test_an_address_that_is_none_of_a_private_head_is_refused_before_anything_is
 @pytest.mark.parametrize(("address", "parts"), [("h:1", ("h", 1)), ("[fd00::1]:6379", ("fd00::1", 6379))])
 def test_an_address_has_two_parts(address, parts):
     assert session.parse_address(address) == parts
+
+
+@pytest.mark.parametrize("address", ["10.0.0.1:6379", "[fd00::1]:6379"])
+@pytest.mark.usefixtures("token")
+def test_ray_gets_an_address_that_it_can_read_and_leaves_sigterm_to_the_command(address, monkeypatch):
+    """As Ray 2.60: its `init` takes SIGTERM, and its parser wants brackets round an address of IPv6."""
+    ray, got, ours = ModuleType("ray"), [], signal.getsignal(signal.SIGTERM)
+
+    def init(where: str, **_) -> None:
+        got.append(where)
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(number))
+
+    vars(ray).update(__spec__=ModuleSpec("ray", None), init=init, shutdown=lambda: None)
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    for name, value in session._OURS.items():
+        monkeypatch.setenv(name, value)
+    for name in ("_require_answer", "_probe", "_check_cluster"):
+        monkeypatch.setattr(session, name, lambda *_: None)
+    monkeypatch.setattr(session, "survey", lambda: ())
+    try:
+        with session.connect(address, alike=False) as found:
+            assert signal.getsignal(signal.SIGTERM) == ours
+        assert [found.address] == got == [address]
+    finally:
+        signal.signal(signal.SIGTERM, ours)
 
 
 @pytest.mark.usefixtures("token")

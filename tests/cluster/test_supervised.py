@@ -32,7 +32,7 @@ def begin(host: SupervisedHost, *, playing_s: float | None = 0.0) -> None:
     host.incarnation = Incarnation(
         number=0, machine="m", name="", remote=remote, first_episodes=first, heard_s=0.0, playing_s=playing_s
     )
-    host.incarnation.asked.extend(range(CREDITS))
+    host.incarnation.num_asked = CREDITS
 
 
 def taken(
@@ -45,13 +45,13 @@ def taken(
     **changes: Any,
 ) -> list[int]:
     """The numbers of the batches that are taken after an answer with this one, which has a record of each of `lanes`
-    with these `fields`; `changes` are of its header.
+    with these `fields`, by default the first of an episode; `changes` are of its header.
     """
     life = host.incarnation
     assert life is not None
-    life.asked.popleft()
+    life.num_asked -= 1
     steps = np.zeros(len(lanes), host.pool.record_dtype)
-    for name, values in {"lane": lanes, **(fields or {})}.items():
+    for name, values in {"lane": lanes, "first": 1, **(fields or {})}.items():
         steps[name] = values
     block = StepBlock(steps, np.zeros((len(lanes), *host.pool.frame_shape), np.uint8))
     header = BatchHeader(**{"run_id": "r", "host": 2, "incarnation": 0, "number": number, **changes})
@@ -75,7 +75,7 @@ def test_a_batch_is_lost_when_no_call_is_left_that_could_bring_it(host):
     with pytest.raises(TransportError, match=r"got batch \('r', 2, 0, 4\) .*, want \('r', 2, 0, 0\); a batch was lost"):
         taken(host, 4)
     host.incarnation.early.clear()
-    host.incarnation.asked.append(0)
+    host.incarnation.num_asked += 1
     with pytest.raises(TransportError, match="a batch was lost"):
         taken(host, 1)
 
@@ -129,8 +129,12 @@ def test_a_host_that_does_not_stay_up_is_started_later_each_time(host):
     ("lanes", "fields", "messages", "text"),
     [
         ([0], {"params_version": 6}, [], "got actions of parameters version 6, but it was given 5"),
-        ([0, 4], {}, [], r"got records of lanes 0\.\.4, want 0\.\.3"),
-        ([0], {"task": 2}, [], "got records of lanes"),
+        ([0, 4], {}, [], r"got records of lane 0\.\.4, want 0\.\.3"),
+        ([0], {"task": 2}, [], r"got records of task 2\.\.2, want 0\.\.1"),
+        ([0, 1], {"action": [-1, 5]}, [], r"got records of action -1\.\.5, want 0\.\.4"),
+        ([0, 2], {"first": 0}, [], "of lane 2 that neither begins an episode nor continues one"),
+        ([0, 0], {"first": 0, "terminated": 1}, [], "of lane 0 that neither begins"),
+        ([3, 3], {"first": [0, 1]}, [], "of lane 3 that neither begins"),
         ([1, 0], {}, [], "not sorted by lane"),
         ([0], {"reward": np.nan}, [], "got a reward that is not finite"),
         ([], {}, [episode_end(4, 0, 0)], "got an episode of lane 4, task 0"),
@@ -139,6 +143,7 @@ def test_a_host_that_does_not_stay_up_is_started_later_each_time(host):
 )
 def test_a_batch_of_what_a_host_cannot_have_played_is_refused(host, lanes, fields, messages, text):
     host.incarnation.params_version = 5
-    assert taken(host, 0, [0, 3], {"params_version": 5, "task": 1}, [episode_end(3, 1, 0)]) == [0]
+    begun = {"params_version": 5, "task": 1, "terminated": [0, 1]}
+    assert taken(host, 0, [0, 3], begun, [episode_end(3, 1, 0)]) == [0]
     with pytest.raises(TransportError, match=text):
         taken(host, 1, lanes, fields, messages)

@@ -12,6 +12,7 @@ import pytest
 
 from gvz.core import records
 from gvz.core.errors import ConfigError, GvzError
+from gvz.core.libraries import import_path
 from gvz.experiments import inventory as progress
 from gvz.experiments import places, schedule
 from gvz.experiments.jobs import Command, Outlook
@@ -154,7 +155,7 @@ import os, pathlib, signal, sys, time
 def saved(*_):
     pathlib.Path({saved!r}).write_text("saved")
     sys.exit(130)
-signal.signal(signal.SIGINT, saved); signal.signal(signal.SIGTERM, saved)
+signal.signal(signal.SIGINT, saved); signal.signal(signal.SIGHUP, saved)
 pathlib.Path({pid!r} + ".new").write_text(str(os.getpid())); os.rename({pid!r} + ".new", {pid!r})
 time.sleep(100)
 '''
@@ -177,6 +178,41 @@ def test_a_signal_reaches_the_jobs_which_save_and_none_is_left(tmp_path, number,
     log_file = progress.log_file(tmp_path, "slow")
     wait_until(lambda: not records.is_locked(log_file), "the release of the job's log", 30)
     assert progress.job_state(tmp_path, "slow", done=False, begun=True) == "stopped"
+
+
+SAVES = """
+import sys, time
+from pathlib import Path
+from gvz.core.stop import StopRequest
+with StopRequest() as stop:
+    Path("begun").touch()
+    while not stop.requested:
+        time.sleep(0.001)
+    time.sleep(0.5)  # it saves itself
+    Path("saved.new").write_text(str(stop.exit_code))
+    Path("saved.new").rename("saved")
+"""
+STARTS = """
+import os, subprocess, sys, threading, time
+for _ in range(3):
+    threading.Thread(target=time.sleep, args=(100,), daemon=True).start()
+job = [sys.executable, "-P", "-m", "gvz.experiments.child", str(os.getpid()), sys.argv[1]]
+subprocess.run([*job, *sys.argv[2:]], start_new_session=True)
+"""
+
+
+@pytest.mark.parametrize("guard", [(), ("-m", "gvz.cluster.guard", str(CORES[0]))], ids=["here", "on a node"])
+def test_a_job_whose_parent_is_killed_saves_itself(guard, tmp_path):
+    """The kernel tells it of every thread of the parent that ends, and a second SIGTERM would end it at once."""
+    command = ["nohup", sys.executable, "-c", STARTS, str(CORES[0]), *guard, "-c", SAVES]
+    launcher = subprocess.Popen(command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": import_path()})
+    try:
+        wait_until((tmp_path / "begun").exists, "the job's start")
+    finally:
+        launcher.kill()
+        launcher.wait(30)
+    wait_until((tmp_path / "saved").exists, "what the job saves")
+    assert (tmp_path / "saved").read_text() == "129"
 
 
 QUEUE = """

@@ -1,8 +1,6 @@
 """Processes that act as one, here as threads without devices: what is agreed, refused, and noticed."""
 
 import contextlib
-import errno
-import os
 import socket
 import threading
 import time
@@ -22,7 +20,7 @@ from gvz.run.config import CheckpointConfig
 from gvz.run.config_files import config_from_dict, config_to_dict, load_config
 from gvz.run.group import Several
 from gvz.run.group_config import GroupConfig
-from gvz.run.relay import Forward, Relay, free_port
+from gvz.run.relay import Relay, free_port
 from learner.checkpoint import Restored
 from tests.waiting import wait_until
 
@@ -183,6 +181,16 @@ def test_processes_that_differ_are_refused_on_both_sides_by_the_name_of_what_dif
         group._opened.close()
 
 
+def test_processes_of_different_source_files_are_refused(monkeypatch):
+    """Two commits can have one version, and each process works out the new parameters by itself."""
+    digests = iter(("1a", "2b"))
+    monkeypatch.setattr("gvz.run.group.source_digest", lambda: next(digests))
+    found = joined(2)
+    assert {type(error) for error in found} == {ConfigError}
+    assert all("group: the version of the source files is" in str(error) for error in found)
+    until_no_link_is_open()
+
+
 def test_two_processes_with_one_number_and_strangers_are_turned_away(monkeypatch):
     monkeypatch.setattr(relay, "HELLO_TIMEOUT_S", 0.2)
     address = "127.0.0.1", free_port("127.0.0.1")
@@ -236,48 +244,6 @@ def test_a_process_that_cannot_reach_jax_in_process_0_says_so(monkeypatch):
     assert isinstance(second, WaitTimeoutError)
     assert str(second).startswith("group: waited 0 s for JAX's coordinator at 127.0.0.1:")
     assert str(second).endswith("(Connection refused); let learner processes reach all ports of each other's hosts")
-
-
-def test_jax_in_process_0_may_come_late():
-    address = "127.0.0.1", free_port("127.0.0.1")
-    waiting = threading.Thread(target=relay.wait_for_listener, args=(address, 30.0))
-    waiting.start()
-    waiting.join(0.3)
-    assert waiting.is_alive()
-    with socket.create_server(address):
-        waiting.join(30)
-    assert not waiting.is_alive()
-
-
-@pytest.mark.parametrize("number", [errno.ECONNABORTED, errno.EMFILE])
-def test_a_connection_that_cannot_be_taken_does_not_keep_later_ones_out(number, monkeypatch):
-    accept, failures = socket.socket.accept, iter([OSError(number, os.strerror(number))])
-
-    def first_fails(server: socket.socket) -> tuple[socket.socket, Any]:
-        for failure in failures:
-            raise failure
-        return accept(server)
-
-    monkeypatch.setattr(socket.socket, "accept", first_fails)
-    address = "127.0.0.1", free_port("127.0.0.1")
-    the_relay = Relay(address, 1)
-    link.Link(address, 0, 1, {}).close()
-    assert next(failures, None) is None
-    the_relay.close()
-
-
-def test_a_forwarded_connection_outlives_the_other_end():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        near = socket.create_connection(("127.0.0.1", Forward(server.getsockname()[:2]).port))
-        far, _ = server.accept()
-        near.sendall(b"out")
-        far.sendall(b"in")
-        assert (far.recv(3), near.recv(2)) == (b"out", b"in")
-        far.close()
-        near.settimeout(0.3)
-        with pytest.raises(TimeoutError):
-            near.recv(1)
-        near.close()
 
 
 @pytest.mark.parametrize(

@@ -97,9 +97,27 @@ def test_a_directory_that_a_machine_cannot_write_to_is_named(tmp_path, monkeypat
         )
 
 
+def test_a_lock_that_does_not_reach_this_machine_is_found_bad_also_if_the_other_ones_clock_is_behind(
+    tmp_path, monkeypatch
+):
+    found, here_s = [], time.time
+    monkeypatch.setattr(records, "is_locked", lambda _: False)
+    monkeypatch.setattr(time, "time", lambda: here_s() - 1000)
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+
+    def look(_: str) -> None:
+        monkeypatch.setattr(time, "time", here_s)
+        found.append(shared_directory.check_other_machine(tmp_path))
+
+    shared_directory.hold(tmp_path, 60, look)
+    assert [finding.state for finding in found] == ["bad"]
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_old_lock_file_says_nothing(tmp_path):
-    said = {"host": "gone", "until_s": time.time() - 1}
-    (tmp_path / shared_directory.LOCK_FILE).write_text(json.dumps(said))
+    file = tmp_path / shared_directory.LOCK_FILE
+    file.write_text(json.dumps({"host": "gone", "seconds": 60}))
+    os.utime(file, (0, time.time() - 61))
     assert shared_directory.check_other_machine(tmp_path).state == "note"
     assert not records.is_locked(tmp_path / shared_directory.LOCK_FILE)
 
