@@ -199,6 +199,7 @@ def test_the_guide_says_how_long_experiments_train_at_the_measured_rates():
         ("general_train4_long", None, 50),
         ("general_train4_two_hours", None, 50),
         ("general_varied", None, 50),
+        ("general_varied_network", None, 50),
         ("general_compositions", None, 50),
         ("general_compositions_long", None, 50),
         ("general", None, 100),

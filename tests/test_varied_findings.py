@@ -5,7 +5,7 @@ import json
 import numpy as np
 
 from gvz.evaluation.statistics import bootstrap, difference
-from gvz.reports.scores import estimate, estimate_groups
+from gvz.reports.scores import Scores, estimate, estimate_groups
 from gvz.tasks import named_tasks, scenario_named, scenarios
 from tests.score_tables import (
     PAGE,
@@ -16,6 +16,7 @@ from tests.score_tables import (
     mean_score,
     results_of,
     rows_of,
+    score_cells,
     score_row,
     scores_of,
     task_sets,
@@ -178,3 +179,55 @@ def test_the_findings_say_what_the_networks_of_varied_maps_find():
         steps.append(f"{network['gradient_steps']:,}")
         assert (network["processor_s"] // 10, network["tints_and_patches"]) == (150, False)
     assert f"made {in_words(steps)} gradient steps in the 1,500 seconds" in WORDS
+
+
+def test_the_findings_say_what_90_minutes_on_varied_maps_gave_with_a_network_of_them():
+    name, updates = "defend_the_center", (10_000, 40_000, 80_000)
+    agent = "rainbow_segmented+varied_network"
+    run = ROOT / "results/general_varied_network/runs" / agent / name / "varied/seed_1111"
+    (steps,) = last_updates(f"general_varied_network/runs/{agent}/{name}/varied/*")
+    episodes = rows_of(run / "episodes.jsonl.gz")
+    means = [
+        np.mean([row["normalized_score"] for row in episodes if first <= row["num_updates"] < first + 10_000])
+        for first in updates
+    ]
+    assert f"{steps:,} gradient steps, {len({row['lane'] for row in episodes})} games at once" in WORDS
+    assert f"Its training episodes have {in_words([f'{mean:.1f}' for mean in means])} in the three" in WORDS
+    varied, _, eight = found = [
+        scores_of(folder, called, name)
+        for folder, called in (
+            ("general_varied_network", agent),
+            ("general_varied", "rainbow_segmented"),
+            ("general", "rainbow_segmented"),
+        )
+    ]
+    rows = (
+        "varied maps | varied maps | 5,400 s",
+        "varied maps | eight tasks | 900 s",
+        "8 tasks | eight tasks | 5,400 s",
+    )
+    for row, scores in zip(rows, found, strict=True):
+        assert f"| {row} | {score_cells(scores, name)} |" in PAGE
+
+    def rounded(scores: Scores, *tasks: str) -> list[str]:
+        found = [estimate(scores, [f"{name}/{task}"]).estimate for task in tasks]
+        return [f"{one.value:.0f}" for one in found if one]
+
+    walls = ("default", "mossy_bricks", "stone_wall")
+    assert f"have {in_words(rounded(varied, *walls))}, with eight tasks {in_words(rounded(eight, *walls))}." in WORDS
+    for task in (
+        "flying_enemies",
+        "fast_enemies+flying_enemies",
+        "fast_enemies+gore+resized_enemies",
+        "gore+resized_enemies",
+    ):
+        (ours,), (theirs,) = rounded(varied, task), rounded(eight, task)
+        assert any(f"`{task}`{has} {ours}, not {theirs}" in WORDS for has in (" has", "")), task
+    (ours,), (theirs,) = (rounded(scores, "fuzzy_enemies+gore+stone_wall") for scores in (varied, eight))
+    assert f"`fuzzy_enemies+gore+stone_wall`, where looks alone change, {ours}, not {theirs}." in WORDS
+    compositions = scores_of("general_compositions_long", "rainbow_segmented", name)
+    of_test = [score_cells(scores, name).split(" | ")[2].split()[0] for scores in (compositions, varied)]
+    assert (
+        "have {} on the test tasks of Defend the Center after 2,700 seconds, varied maps {} after".format(*of_test)
+        in WORDS
+    )
