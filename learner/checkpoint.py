@@ -95,8 +95,9 @@ def _files(directory: Path) -> list[Path]:
 
 @cache
 def _quiet() -> None:
-    """Orbax warns, at every save, of what is meant to be so, and logs the traceback of each error that it raises. It
-    closes its event loop at the first error, and tensorstore's threads then show a traceback for every other array.
+    """Silences what orbax logs: warnings of what is meant to be so at every save, and tracebacks of errors it raises.
+
+    It closes its event loop at the first error. Each further array then ends in a traceback of a thread of tensorstore.
     """
     logging.getLogger("absl").setLevel(logging.CRITICAL)
     shown_before = sys.unraisablehook

@@ -12,6 +12,7 @@ from gvz.core.env_config import LABEL_CLASSES, EnvConfig
 from gvz.core.errors import ConfigError
 from gvz.env import DoomEnv
 from gvz.evaluation.segmentation import training_tasks
+from gvz.experiments.base import experiments
 from gvz.segmentation import (
     CLASS_COLOURS,
     INPUT_HEIGHT,
@@ -142,7 +143,7 @@ def test_every_scenario_has_a_network_that_has_seen_the_four_training_tasks_alon
     assert "train4" in segmenter_names()
 
 
-@pytest.mark.parametrize("scenario", ["defend_the_center", "seek_and_kill"])
+@pytest.mark.parametrize("scenario", experiments()["general_segmented_varied_network"].scenarios)
 def test_networks_that_have_seen_varied_maps_have_seen_the_eight_training_tasks_too(scenario: str):
     file = segmenter_file(scenario, EnvConfig(frames="segmented", segmenter="varied"))
     assert file == SEGMENTERS / "varied" / f"{scenario}.onnx"

@@ -136,12 +136,8 @@ def collect_evaluations(paths: Iterable[Path | str]) -> tuple[pl.DataFrame, list
             "two players have this name, or two versions of one; give each a name of its own"
         )
     together = together.unique(("run_dir", *_IDENTITY), keep="first", maintain_order=True)
-    one_policy = (
-        "run_dir",
-        "player",
-        "num_updates",
-        "scenario",
-    )  # runs of several scenarios may have one name and seed
+    # runs of several scenarios may have one name and seed
+    one_policy = ("run_dir", "player", "num_updates", "scenario")
     policies = together.drop_nulls("params").group_by(one_policy, maintain_order=True)
     for run_dir, player, _, scenario, num_policies in policies.agg(pl.col("params").n_unique()).iter_rows():
         if num_policies > 1:

@@ -10,6 +10,7 @@ import pytest
 from gvz.core.errors import ConfigError, TaskError
 from gvz.experiments.base import Experiment, TrainingRun, experiment_named, experiments
 from gvz.run.config_files import load_config, with_settings
+from gvz.segmentation import segmenter_file
 from gvz.tasks import named_tasks, parse_task, scenarios
 
 THESIS_AVERAGES = {
@@ -64,6 +65,8 @@ def test_every_run_has_an_id_of_its_own_tasks_of_its_scenario_and_checkpoints_up
         assert len(run.checkpoints) == run.num_checkpoints
         assert run.checkpoints[-1] == run.total_updates
         assert list(run.checkpoints) == sorted(set(run.checkpoints))
+        env = with_settings(run.run_config, run.settings).env
+        assert env.frames != "segmented" or segmenter_file(run.scenario, env), "its network comes with GViZDoom"
 
 
 @pytest.mark.parametrize(("name", "averages"), THESIS_AVERAGES.items())
