@@ -62,7 +62,8 @@ class AgentConfig:
     encoder: str = "nature"
     """module in learner/encoders, or the path of a Python file: what makes features of frames"""
     conv_channels: tuple[int, ...] = (32, 64, 64)
-    """output channels of the convolutions"""
+    """output channels of the convolutions. The encoders small, impala, impala_height_pool and impoola have layers of
+    fixed sizes: for them, conv_channels, conv_kernels and conv_strides have no effect"""
     conv_kernels: tuple[int, ...] = (8, 4, 3)
     """kernel sizes, pixels"""
     conv_strides: tuple[int, ...] = (4, 2, 1)
