@@ -166,7 +166,8 @@ class QNetwork(nn.Module):
         layer_norm: hidden layers are normalized before their rectifier.
         num_sights: outputs of a dense layer on the features of the frames, which say what is in sight. They are the
             variable `sight` / `logits` [B, C], for those who ask for it. 0: there is no such layer. The layer reads
-            normalized features; else its loss makes them so large that the values are not learnt (docs/FINDINGS.md).
+            normalized features; else its loss makes them so large that the values are not learnt
+            (docs/findings/screen.md).
     """
 
     config: AgentConfig

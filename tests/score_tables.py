@@ -16,16 +16,15 @@ from gvz.reports.scores import Scores, agent_scores, estimate, estimate_groups
 from gvz.tasks import TaskSet, named_tasks, scenario_named
 
 ROOT = Path(__file__).parent.parent
-PAGE = (ROOT / "docs" / "FINDINGS.md").read_text()
+PAGES = [ROOT / "docs" / "FINDINGS.md", *sorted((ROOT / "docs" / "findings").glob("*.md"))]
+PAGE = "\n".join(page.read_text() for page in PAGES)
+WORDS = " ".join(PAGE.split())
 SUMMARY = PAGE.partition("## In short")[2].partition("\n## ")[0]
 
 
 def words_of(page: str) -> str:
     """A page of the repository with one space between words."""
     return " ".join((ROOT / page).read_text().split())
-
-
-WORDS = words_of("docs/FINDINGS.md")
 
 
 @cache

@@ -155,7 +155,7 @@ def test_the_findings_say_how_long_agents_of_compositions_learned():
         (
             "general_compositions_long",
             "*/*/seed_1111",
-            "{:,} to {:,} gradient steps ([records](../results/general_compositions_long",
+            "{:,} to {:,} gradient steps ([records](../../results/general_compositions_long",
         ),
         ("general_compositions_long", "*/*/seed_[23]*", "2,700 seconds, with {:,} to {:,} gradient steps:"),
     ):

@@ -33,6 +33,12 @@ def command_lines(page: Path) -> list[list[str]]:
     return [words for words in lines if words]
 
 
+def headings(page: Path) -> set[str]:
+    """What links call the headings of the page."""
+    lines = re.findall(r"^#+ (.*)", page.read_text(), flags=re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", line.lower()).replace(" ", "-") for line in lines}
+
+
 @pytest.mark.engine
 @pytest.mark.parametrize("example", EXAMPLES)
 def test_an_example_runs(example, tmp_path):
@@ -72,6 +78,8 @@ def test_the_index_of_records_has_every_folder():
 
 
 @pytest.mark.parametrize("page", [*PAGES, *RECORDS, *REPORTS], ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_to_files_lead_somewhere(page):
-    for target in re.findall(r"\]\((?!https?://|#)([^)#]+)", page.read_text()):
-        assert (page.parent / target).exists(), f"{page.name} links to {target}, which is not there"
+def test_links_lead_somewhere(page):
+    for target, heading in re.findall(r"\]\((?!https?://)([^)#]*)#?([^)]*)\)", page.read_text()):
+        file = page.parent / target if target else page
+        assert file.exists(), f"{page.name} links to {target}, which is not there"
+        assert not heading or heading in headings(file), f"{page.name} links to {target}#{heading}, which is not there"

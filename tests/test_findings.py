@@ -246,8 +246,10 @@ def test_the_findings_say_how_far_apart_two_seeds_of_one_agent_lie():
             apart[algorithm] = max(apart[algorithm], (float(max(means) - min(means)), f"{agent} {name}"))
     (of_rainbow, shots), (of_pqn, plain) = apart.values()
     assert (shots, plain) == ("rainbow_quick+shots_cost seek_and_kill", "pqn_quick+plain health_gathering")
-    assert f"the seed alone can lie [{of_rainbow:.0f} points apart](#free-shots-in-seek-and-kill-yes) on the" in WORDS
-    assert f"two runs of PQN [{of_pqn:.0f} points](#replay-or-on-policy-learning-replay)." in WORDS
+    of_shots = "(findings/rewards-and-hyperparameters.md#free-shots-in-seek-and-kill-yes)"
+    assert f"the seed alone can lie [{of_rainbow:.0f} points apart]{of_shots} on the" in WORDS
+    of_replay = "(findings/algorithms-and-budgets.md#replay-or-on-policy-learning-replay)"
+    assert f"two runs of PQN [{of_pqn:.0f} points]{of_replay}." in WORDS
     assert f"On the gate tasks the two with the price lie {of_rainbow:.0f} points apart." in WORDS
 
 

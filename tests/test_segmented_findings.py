@@ -165,7 +165,8 @@ def test_the_findings_say_what_pairs_gave_beside_segmented_frames():
 
 def test_the_findings_say_what_six_times_the_time_gave():
     steps = last_updates("general/runs/rainbow_segmented/**")
-    assert f"of [segmented frames](#segmented-frames-yes), {steps[0]:,} to {steps[-1]:,} gradient steps." in PAGE
+    of_frames = "of [segmented frames](segmented-frames.md#segmented-frames-yes)"
+    assert f"{of_frames}, {steps[0]:,} to {steps[-1]:,} gradient steps." in WORDS
     agents = {"rainbow_general+sight_loss": "loss of sight", "rainbow_segmented": "segmented"}
     long = results_of("general").episodes
     runs = sorted(long.filter(long["agent"].is_in(agents)).select("scenario", "agent", "run_seed").unique().rows())

@@ -57,7 +57,7 @@ class TrainSegmenter:
     They share the frames in files of the temporary directory (TMPDIR), 185 KB each"""
     tints_and_patches: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = True
     """leave walls and floors as they are. By default, those of some frames get tints and patches: the network is then
-    better in Health Gathering, worse in Seek and Kill (docs/FINDINGS.md)"""
+    better in Health Gathering, worse in Seek and Kill (docs/findings/segmented-frames.md)"""
     seed: int = 1111
     """of the first parameters and of the changes of frames"""
 
