@@ -116,6 +116,15 @@ def test_the_page_says_what_each_configuration_has_of_the_recipe():
         assert written[name] == [word(value) for value in (*parts, *more)], name
 
 
+def test_the_guide_says_what_each_configuration_is_for():
+    guide = (Path(__file__).parents[2] / "docs" / "how-to" / "train.md").read_text()
+    rows = re.findall(r"^\| (`.*?) \| (.*?) \| (.*) \|$", guide, re.M)
+    lengths = {name: length for names, _, length in rows for name in re.findall(r"`([\w.]+)`", names)}
+    for file in configs_directory().glob("[!_]*.py"):
+        length = lengths["rainbow_no_..." if file.stem.startswith("rainbow_no_") else file.stem]
+        assert f"{load_config(file.stem).learner.total_updates:,} gradient steps" in length or "decisions" in length
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
