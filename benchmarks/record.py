@@ -17,7 +17,7 @@ SCHEMA = 1
 """Part of every record; increased by one when a record's meaning changes."""
 ROOT = Path(__file__).parent.parent
 DIRECTORY = ROOT / "results" / "performance"
-WITHOUT_AN_ENGINE = frozenset({"encoders", "learner_update", "sum_tree"})
+WITHOUT_AN_ENGINE = frozenset({"augmentations", "encoders", "learner_update", "sum_tree"})
 """benchmarks that play no game, so that the installed engine does not matter"""
 
 

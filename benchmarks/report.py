@@ -31,6 +31,7 @@ GOALS = {
     11: ("placement", "Placement"),
     12: ("gpu", "GPU"),
     13: ("cluster", "Actor hosts"),
+    14: ("augmentations", "Augmentations"),
 }
 """number -> (benchmark, title); a benchmark may have figures and no goal"""
 RATES = ("decisions", "frames", "updates", "samples")

@@ -109,7 +109,7 @@ def random_conv(key: PRNGKeyArray, frames: Frames, strength: Strength) -> Frames
     mixed = (1 - share) * planes[:, :, 1:-1, stack:-stack] + share * 255 * jax.nn.sigmoid(sums)
     mixed = jnp.round(mixed).astype(jnp.uint8)
     # Only bytes are put side by side: XLA fuses whatever makes them into that and computes it number by number, which
-    # took 41 ms with floats and takes 6 so (84x84 RGB, as below).
+    # took 41 ms with floats and takes 6 so (32 stacks of 84x84 RGB).
     return jnp.stack(list(mixed.reshape(channels, batch, height, width, stack)), axis=-1)
 
 
@@ -165,9 +165,6 @@ def grey(key: PRNGKeyArray, frames: Frames, strength: Strength) -> Frames:
     return jnp.round((1 - share) * x + share * luma).astype(jnp.uint8)
 
 
-# ms for 32 stacks of 4 frames, 48x84 grey and 84x84 RGB, each alone (2026-11-22, 2-core AMD EPYC):
-# shift 0.2 and 0.4, random_conv 0.5 and 5.8, contrast 0.2 and 2.3, gamma 0.5 and 5.2, inversion 0.2 and 0.6,
-# cutout 0.2 and 0.4, grey 0 and 2.8. `tests/perf/test_augment_speed.py` measures them.
 AUGMENTATIONS: dict[str, Callable[[PRNGKeyArray, Frames, Strength], Frames]] = {
     f.__name__: f for f in (shift, vertical_shift, random_conv, contrast, gamma, inversion, cutout, grey)
 }

@@ -16,6 +16,8 @@ from actors import placement
 from benchmarks import plots, record, remote, report, rounds, runner, whole
 from gvz.core.control_groups import num_cores
 from gvz.core.errors import ConfigError
+from gvz.core.registry import discover
+from learner.augment import AUGMENTATIONS
 from tests.processes import arguments
 from tests.waiting import wait_until
 
@@ -57,7 +59,14 @@ def test_the_page_has_a_section_for_every_benchmark():
 def test_a_body_runs_and_measures_its_goals(name):
     rows = runner.benchmarks()[name].measure(QUICK)
     goals = {number: benchmark for number, (benchmark, _) in report.GOALS.items()}
-    without_a_goal_here = {"sum_tree", "learner_update", "encoders", "placement", "gpu"}  # the first two need a peer
+    without_a_goal_here = {
+        "sum_tree",
+        "learner_update",
+        "encoders",
+        "augmentations",
+        "placement",
+        "gpu",
+    }  # the first two need a peer
     assert {goals[row["number"]] for row in rows if row["kind"] == "goal"} == ({name} - without_a_goal_here)
     for row in rows:
         if row["kind"] == "absent":
@@ -245,6 +254,13 @@ def test_a_remote_body_answers_and_one_that_dies_is_an_error():
 def test_the_page_is_what_the_records_give():
     page = report.PAGE.read_text()
     assert report.write_page(page, record.read_all()) == page
+
+
+def test_the_page_has_the_cost_of_every_encoder_and_augmentation():
+    parts = {"encoders": discover("learner.encoders", "ENCODER").keys(), "augmentations": AUGMENTATIONS.keys()}
+    for benchmark, names in parts.items():
+        (found,) = [made for made in record.read_all() if made.benchmark == benchmark]
+        assert names <= {row["name"].partition(",")[0] for row in found.rows}, benchmark
 
 
 def test_a_record_is_read_as_it_was_written(tmp_path):

@@ -91,6 +91,19 @@ def test_the_findings_say_what_more_decisions_for_each_gradient_step_take():
     assert f"{wait} percent of their time, with 16 still {wait_16}." in WORDS
 
 
+def test_the_findings_say_how_long_runs_of_the_gate_of_decisions_took_by_the_clock():
+    said = []
+    for number in (16, 4):
+        runs = (ROOT / "results" / "gates" / "runs" / f"rainbow_4task+decisions_{number}").glob("*/train4/seed_*")
+        starts_and_ends = [
+            (json.loads((run / "starts.jsonl").read_text()), rows_of(run / "metrics.jsonl.gz")[-1]) for run in runs
+        ]
+        seconds = [end["time_s"] - start["time_s"] for start, end in starts_and_ends]
+        assert len(seconds) == 4
+        said.append(f"{min(seconds):,.0f} to {max(seconds):,.0f}")
+    assert f"had less time**: {said[0]} seconds, those with 4 had {said[1]}." in WORDS
+
+
 def test_the_findings_say_how_training_went_with_more_gradient_steps_beside_segmented_frames():
     periods_s, columns, variants = ((100, 300), (300, 600), (600, 900)), [], ("4", "8", "16", "batch_64")
     for variant in variants:

@@ -31,6 +31,7 @@ from gvz.tasks import named_tasks, parse_task
 from learner.agents.configs.ppo import PPOConfig
 from learner.config import OnPolicyConfig
 from learner.export import flatten_params
+from learner.observation import Observation
 from tests.evaluation.policies import CONFIG, write_policy
 
 
@@ -69,8 +70,10 @@ def test_rows_say_which_parameters_played(run):
 
 @pytest.mark.engine
 @pytest.mark.parametrize("conditioned", [False, True])
-def test_a_policy_acts_greedily_on_the_stack_it_was_trained_on(run, conditioned):
-    config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, task_conditioned=conditioned))
+def test_a_policy_acts_greedily_on_what_it_was_trained_on(run, conditioned):
+    """Frames, game variables and past actions, and the task if it is told."""
+    agent_config = dataclasses.replace(CONFIG.agent, task_conditioned=conditioned, past_actions=2, game_variables=True)
+    config = dataclasses.replace(CONFIG, agent=agent_config)
     (run / "config.json").write_text(json.dumps(config_to_dict(config)))
     params, agent = write_policy(run, config, 30), run_agent(config)
     player = pickle.loads(pickle.dumps(trained_player(run, config, 30))).make_player()
@@ -79,10 +82,15 @@ def test_a_policy_acts_greedily_on_the_stack_it_was_trained_on(run, conditioned)
     frame, info = env.reset(seed=1)
     player.begin(env, frame, info, 1)
     assert player.values is None
-    stack, empty = [frame] * 4, agent.spec.zeros()
+    stack, past = [frame] * 4, [-1, -1]
     for _ in range(12):
-        frames = jnp.asarray(np.concatenate(stack, axis=-1)[None])
-        wanted = agent.evaluate(params, dataclasses.replace(empty, frames=frames, task=jnp.array([int(conditioned)])))
+        observed = Observation(
+            frames=jnp.asarray(np.concatenate(stack, axis=-1)[None]),
+            vector=jnp.array([[info["variables"][name] for name in config.table.variables]]),
+            actions=jnp.array([past]),
+            task=jnp.array([int(conditioned)]),
+        )
+        wanted = agent.evaluate(params, observed)
         action = player.act()
         assert action == int(wanted.action[0]) == int(player.values.q_values.argmax())
         np.testing.assert_allclose(player.values.q_values, wanted.q_values[0], atol=1e-5)
@@ -91,7 +99,8 @@ def test_a_policy_acts_greedily_on_the_stack_it_was_trained_on(run, conditioned)
         np.testing.assert_allclose(means, player.values.q_values, atol=1e-4)
         frame, _, _, _, info = env.step(action)
         player.observe(frame, info)
-        stack = [*stack[1:], frame]
+        stack, past = [*stack[1:], frame], [past[1], action]
+    assert observed.vector.any()
     env.close()
 
 

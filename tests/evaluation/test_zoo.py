@@ -138,7 +138,7 @@ def test_a_packed_policy_has_few_rows_of_training_and_the_last_one(run, record, 
 
 
 @pytest.mark.engine
-def test_it_is_evaluated_recorded_and_listed_with_its_score_card(run, tmp_path, capsys, monkeypatch):
+def test_it_is_evaluated_recorded_exported_and_listed_with_its_score_card(run, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     pack(run, "one")
     task = "defend_the_center/gore+mossy_bricks"
@@ -146,6 +146,8 @@ def test_it_is_evaluated_recorded_and_listed_with_its_score_card(run, tmp_path, 
     assert cli.main(["zoo", "--add", "zoo:one", "--name", "one"]) == 0
     rows = read_rows(run_directory("zoo:one") / "evaluation.jsonl")
     assert [row["task"] for row in rows] == [task] * 2
+    assert cli.main(["export", "zoo:one", "--out", "tables"]) == 0
+    assert (tmp_path / "tables" / "evaluation.csv").read_text().count(task) == 2
     capsys.readouterr()
     assert cli.main(["zoo"]) == 0
     _, line, *_ = capsys.readouterr().out.splitlines()

@@ -15,6 +15,8 @@ from learner.agents.configs.pqn import PQNConfig
 from learner.agents.configs.rainbow import RainbowConfig
 from learner.config import LearnerConfig, OnPolicyConfig, ReplayConfig
 
+PAGE = (Path(__file__).parents[2] / "docs" / "AGENTS.md").read_text()
+
 
 def settings(config: RunConfig) -> dict[str, object]:
     parts = {"agent": config.agent, "replay": config.replay, "learner": config.learner}
@@ -82,9 +84,22 @@ def test_a_ready_configuration_differs_from_rainbow_by_what_its_name_says(name: 
     assert replace(config, **same) == rainbow
 
 
+@pytest.mark.parametrize("name", ["rainbow_4task", "rainbow_4task_thesis", "dqn_4task"])
+def test_parts_beyond_the_thesis_are_off_in_its_configurations(name: str):
+    """The flags of the page's table. Strength and clean share have no effect without an augmentation."""
+    (section,) = re.findall(r"## Parts beyond the thesis\n(.*?)\n## ", PAGE, re.DOTALL)
+    flags = {flag.replace("-", "_") for flag in re.findall(r"--((?:agent|env|learner)\.[a-z-]+)", section)}
+    assert len(flags) >= 18
+    config = load_config(name)
+    values = {flag: getattr(getattr(config, part), field, None) for flag in flags for part, field in [flag.split(".")]}
+    without_effect = {"agent.augmentation_strength": 1.0, "agent.augmentation_clean_share": 0.5}
+    on = {flag: value for flag, value in values.items() if value}
+    assert on == {"agent.encoder": "nature", "learner.adam_eps": 1e-7} | without_effect
+    assert config.env.frames == "screen"
+
+
 def test_the_page_says_what_each_configuration_has_of_the_recipe():
-    page = (Path(__file__).parents[2] / "docs" / "AGENTS.md").read_text()
-    written = {name: row.split(" | ") for name, row in re.findall(r"^\| `(\w+)` \| ((?:yes|no) .*) \|$", page, re.M)}
+    written = {name: row.split(" | ") for name, row in re.findall(r"^\| `(\w+)` \| ((?:yes|no) .*) \|$", PAGE, re.M)}
     files = sorted(file.stem for file in configs_directory().glob("*.py") if file.stem != "__init__")
     names = [name for name in files if not load_config(name).agent.on_policy]
     assert list(written) == names
@@ -99,6 +114,15 @@ def test_the_page_says_what_each_configuration_has_of_the_recipe():
         parts = (rainbow.double, rainbow.dueling, rainbow.noisy == "factorized", rainbow.distributional, agent.n_steps)
         more = replay.prioritized, config.learner.kpi_weighting, replay.num_newest, agent.hidden_units
         assert written[name] == [word(value) for value in (*parts, *more)], name
+
+
+def test_the_guide_says_what_each_configuration_is_for():
+    guide = (Path(__file__).parents[2] / "docs" / "how-to" / "train.md").read_text()
+    rows = re.findall(r"^\| (`.*?) \| (.*?) \| (.*) \|$", guide, re.M)
+    lengths = {name: length for names, _, length in rows for name in re.findall(r"`([\w.]+)`", names)}
+    for file in configs_directory().glob("[!_]*.py"):
+        length = lengths["rainbow_no_..." if file.stem.startswith("rainbow_no_") else file.stem]
+        assert f"{load_config(file.stem).learner.total_updates:,} gradient steps" in length or "decisions" in length
 
 
 @pytest.mark.parametrize(
