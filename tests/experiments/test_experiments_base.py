@@ -176,7 +176,13 @@ def test_settings_change_their_fields_alone_and_another_agent_comes_first():
     [
         ({"seeds": ()}, r"experiment quick_comparison: seeds: got \(\), want at least one, each once"),
         ({"seeds": (1, 1)}, "want at least one, each once"),
-        ({"configs": "dqn_quick"}, r"configs: got the text 'dqn_quick', want a tuple: \('dqn_quick',\)"),
+        ({"configs": "dqn_quick"}, r"configs: got 'dqn_quick', want a list, such as \['dqn_quick'\]"),
+        ({"players": "random"}, r"players: got 'random', want a list, such as \['random'\]"),
+        ({"total_updates": 2e5}, "total_updates: got 200000.0, want int"),
+        ({"seeds": (1.5,)}, "seeds: got 1.5, want int"),
+        ({"variants": ("a",)}, r"variants: got \('a',\), want Mapping"),
+        ({"tasks_per_level": 0}, "tasks_per_level: got 0, want at least 1"),
+        ({"published": {"thesis": {"seek_an_kill": (1.0, 2.0)}}}, "unknown scenario 'seek_an_kill'"),
         (
             {"evaluate_on": "everything"},
             "evaluate_on: got 'everything', want one of own, test, all, gate, procedural, at",
