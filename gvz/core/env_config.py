@@ -213,8 +213,11 @@ def given_episode_seed(options: Mapping[str, object], others: Sequence[str] = ()
     """The episode seed in the options of an environment's `reset`; None if it has none.
 
     Raises:
-        ValueError: an option that is neither `episode_seed` nor of `others`, or an episode seed outside [0, 2^31).
+        ValueError: no mapping, an option that is neither `episode_seed` nor of `others`, or an episode seed outside
+            [0, 2^31).
     """
+    if not isinstance(options, Mapping):
+        raise ValueError(f"reset: options: got {options!r}, want a dict, such as {{'episode_seed': 1}}")
     known = ("episode_seed", *others)
     if unknown := [name for name in options if name not in known]:
         raise ValueError(f"reset: unknown options {unknown}, want {' or '.join(known)}")
