@@ -209,7 +209,7 @@ EPISODE_SEEDS = 2**31
 """an episode's seed is smaller than this"""
 
 
-def given_episode_seed(options: Mapping[str, object], others: Sequence[str] = ()) -> int | None:
+def given_episode_seed(options: Any, others: Sequence[str] = ()) -> int | None:
     """The episode seed in the options of an environment's `reset`; None if it has none.
 
     Raises:
