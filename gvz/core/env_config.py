@@ -173,7 +173,7 @@ def typed(kind: Any, value: Any, where: str) -> Any:
     is_number = issubclass(type(value), Real) and type(value) is not bool
     is_integer = is_number and issubclass(type(value), Integral)
     if kind is int and is_integer:
-        return value if isinstance(value, int) else int(value)
+        return int(value)
     if kind is float and is_number:
         if (is_integer and abs(value) > _LARGEST_EXACT) or not math.isfinite(value):
             raise ConfigError(f"{where}: got {value}, want a finite float")
@@ -193,14 +193,21 @@ def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield prefix + field.name, value
 
 
-def check_types(config: Any, prefix: str) -> None:
+def check_types(config: Any, prefix: str, *, convert: bool = True) -> None:
     """Gives each field of a frozen dataclass the type that it is annotated with; for its `__post_init__`.
+
+    Args:
+        config: the dataclass.
+        prefix: what its fields are named behind in errors.
+        convert: False only looks at the types, and leaves the values as they are: 1 and 1.0 differ in a script.
 
     Raises:
         ConfigError: as `typed`; names the field behind `prefix`.
     """
     for name, kind in _hints(type(config)).items():
-        object.__setattr__(config, name, typed(kind, getattr(config, name), f"{prefix}.{name}"))
+        value = typed(kind, getattr(config, name), f"{prefix}.{name}")
+        if convert:
+            object.__setattr__(config, name, value)
 
 
 _hints = cache(get_type_hints)

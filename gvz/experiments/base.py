@@ -150,7 +150,7 @@ class Experiment:
     """shown with the table"""
 
     def __post_init__(self) -> None:
-        check_types(self, f"experiment {self.name}")
+        check_types(self, f"experiment {self.name}", convert=False)
         if not self.scenarios:
             object.__setattr__(self, "scenarios", tuple(next(iter(self.published.values()), scenarios())))
         if (problem := next(self._problems(), None)) is not None:

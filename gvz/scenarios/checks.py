@@ -30,9 +30,9 @@ def check_scenario(scenario: "Scenario") -> None:
             unknown reward or lasts no tic; no time-out or bound of a profile; a combined button that the scenario
             lacks.
     """
-    check_types(scenario, f"scenario {scenario.id}")
+    check_types(scenario, f"scenario {scenario.id}", convert=False)
     for content in (scenario.content, scenario.levdoom, *scenario.levdoom_tasks.values()):
-        check_types(content, f"scenario {scenario.id}, content")
+        check_types(content, f"scenario {scenario.id}, content", convert=False)
     if not _NAME.fullmatch(scenario.id):
         raise TaskError(f"scenario: got the id {scenario.id!r}, want lower-case letters, digits and '_'")
     if scenario.content.base_wad is None or scenario.content.textures is None:
@@ -64,9 +64,9 @@ def _check_attributes(scenario: "Scenario") -> None:
     owners: dict[str, str] = {}
     for attribute in scenario.attributes:
         where = f"scenario {scenario.id}, attribute {attribute.name!r}"
-        check_types(attribute, where)
+        check_types(attribute, where, convert=False)
         for content in (attribute.content, attribute.levdoom):
-            check_types(content, f"{where}, content")
+            check_types(content, f"{where}, content", convert=False)
         if not attribute.groups:
             raise TaskError(f"{where}: got no group, want one or more")
         for name in (attribute.name, *attribute.aliases):
@@ -91,7 +91,7 @@ def _check_score(scenario: "Scenario") -> None:
         raise TaskError(f"{where}, combination_buttons: got {strange}, want some of {', '.join(scenario.buttons)}")
     variables = (*scenario.game_variables, *ALWAYS_READ, *BOOKKEEPING)
     for name, reward in scenario.rewards.items():
-        check_types(reward, f"{where}, reward {name!r}")
+        check_types(reward, f"{where}, reward {name!r}", convert=False)
         if isinstance(reward.event, Rose | Fell | Gained) and (read := reward.event.name) not in variables:
             raise TaskError(
                 f"{where}, reward {name!r}: got the variable {read!r}{nearest(read, variables)}, which is not read; "

@@ -180,7 +180,7 @@ def test_settings_change_their_fields_alone_and_another_agent_comes_first():
         ({"players": "random"}, r"players: got 'random', want a list, such as \['random'\]"),
         ({"total_updates": 2e5}, "total_updates: got 200000.0, want int"),
         ({"seeds": (1.5,)}, "seeds: got 1.5, want int"),
-        ({"variants": ("a",)}, r"variants: got \('a',\), want Mapping"),
+        ({"variants": ("a",)}, r"variants: got \('a',\), want a mapping"),
         ({"tasks_per_level": 0}, "tasks_per_level: got 0, want at least 1"),
         ({"published": {"thesis": {"seek_an_kill": (1.0, 2.0)}}}, "unknown scenario 'seek_an_kill'"),
         (
