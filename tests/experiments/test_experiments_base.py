@@ -224,8 +224,9 @@ def test_an_unknown_name_is_answered_with_the_nearest():
 def test_the_page_lists_every_experiment_with_its_size():
     page = (Path(__file__).parents[2] / "docs" / "EXPERIMENTS.md").read_text()
     for experiment in experiments().values():
-        (line,) = [line for line in page.splitlines() if line.startswith(f"| `{experiment.name}` |")]
-        assert line.endswith(f"| {len(experiment.runs())} | {experiment.total_updates:,} |")
+        lines = [line for line in page.splitlines() if line.startswith(f"| `{experiment.name}` |")]
+        assert len(lines) == 1, f"want one row of {experiment.name} in the first table of docs/EXPERIMENTS.md"
+        assert lines[0].endswith(f"| {len(experiment.runs())} | {experiment.total_updates:,} |")
 
 
 def test_the_page_says_which_processor_time_a_run_of_each_experiment_has():
