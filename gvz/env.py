@@ -273,6 +273,11 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             self._window = None
         self._playing = False
 
+    def __getstate__(self) -> dict[str, Any]:
+        if self._engine is not None:
+            raise TypeError("DoomEnv: a running game can be neither copied nor pickled; close it, or make another one")
+        return self.__dict__
+
     def _begin(self) -> tuple[Engine, EngineError | None]:
         """Starts the episode, on a new engine if needed; returns the engine, and the error if an engine died."""
         crash = None

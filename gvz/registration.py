@@ -6,6 +6,8 @@ from importlib.util import find_spec
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from gvz.core.errors import ConfigError
+
 if TYPE_CHECKING:
     from gvz.scenarios.base import Task
 
@@ -20,7 +22,11 @@ def gymnasium_id(task: "Task") -> str:
 
 
 def register_envs() -> None:
-    """Registers the named tasks of every suite in Gymnasium."""
+    """Registers the named tasks of every suite in Gymnasium.
+
+    Raises:
+        ConfigError: two tasks would have one id, because their scenarios have one title.
+    """
     import gymnasium
 
     from gvz.tasks import all_scenarios, named_tasks
@@ -34,6 +40,8 @@ def register_envs() -> None:
                 vector_entry_point="gvz.vector.env:of_task",
                 kwargs={"task": task.id},
             )
+        elif (other := gymnasium.registry[name].kwargs.get("task")) != task.id:
+            raise ConfigError(f"{task.id}: got the id {name} in Gymnasium, which {other} has; want another title")
 
 
 def register_with_gymnasium() -> None:

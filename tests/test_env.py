@@ -346,6 +346,7 @@ def test_wrong_arguments_fail_at_construction(options: dict, error: type[Excepti
 def test_wrong_calls_say_what_is_wanted(shared: DoomEnv):
     for options, message in (
         ({"sed": 1}, r"unknown options \['sed'\]"),
+        (["episode_seed"], r"options: got \['episode_seed'\], want a dict"),
         ({"episode_seed": 2**31}, r"episode_seed 2147483648, want an integer, 0\.\.2147483647"),
         ({"episode_seed": 1.9}, r"episode_seed 1\.9, want an integer"),
     ):

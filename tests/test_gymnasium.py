@@ -1,16 +1,21 @@
 """The environments as Gymnasium's own: its checker, registration by name, vector environments, wrappers."""
 
+import copy
+import dataclasses
+import pickle
 import subprocess
 import sys
+from collections.abc import Callable
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from gvz.core.errors import ConfigError
 from gvz.env import DoomEnv
-from gvz.registration import gymnasium_id
-from gvz.tasks import named_tasks, parse_task, scenarios
+from gvz.registration import gymnasium_id, register_envs
+from gvz.tasks import named_tasks, parse_task, scenario_named, scenarios
 from tests.episodes import TURN
 
 pytestmark = pytest.mark.engine
@@ -49,6 +54,25 @@ def test_ids_are_names():
         == "GViZDoom/DefendTheCenter-Gore-MossyBricks-v0"
     )
     assert gymnasium_id(parse_task("seek_and_kill/complete")) == "GViZDoom/SeekAndKill-Complete-v0"
+
+
+def test_a_scenario_with_the_title_of_another_one_is_refused(monkeypatch: pytest.MonkeyPatch):
+    """Else an id would play the tasks of whichever scenario came first."""
+    copied = dataclasses.replace(scenario_named("seek_and_kill"), id="hunt")
+    monkeypatch.setattr("gvz.tasks.all_scenarios", lambda: {"hunt": copied})
+    said = r"hunt/default: got the id GViZDoom/SeekAndKill-Default-v0 in Gymnasium, which seek_and_kill/default has"
+    with pytest.raises(ConfigError, match=said):
+        register_envs()
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_a_running_game_is_not_copied_or_pickled_and_a_closed_one_is(copied: Callable[[DoomEnv], object]):
+    env = DoomEnv("defend_the_center/default")
+    env.reset(seed=1)
+    with pytest.raises(TypeError, match="a running game can be neither copied nor pickled; close it, or make another"):
+        copied(env)
+    env.close()
+    copied(env)
 
 
 def test_every_named_task_is_registered():

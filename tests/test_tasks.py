@@ -5,7 +5,6 @@ import doctest
 import functools
 import pickle
 from pathlib import Path
-from typing import Any
 
 import cloudpickle
 import gymnasium
@@ -20,7 +19,6 @@ from gvz.core.errors import TaskError
 from gvz.scenarios.base import Attribute, Content, Task, Textures
 from gvz.scenarios.compiler import task_content
 from gvz.scenarios.map_set import PARTS, MapSet
-from gvz.scenarios.rewards import Fell, Pace, Reward, living
 from gvz.tasks import all_scenarios, named_tasks, parse_task, scenario_named, scenarios
 
 LEVELS = {  # tasks of level 0, 1, 2, 3, 4
@@ -288,63 +286,6 @@ def test_an_added_attribute_obeys_its_group():
     with_ice = dataclasses.replace(scenario, attributes=(*scenario.attributes, ice))
     with pytest.raises(TaskError, match="ice and stone_wall are both of group textures"):
         Task(with_ice, ("ice", "stone_wall"))
-
-
-ICE = Attribute(name="ice", groups=("textures",), content=Content(textures=Textures("FLAT14", "A", "B")))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"name": "gore"}, r"got the name 'gore', which 'gore' has; want another one"),
-        ({"aliases": ("fast",)}, r"got the name 'fast', which 'fast_enemies' has"),
-        ({"name": "on+ice"}, r"got the name 'on\+ice', want lower-case letters, digits and '_'"),
-        ({"name": "ice=1"}, r"got the name 'ice=1', want lower-case"),
-        ({"name": "Ice"}, r"got the name 'Ice', want lower-case"),
-        ({"name": "varied"}, r"got the name 'varied', want .* none of default, complete, varied, procedural"),
-        ({"groups": "map"}, r"got the text 'map' for its groups, want a tuple, such as \('map',\)"),
-        ({"aliases": "ice_cold"}, r"got the text 'ice_cold' for its aliases"),
-        ({"groups": ()}, r"got no group"),
-    ],
-)
-def test_an_attribute_whose_name_or_groups_would_make_another_task_is_refused(changes: dict[str, Any], message: str):
-    scenario = scenario_named("defend_the_center")
-    with pytest.raises(TaskError, match=f"scenario defend_the_center, attribute .*{message}"):
-        dataclasses.replace(scenario, attributes=(*scenario.attributes, dataclasses.replace(ICE, **changes)))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (
-            {"levdoom_tasks": {"stone_wall+gore": Content()}},
-            r"levdoom_tasks: got 'stone_wall\+gore', want .*'gore\+ston",
-        ),
-        ({"levdoom_tasks": {"fast": Content()}}, "got 'fast', want the task's name, 'fast_enemies'"),
-        ({"levdoom_tasks": {"gor": Content()}}, "unknown attribute 'gor'"),
-        ({"complete": ("gore", "fast")}, "complete: got 'fast', want the attribute's name, 'fast_enemies'"),
-        ({"content": Content(base_wad="basic.wad")}, "got a content without base_wad or textures"),
-        ({"content": Content(textures=ICE.content.textures)}, "got a content without base_wad or textures"),
-        ({"metric": "kill"}, "got the metric 'kill', want one of frames_alive, kills, goals"),
-        (
-            {"timeouts": {"thesis": 1100}},
-            "got timeouts {'thesis': 1100}, want a positive one for each profile",
-        ),
-        ({"upper_bounds": {"thesis": 0, "levdoom": 1}}, "got upper_bounds .*, want a positive one for each"),
-        ({"combination_buttons": ("ATTACK", "SPEED")}, "combination_buttons: got {'SPEED'}, want some of ATTACK, TURN"),
-        (
-            {"rewards": {"shells": Reward(event=Fell("AMMO3"), weight=-1.0, levdoom=-1.0)}},
-            r"reward 'shells': got the variable 'AMMO3' \(did you mean 'AMMO2'\?\), which is not read; want one of",
-        ),
-        (
-            {"rewards": {"alive": Reward(event=living, weight=1.0, levdoom=1.0, paces=(Pace(needs="ammo"),))}},
-            "reward 'alive': got a pace that needs 'ammo', want one of alive",
-        ),
-    ],
-)
-def test_a_scenario_whose_parts_do_not_fit_together_is_refused(changes: dict[str, Any], message: str):
-    with pytest.raises(TaskError, match=f"scenario defend_the_center.*{message}"):
-        dataclasses.replace(scenario_named("defend_the_center"), **changes)
 
 
 TABLE_3_1 = {

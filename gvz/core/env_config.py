@@ -1,11 +1,14 @@
 """The vocabulary of sizes that game, actors and learner share, and the check of a field's type."""
 
+import contextlib
 import math
 import operator
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
 from numbers import Integral, Real
 from pathlib import Path
+from types import UnionType
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from gvz.core.errors import ConfigError
@@ -129,7 +132,8 @@ def typed(kind: Any, value: Any, where: str) -> Any:
     Nothing else is converted: True is no 1, and 4.0 no 4.
 
     Args:
-        kind: bool, int, float, str, Path, a Literal, a tuple, or one of these or None.
+        kind: bool, int, float, str, Path, another class, a Literal, a tuple or a Mapping of these, one of several, or
+            one or None. What is Any is not looked at.
         value: anything.
         where: the field, for the error.
 
@@ -139,9 +143,22 @@ def typed(kind: Any, value: Any, where: str) -> Any:
     origin, args = get_origin(kind), get_args(kind)
     if type(None) in args:
         return None if value is None else typed(next(a for a in args if a is not type(None)), value, where)
+    if kind is Any:
+        return value
+    if origin is UnionType:
+        for one in args:
+            with contextlib.suppress(ConfigError):
+                return typed(one, value, where)
+        raise ConfigError(f"{where}: got {value!r}, want {kind}")
+    if origin is Mapping:
+        if not isinstance(value, Mapping):
+            raise ConfigError(f"{where}: got {value!r}, want a mapping")
+        of_name, of_value = args
+        return {typed(of_name, n, where): typed(of_value, one, f"{where}[{n!r}]") for n, one in value.items()}
     if origin is tuple:
         if not isinstance(value, list | tuple):
-            raise ConfigError(f"{where}: got {value!r}, want a list")
+            example = f", such as [{value!r}]" if type(value) is args[0] else ""
+            raise ConfigError(f"{where}: got {value!r}, want a list{example}")
         if args[-1] is ...:
             return tuple(typed(args[0], item, where) for item in value)
         if len(value) != len(args):
@@ -161,8 +178,8 @@ def typed(kind: Any, value: Any, where: str) -> Any:
         if (is_integer and abs(value) > _LARGEST_EXACT) or not math.isfinite(value):
             raise ConfigError(f"{where}: got {value}, want a finite float")
         return float(value)
-    if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
-        raise ConfigError(f"{where}: got {value!r}, want {kind.__name__}")
+    if not isinstance(value, origin or kind) or (kind is not bool and isinstance(value, bool)):
+        raise ConfigError(f"{where}: got {value!r}, want {'a function' if origin is Callable else kind.__name__}")
     return value
 
 
@@ -176,26 +193,38 @@ def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield prefix + field.name, value
 
 
-def check_types(config: Any, prefix: str) -> None:
+def check_types(config: Any, prefix: str, *, convert: bool = True) -> None:
     """Gives each field of a frozen dataclass the type that it is annotated with; for its `__post_init__`.
+
+    Args:
+        config: the dataclass.
+        prefix: what its fields are named behind in errors.
+        convert: False only looks at the types, and leaves the values as they are: 1 and 1.0 differ in a script.
 
     Raises:
         ConfigError: as `typed`; names the field behind `prefix`.
     """
-    for name, kind in get_type_hints(type(config)).items():
-        object.__setattr__(config, name, typed(kind, getattr(config, name), f"{prefix}.{name}"))
+    for name, kind in _hints(type(config)).items():
+        value = typed(kind, getattr(config, name), f"{prefix}.{name}")
+        if convert:
+            object.__setattr__(config, name, value)
 
+
+_hints = cache(get_type_hints)
 
 EPISODE_SEEDS = 2**31
 """an episode's seed is smaller than this"""
 
 
-def given_episode_seed(options: Mapping[str, object], others: Sequence[str] = ()) -> int | None:
+def given_episode_seed(options: Any, others: Sequence[str] = ()) -> int | None:
     """The episode seed in the options of an environment's `reset`; None if it has none.
 
     Raises:
-        ValueError: an option that is neither `episode_seed` nor of `others`, or an episode seed outside [0, 2^31).
+        ValueError: no mapping, an option that is neither `episode_seed` nor of `others`, or an episode seed outside
+            [0, 2^31).
     """
+    if not isinstance(options, Mapping):
+        raise ValueError(f"reset: options: got {options!r}, want a dict, such as {{'episode_seed': 1}}")
     known = ("episode_seed", *others)
     if unknown := [name for name in options if name not in known]:
         raise ValueError(f"reset: unknown options {unknown}, want {' or '.join(known)}")

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from gvz.core.errors import ConfigError, nearest
+from gvz.core.errors import ConfigError, GvzError, nearest
 
 
 class OwnFiles(NamedTuple):
@@ -39,7 +39,8 @@ def discover(package: str, constant: str | None = None) -> dict[str, ModuleType]
     Returns: file name without suffix -> module, in alphabetical order. Sub-packages are left out.
 
     Raises:
-        ImportError: the package or one of its modules cannot be imported.
+        ConfigError: one of its modules cannot be imported; names the file and its line.
+        ImportError: the package cannot be imported, or a library that a module needs, as when it is interrupted.
         ValueError: `package` names a module that is not a package.
     """
     parent = import_module(package)
@@ -48,18 +49,18 @@ def discover(package: str, constant: str | None = None) -> dict[str, ModuleType]
     names = sorted(info.name for info in pkgutil.iter_modules(parent.__path__) if not info.ispkg)
     if constant is not None:
         names = [name for name in names if _sets(f"{package}.{name}", constant)]
-    return {name: import_module(f"{package}.{name}") for name in names}
+    return {name: _imported(f"{package}.{name}") for name in names}
 
 
 def named(package: str, constant: str, attribute: str) -> dict[str, Any]:
     """The constants of a package's modules by file name, where each has its file's name as an attribute, too.
 
     Raises:
-        ConfigError: one has another name.
+        ConfigError: one has another name, or as `discover`.
     """
     found = {name: getattr(module, constant) for name, module in discover(package, constant).items()}
     for name, one in found.items():
-        if (got := getattr(one, attribute)) != name:
+        if (got := getattr(one, attribute, None)) != name:
             raise ConfigError(
                 f"{package}: {name}.py: got {constant} with {attribute} {got!r}, want {name!r}, the name of its file"
             )
@@ -111,10 +112,23 @@ def find(package: str, constant: str, name: str, field: str, *arguments: str) ->
 
 
 def _sets(module: str, constant: str) -> bool:
+    return re.search(rf"^{constant}\b.*=", _file(module).read_text(encoding="utf-8"), re.MULTILINE) is not None
+
+
+def _file(module: str) -> Path:
     spec = find_spec(module)
     assert spec is not None
     assert spec.origin is not None
-    return re.search(rf"^{constant}\b.*=", Path(spec.origin).read_text(encoding="utf-8"), re.MULTILINE) is not None
+    return Path(spec.origin)
+
+
+def _imported(module: str) -> ModuleType:
+    try:
+        return import_module(module)
+    except Exception as error:
+        if isinstance(error, ImportError) and error.name is None:  # a library's own, as when it is interrupted
+            raise
+        raise failed(error, _file(module)) from error
 
 
 @cache
@@ -126,13 +140,19 @@ def _module_in_file(file: Path) -> ModuleType:
     module = sys.modules[name] = module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # the file is the user's own program: anything may come out of it
+    except Exception as error:
         del sys.modules[name]
-        raise ConfigError(f"{place(error, file)}: {type(error).__name__}: {error}") from error
+        raise failed(error, file) from error
     return module
 
 
-def place(error: Exception, file: Path) -> str:
-    """The file that was executed, with the number of its line that `error` came from if there is one."""
+def failed(error: Exception, file: Path) -> ConfigError:
+    """The error of a file that was executed: it is the user's own program, and anything may come out of it.
+
+    It names the number of the file's line that `error` came from, if there is one.
+    """
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(file)]
-    return f"{file}, line {lines[-1]}" if lines else str(file)
+    where = f"{file}, line {lines[-1]}" if lines else str(file)
+    return ConfigError(
+        f"{where}: {error}" if isinstance(error, GvzError) else f"{where}: {type(error).__name__}: {error}"
+    )

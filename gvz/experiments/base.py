@@ -11,6 +11,7 @@ from functools import cache
 from types import MappingProxyType
 from typing import Any, Literal, get_args
 
+from gvz.core.env_config import check_types
 from gvz.core.errors import ConfigError, nearest
 from gvz.core.registry import named
 from gvz.evaluation.simple import SIMPLE_PLAYERS
@@ -149,6 +150,7 @@ class Experiment:
     """shown with the table"""
 
     def __post_init__(self) -> None:
+        check_types(self, f"experiment {self.name}", convert=False)
         if not self.scenarios:
             object.__setattr__(self, "scenarios", tuple(next(iter(self.published.values()), scenarios())))
         if (problem := next(self._problems(), None)) is not None:
@@ -158,16 +160,11 @@ class Experiment:
         """Why the experiment cannot be; each reason may depend on the absence of those before it."""
         for name in ("configs", "scenarios", "trainings", "seeds"):
             values = getattr(self, name)
-            if isinstance(values, str):
-                yield f"{name}: got the text {values!r}, want a tuple: ({values!r},)"
             if not values or len(set(values)) < len(values):
                 yield f"{name}: got {values}, want at least one, each once"
-        for name in ("total_updates", "num_checkpoints", "episodes", "table_checkpoints"):
-            if getattr(self, name) < 1:
-                yield f"{name}: got {getattr(self, name)}, want at least 1"
-        for name, choices in (("evaluate_on", get_args(EvaluateOn)), ("columns", get_args(Columns))):
-            if getattr(self, name) not in choices:
-                yield f"{name}: got {getattr(self, name)!r}, want one of {', '.join(choices)}"
+        for name in ("total_updates", "num_checkpoints", "episodes", "table_checkpoints", "tasks_per_level"):
+            if (number := getattr(self, name)) is not None and number < 1:
+                yield f"{name}: got {number}, want at least 1"
         if not self.table_checkpoints <= self.num_checkpoints <= self.total_updates:
             yield (
                 f"got table_checkpoints {self.table_checkpoints}, num_checkpoints {self.num_checkpoints}, "
@@ -209,6 +206,7 @@ class Experiment:
         width = len(self.column_names)
         for who, rows in self.published.items():
             for scenario, values in rows.items():
+                scenario_named(scenario)
                 if len(values) != width:
                     yield (
                         f"published by {who}, {scenario}: got {len(values)} numbers, want {width}, one for each "

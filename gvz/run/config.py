@@ -10,7 +10,7 @@ from typing import Literal
 from actors.config import MAX_LANES, ActorsConfig
 from gvz.cluster.config import ClusterConfig
 from gvz.core.control_groups import num_cores
-from gvz.core.env_config import EnvConfig, leaves
+from gvz.core.env_config import EnvConfig, check_types, leaves
 from gvz.core.errors import ConfigError
 from gvz.core.registry import OwnFiles
 from gvz.run.curriculum_config import CurriculumConfig, check_curriculum
@@ -108,6 +108,7 @@ class RunConfig:
     log: LogConfig = field(default_factory=LogConfig)
 
     def __post_init__(self) -> None:
+        check_types(self, "CONFIG", convert=False)
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._+-]*", self.name):
             raise ConfigError(f"name: got {self.name!r}, want letters, digits and . _ + - (it names a directory)")
         if not 0 <= self.seed < 2**31:

@@ -11,8 +11,8 @@ from types import MappingProxyType
 from typing import Any, get_args, get_type_hints
 
 from gvz.core.env_config import typed
-from gvz.core.errors import ConfigError, TaskError, nearest
-from gvz.core.registry import NO_OWN_FILES, OwnFiles, place
+from gvz.core.errors import ConfigError, nearest
+from gvz.core.registry import NO_OWN_FILES, OwnFiles, failed
 from gvz.run.config import RunConfig, with_agent
 from gvz.tasks import scenario_named
 from learner.config import AgentConfig, LearnerConfig, OnPolicyConfig, agent_config_class
@@ -78,10 +78,8 @@ def load_config(text: str, scenario: str | None = None) -> RunConfig:
         for name in settings:
             scenario_named(name)  # or an error that names it
         return with_settings(config, settings.get(scenario, {}))
-    except (ConfigError, TaskError) as error:
-        raise ConfigError(f"{place(error, path)}: {error}") from error
-    except Exception as error:  # a config file is the user's own program: anything may come out of it
-        raise ConfigError(f"{place(error, path)}: {type(error).__name__}: {error}") from error
+    except Exception as error:
+        raise failed(error, path) from error
 
 
 @lru_cache(maxsize=1)

@@ -49,7 +49,7 @@ class Period(int):
     """Tics after which something comes again; 0: it never comes. At a severity it comes so much more rarely."""
 
 
-Value = int | float | str | Uniform | Toward | Chance | tuple[str | float, ...]
+Value = bool | int | float | str | Uniform | Toward | Chance | tuple[str | float, ...]
 """A value in a script. int: ACS integer; float: fixed point; str: unchanged ACS expression; tuple: initializer of an
 array, with quoted strings. Toward and Chance are for properties alone."""
 

@@ -4,7 +4,7 @@ import dataclasses
 import re
 from typing import TYPE_CHECKING, get_args
 
-from gvz.core.env_config import Profile
+from gvz.core.env_config import Profile, check_types
 from gvz.core.errors import TaskError, nearest
 from gvz.scenarios.map_set import PROCEDURAL, VARIED
 from gvz.scenarios.rewards import Fell, Gained, Rose
@@ -23,15 +23,22 @@ def check_scenario(scenario: "Scenario") -> None:
     """Refuses a scenario that would play another task than an id says, or whose rewards or scores would be wrong.
 
     Raises:
-        TaskError: a name of an attribute that ids cannot have or that another attribute has; groups or aliases that are
-            no tuple; no group; an attribute in `complete` or an exception in `levdoom_tasks` under another name than
-            its own; no base map or textures; an unknown metric; a reward of a variable that is not read; a pace that
-            needs an unknown reward; no time-out or bound of a profile; a combined button that the scenario lacks.
+        ConfigError: a field of another type.
+        TaskError: a name of an attribute that ids cannot have or that another attribute has; no group; an attribute in
+            `complete` or an exception in `levdoom_tasks` under another name than its own; a set without tasks, or with
+            one that has no name; no base map or textures; a reward of a variable that is not read; a pace that needs an
+            unknown reward or lasts no tic; no time-out or bound of a profile; a combined button that the scenario
+            lacks.
     """
+    check_types(scenario, f"scenario {scenario.id}", convert=False)
+    for content in (scenario.content, scenario.levdoom, *scenario.levdoom_tasks.values()):
+        check_types(content, f"scenario {scenario.id}, content", convert=False)
     if not _NAME.fullmatch(scenario.id):
         raise TaskError(f"scenario: got the id {scenario.id!r}, want lower-case letters, digits and '_'")
     if scenario.content.base_wad is None or scenario.content.textures is None:
         raise TaskError(f"scenario {scenario.id}: got a content without base_wad or textures, want both")
+    from gvz.scenarios.base import Split  # which imports this module
+
     _check_attributes(scenario)
     for name in scenario.complete:
         if name != (wanted := scenario.attribute(name).name):
@@ -41,6 +48,15 @@ def check_scenario(scenario: "Scenario") -> None:
         wanted = "complete" if set(names) == set(scenario.complete) else "+".join(names)
         if task != wanted:
             raise TaskError(f"scenario {scenario.id}, levdoom_tasks: got {task!r}, want the task's name, {wanted!r}")
+    for split in get_args(Split):
+        names = scenario.splits.get(split, ())
+        if not names:
+            raise TaskError(f"scenario {scenario.id}, splits: got no task for {split}, want one or more")
+        if strange := [name for name in names if name not in scenario.tasks]:
+            raise TaskError(
+                f"scenario {scenario.id}, splits, {split}: got {strange[0]!r}{nearest(strange[0], scenario.tasks)}, "
+                f"want some of its tasks: {', '.join(scenario.tasks)}"
+            )
     _check_score(scenario)
 
 
@@ -48,9 +64,9 @@ def _check_attributes(scenario: "Scenario") -> None:
     owners: dict[str, str] = {}
     for attribute in scenario.attributes:
         where = f"scenario {scenario.id}, attribute {attribute.name!r}"
-        for field in ("groups", "aliases"):
-            if isinstance(text := getattr(attribute, field), str):
-                raise TaskError(f"{where}: got the text {text!r} for its {field}, want a tuple, such as ({text!r},)")
+        check_types(attribute, where, convert=False)
+        for content in (attribute.content, attribute.levdoom):
+            check_types(content, f"{where}, content", convert=False)
         if not attribute.groups:
             raise TaskError(f"{where}: got no group, want one or more")
         for name in (attribute.name, *attribute.aliases):
@@ -65,11 +81,9 @@ def _check_attributes(scenario: "Scenario") -> None:
 
 
 def _check_score(scenario: "Scenario") -> None:
-    from gvz.scenarios.base import BOOKKEEPING, Metric  # which imports this module
+    from gvz.scenarios.base import BOOKKEEPING  # which imports this module
 
     where = f"scenario {scenario.id}"
-    if scenario.metric not in get_args(Metric):
-        raise TaskError(f"{where}: got the metric {scenario.metric!r}, want one of {', '.join(get_args(Metric))}")
     for field in ("timeouts", "upper_bounds"):
         if not all(getattr(scenario, field).get(profile, 0) > 0 for profile in get_args(Profile)):
             raise TaskError(f"{where}: got {field} {getattr(scenario, field)}, want a positive one for each profile")
@@ -77,12 +91,15 @@ def _check_score(scenario: "Scenario") -> None:
         raise TaskError(f"{where}, combination_buttons: got {strange}, want some of {', '.join(scenario.buttons)}")
     variables = (*scenario.game_variables, *ALWAYS_READ, *BOOKKEEPING)
     for name, reward in scenario.rewards.items():
+        check_types(reward, f"{where}, reward {name!r}", convert=False)
         if isinstance(reward.event, Rose | Fell | Gained) and (read := reward.event.name) not in variables:
             raise TaskError(
                 f"{where}, reward {name!r}: got the variable {read!r}{nearest(read, variables)}, which is not read; "
                 f"want one of {', '.join(variables)}, or add it to game_variables"
             )
         for pace in (*reward.paces, *(reward.levdoom_paces or ())):
+            if not (pace.tics > 0 and pace.times > 0):
+                raise TaskError(f"{where}, reward {name!r}: got {pace}, want more than 0 tics and more than 0 times")
             if pace.needs is not None and pace.needs not in scenario.rewards:
                 raise TaskError(
                     f"{where}, reward {name!r}: got a pace that needs {pace.needs!r}, "

@@ -12,7 +12,7 @@ import hashlib
 import itertools
 import re
 import secrets
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -105,7 +105,7 @@ def _map_alone(task: Task, profile: Profile, number: int | None = None) -> tuple
 def _in_force(task: Task, profile: Profile, episode_seed: int) -> Task:
     """The task that an episode plays: a whole attribute of severity below 1 is in force in a part of the episodes."""
     sometimes = _sometimes(task, profile)
-    idle = [name for name in sometimes if not in_force(task.severity(name), name, episode_seed)]
+    idle = tuple(name for name in sometimes if not in_force(task.severity(name), name, episode_seed))
     return _one_way(task, profile, idle)
 
 
@@ -114,7 +114,8 @@ def _sometimes(task: Task, profile: Profile) -> list[str]:
     return [name for name, _ in task.severities if is_whole(_change(task.scenario.attribute(name), profile))]
 
 
-def _one_way(task: Task, profile: Profile, idle: Iterable[str]) -> Task:
+@lru_cache(maxsize=1000)
+def _one_way(task: Task, profile: Profile, idle: tuple[str, ...]) -> Task:
     """The task with these attributes left out, and others that are sometimes in force in force."""
     fixed = dict.fromkeys(_sometimes(task, profile), 1.0) | dict.fromkeys(idle, 0.0)
     if not fixed:
@@ -127,7 +128,7 @@ def _all_ways(task: Task, profile: Profile) -> Content:
     """The classes and blended textures of all maps that the task's episodes play."""
     sometimes, found = _sometimes(task, profile), Content()
     for idle in itertools.product((False, True), repeat=len(sometimes)):
-        content = task_content(_one_way(task, profile, itertools.compress(sometimes, idle)), profile)
+        content = task_content(_one_way(task, profile, tuple(itertools.compress(sometimes, idle))), profile)
         found = found.overlaid(Content(actors=content.actors, blends=content.blends))
     return found
 

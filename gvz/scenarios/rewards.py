@@ -149,7 +149,7 @@ class Rewarder:
         assert self._history, "Rewarder.step before reset"
         self._history.append(variables)
         history = self._history  # "0.0 +" turns -0.0 into 0.0 for the logs
-        return {name: 0.0 + weight * event(history, terminated) for name, weight, event in self._terms}
+        return {name: 0.0 + weight * float(event(history, terminated)) for name, weight, event in self._terms}
 
 
 def return_range(

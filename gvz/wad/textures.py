@@ -149,8 +149,13 @@ def blended(
         patches: of all wall textures.
 
     Raises:
-        WadError: an unknown texture.
+        WadError: an unknown texture; an opacity outside 0..1; a name that the engine would cut off.
     """
+    if not _NAME.fullmatch(name) or name != name.upper() or not 0 <= opacity <= 1:
+        raise WadError(
+            f"texture {name}: got a blend with opacity {opacity:g}, want a name of 1 to 8 upper-case ASCII characters, "
+            "and an opacity from 0 to 1"
+        )
     for texture in (under, over):
         _check_texture(f"texture {name}", texture, sizes)
     width, height = (math.lcm(*pair) for pair in zip(sizes[under], sizes[over], strict=True))

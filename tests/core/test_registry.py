@@ -41,8 +41,26 @@ def test_with_a_constant_only_modules_that_set_it_are_imported(package: Path):
 
 def test_a_module_that_cannot_be_imported_is_not_skipped(package: Path):
     (package / "broken.py").write_text("import nothing_of_that_name\n")
-    with pytest.raises(ImportError, match="nothing_of_that_name"):
+    with pytest.raises(ConfigError, match=r"broken\.py, line 1: ModuleNotFoundError: No module named 'nothing_of_that"):
         discover("found_by_name")
+    (package / "broken.py").write_text("raise ImportError('initialization failed')\n")  # as an interrupted library
+    with pytest.raises(ImportError, match="initialization failed"):
+        discover("found_by_name")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("KIND = (\n", r"hen\.py: SyntaxError: '\(' was never closed"),
+        ("\nKIND = dict(1)\n", r"hen\.py, line 2: TypeError: 'int' object is not iterable$"),
+        ("from gvz.tasks import parse_task\n\nKIND = parse_task('x')\n", r"hen\.py, line 3: task: got 'x', want"),
+        ("KIND = 3\n", r"hen\.py: got KIND with id None, want 'hen', the name of its file"),
+    ],
+)
+def test_what_a_module_raises_is_told_in_one_line(package: Path, text: str, message: str):
+    (package / "hen.py").write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        named("found_by_name", "KIND", "id")
 
 
 def test_a_module_that_is_no_package_is_refused():

@@ -176,7 +176,13 @@ def test_settings_change_their_fields_alone_and_another_agent_comes_first():
     [
         ({"seeds": ()}, r"experiment quick_comparison: seeds: got \(\), want at least one, each once"),
         ({"seeds": (1, 1)}, "want at least one, each once"),
-        ({"configs": "dqn_quick"}, r"configs: got the text 'dqn_quick', want a tuple: \('dqn_quick',\)"),
+        ({"configs": "dqn_quick"}, r"configs: got 'dqn_quick', want a list, such as \['dqn_quick'\]"),
+        ({"players": "random"}, r"players: got 'random', want a list, such as \['random'\]"),
+        ({"total_updates": 2e5}, "total_updates: got 200000.0, want int"),
+        ({"seeds": (1.5,)}, "seeds: got 1.5, want int"),
+        ({"variants": ("a",)}, r"variants: got \('a',\), want a mapping"),
+        ({"tasks_per_level": 0}, "tasks_per_level: got 0, want at least 1"),
+        ({"published": {"thesis": {"seek_an_kill": (1.0, 2.0)}}}, "unknown scenario 'seek_an_kill'"),
         (
             {"evaluate_on": "everything"},
             "evaluate_on: got 'everything', want one of own, test, all, gate, procedural, at",
@@ -218,8 +224,9 @@ def test_an_unknown_name_is_answered_with_the_nearest():
 def test_the_page_lists_every_experiment_with_its_size():
     page = (Path(__file__).parents[2] / "docs" / "EXPERIMENTS.md").read_text()
     for experiment in experiments().values():
-        (line,) = [line for line in page.splitlines() if line.startswith(f"| `{experiment.name}` |")]
-        assert line.endswith(f"| {len(experiment.runs())} | {experiment.total_updates:,} |")
+        lines = [line for line in page.splitlines() if line.startswith(f"| `{experiment.name}` |")]
+        assert len(lines) == 1, f"want one row of {experiment.name} in the first table of docs/EXPERIMENTS.md"
+        assert lines[0].endswith(f"| {len(experiment.runs())} | {experiment.total_updates:,} |")
 
 
 def test_the_page_says_which_processor_time_a_run_of_each_experiment_has():

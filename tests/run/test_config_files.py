@@ -26,7 +26,17 @@ def test_a_path_is_taken_as_a_path(tmp_path):
         ("x = 1\n1 / 0", ", line 3: ZeroDivisionError: division by zero"),
         ("def (", "SyntaxError"),
         ("CONFIG = RunConfig(name='a b')", ", line 2: name: got 'a b'"),
-        ("CONFIG = RunConfig(name='a', mode='asynch')", "CONFIG.mode: got 'asynch'"),
+        ("CONFIG = RunConfig(name='a', mode='asynch')", ", line 2: CONFIG.mode: got 'asynch'"),
+        (
+            "CONFIG = RunConfig(name='a', training_set=2)",
+            "CONFIG.training_set: got 2, want one of 1, 4, 8, pairs, comp",
+        ),
+        ("CONFIG = RunConfig(name='a', env={'frame_skip': 2})", "CONFIG.env: got {'frame_skip': 2}, want EnvConfig"),
+        ("CONFIG = RunConfig(name='a', learner=LearnerConfig)", "CONFIG.learner: got <class 'learner.config.Lear"),
+        (
+            "CONFIG = RunConfig(name='a', tasks='rockets/blue')",
+            "CONFIG.tasks: got 'rockets/blue', want a list, such as",
+        ),
         (
             "CONFIG = RunConfig(name='a', learner=LearnerConfig(batch_size=32.5))",
             "CONFIG.learner.batch_size: got 32.5, want int",

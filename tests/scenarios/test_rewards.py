@@ -6,7 +6,7 @@ import math
 import re
 from contextlib import closing
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from gvz.evaluation.players import CLASSES
 from gvz.evaluation.simple import player_env
 from gvz.scenarios.base import Scenario, Task
 from gvz.scenarios.compiler import compile_task
-from gvz.scenarios.rewards import Pace, Reward, living, return_range
+from gvz.scenarios.rewards import Pace, Reward, Rewarder, living, return_range
 from gvz.tasks import all_scenarios, parse_task, scenario_named, scenarios
 
 ALIVE = {"KILLCOUNT": 0, "PLAYER_KILLS": 0, "AMMO2": 26, "HEALTH": 100, "POSITION_X": 0, "POSITION_Y": 0}
@@ -125,6 +125,15 @@ def test_weights_of_any_number_type_are_taken():
     rewarder = scenario_named("defend_the_center").make_rewarder({"kill": 2, "death": np.float32(-0.5)})
     assert (rewarder.weights["kill"], rewarder.weights["death"]) == (2.0, -0.5)
     assert {type(weight) for weight in rewarder.weights.values()} == {float}
+
+
+@pytest.mark.parametrize("amount", [np.float64(3), np.float32(3), np.int64(3), 3])
+def test_an_event_may_give_any_number_type(amount: Any):
+    """The sum of an episode's rewards goes into records, which take Python's numbers alone."""
+    rewarder = Rewarder({"mine": lambda _history, _terminated: amount}, {"mine": 0.5})
+    rewarder.reset(ALIVE)
+    reward = rewarder.step(ALIVE, False)["mine"]
+    assert (type(reward), reward) == (float, 1.5)
 
 
 def range_of(frame_skip: int, discount: float, weight: float = 1.0, **options) -> tuple[float, float]:

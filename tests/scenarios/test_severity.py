@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gvz
-from gvz.core.errors import TaskError
+from gvz.core.errors import TaskError, WadError
 from gvz.evaluation.gallery import task_frame
 from gvz.evaluation.play import episode_seed
 from gvz.scenarios.base import Attribute, Content, Period, Task, Toward, Uniform
@@ -144,6 +144,12 @@ def test_a_texture_of_a_blend_is_repeated_over_its_width_too():
     assert entries[0] == 'Texture "XWALL", 256, 128'
     places = {(x, y) for x in (0, 64, 128, 192) for y in (0, 64)}
     assert {line for line in entries if "FLAT" in line} == {f'Patch "FLAT", {x}, {y} ' for x, y in places}
+
+
+@pytest.mark.parametrize(("name", "opacity"), [("XWALL", 50.0), ("XWALL", -0.1), ("XWALLXWALL", 0.5), ("xwall", 0.5)])
+def test_a_blend_that_the_engine_would_show_otherwise_is_refused(name: str, opacity: float):
+    with pytest.raises(WadError, match=f"texture {name}: got a blend with opacity {opacity:g}, want a name of 1 to 8"):
+        blended(name, "WALL", "WALL", opacity, {"WALL": (64, 128)}, {})
 
 
 def test_a_file_has_the_blends_of_all_maps_that_its_episodes_play():
