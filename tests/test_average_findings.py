@@ -154,3 +154,6 @@ def test_the_findings_say_what_ppo_s_first_seed_has_without_an_average():
     assert f"seed 1111 have {defend} on the training tasks, so the" in WORDS
     seek = f"{training} on the training tasks and {gate} on the gate tasks, and {test} on the test tasks."
     assert f"seed 1111 have {seek}" in WORDS
+    *_, test, hardest = score_cells(long_pair("seek_and_kill")[0], "seek_and_kill").split(" | ")
+    said = f"has {test.split()[0]} on the test tasks and {hardest.split()[0]} on level 4."
+    assert f"with averaged parameters, {said}" in WORDS

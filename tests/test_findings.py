@@ -323,7 +323,7 @@ def test_the_findings_say_what_pairs_of_attributes_gave():
         assert re.search(f"`{called}` (has )?{' instead of '.join(found)}", WORDS)
     runs = ROOT / "results" / "general_short" / "runs" / "rainbow_general"
     steps = [metrics_of(runs / name / "pairs" / "seed_1111")[-1]["num_updates"] for name in names]
-    assert "One seed, {:,} and {:,} gradient steps (intervals".format(*steps) in WORDS
+    assert "One seed, {:,} and {:,} gradient steps, 24".format(*steps) in WORDS
 
 
 def test_the_findings_say_what_classes_and_the_screen_have_on_single_tasks():

@@ -5,6 +5,7 @@ import itertools
 import json
 import runpy
 import sys
+from collections import defaultdict
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from gvz.core.errors import ConfigError
 from gvz.evaluation.play import episode_seed
 from gvz.experiments.base import experiment_named
 from gvz.tasks import all_scenarios, named_tasks, scenarios
+from tests.score_tables import rows_of
 
 SCORES = read_reference()
 
@@ -97,6 +99,24 @@ def test_the_page_says_what_a_player_without_sight_reaches():
         f"and {percent('sweep', *test_tasks):.0f} % of the bound on the test set",
     ):
         assert told in page, told
+
+
+def test_the_page_says_what_players_reach_on_drawn_maps():
+    page, drawn = PAGE.read_text(), defaultdict[tuple[str, str], list[float]](list)
+    for player in ("random", "scripted"):
+        for row in rows_of(RECORDS.parent / "drawn_maps" / f"{player}.jsonl.gz"):
+            assert row["seed"] == episode_seed(row["task"], row["episode"])
+            drawn[player, row["task"]].append(row["score"])
+    assert {len(scores) for scores in drawn.values()} == {100}
+    for name, scenario in scenarios().items():
+        digits = 1 if scenario.metric == "kills" else 0
+        scores = (
+            mean("scripted", f"{name}/default"),
+            *(np.mean(drawn["scripted", f"{name}/{maps}"]) for maps in ("varied", "procedural-train")),
+            mean("random", f"{name}/default"),
+            np.mean(drawn["random", f"{name}/procedural-train"]),
+        )
+        assert f"| {scenario.title} | {' | '.join(f'{score:.{digits}f}' for score in scores)} |" in page
 
 
 def test_the_page_says_how_many_sergeants_died_by_other_hands():

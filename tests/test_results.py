@@ -130,6 +130,8 @@ def test_the_joint_run_says_what_its_records_give():
             means.append(np.mean(scores))
         cells = " | ".join(f"{value:.1f}" for value in (*means, np.mean(means)))
         assert f"| {title} each, {episodes} episodes a task | {cells} |" in readme
+        if split == "train4":
+            assert "are learned to {:.1f} and {:.1f} percent.".format(*means[1:3]) in WORDS
     report = (folder / "report" / "report.md").read_text()
     assert "P_norm, 43.6 [42.8, 44.4]" in readme
     alone = {}

@@ -131,6 +131,14 @@ def test_the_findings_say_what_six_times_the_time_gave_on_four_training_tasks(sc
         )
         said = f"`{task}` has {four:.0f} (after 900 seconds {four_short:.0f}, with eight tasks {eight:.0f})"
         assert said in WORDS
+    gathering, test_tasks = "health_gathering", task_sets("health_gathering", "train4")[2]
+    short_of_steps, other = last_updates(f"general_train4_long/runs/*/{gathering}/*/*")
+    assert f"had {short_of_steps:,} and {other:,} gradient steps" in WORDS
+    of_seeds = [
+        np.mean([found[task].mean() for task in test_tasks])
+        for _, found in sorted(longer[gathering, "4 tasks"].runs.items())
+    ]
+    assert "steps; they have {:.1f} and {:.1f} on the test tasks.".format(*of_seeds) in WORDS
     steps = last_updates("general_train4_long/runs/**")
     assert f"in Health Gathering also 2222; {steps[0]:,} to {steps[-1]:,} gradient steps, 50 episodes" in WORDS
 
