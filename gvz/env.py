@@ -278,6 +278,9 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             raise TypeError("DoomEnv: a running game can be neither copied nor pickled; close it, or make another one")
         return self.__dict__
 
+    def __copy__(self) -> "DoomEnv":
+        return deepcopy(self)  # two games share nothing, such as the history of their rewards
+
     def _begin(self) -> tuple[Engine, EngineError | None]:
         """Starts the episode, on a new engine if needed; returns the engine, and the error if an engine died."""
         crash = None
