@@ -204,6 +204,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         Raises:
             ResetNeeded: no episode is running.
             ValueError: no such action.
+            TaskError: an event of the reward gave no number of at least 0.
             EngineError: the engine crashed too often in a row.
         """
         engine = self._engine
