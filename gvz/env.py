@@ -300,7 +300,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
                 self._stop_engine()
                 raise EngineError(
                     f"{self.task.id}: {self._compiled.wad_path} runs a map with magic number {magic:.0f}, "
-                    f"want {map_magic}, that of the map of episode seed {self._episode_seed}"
+                    f"want {map_magic}, that of the map of episode seed {self._episode_seed}, which its script sets in "
+                    "`global int 60`"
                 )
             return self._engine, crash
 

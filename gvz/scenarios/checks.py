@@ -31,7 +31,7 @@ def check_scenario(scenario: "Scenario") -> None:
             attribute in `complete` has and whose name is nearly that of another group; an attribute in `complete` or an
             exception in `levdoom_tasks` under another name than its own; a set without tasks, or with one that has no
             name; no base map or textures; a reward of a variable that is not read; a pace that needs an unknown reward
-            or lasts no tic; no time-out or bound of a profile; a combined button that the scenario lacks.
+            or lasts no tic; no button; no time-out or bound of a profile; a combined button that the scenario lacks.
     """
     check_types(scenario, f"scenario {scenario.id}", convert=False)
     for content in (scenario.content, scenario.levdoom, *scenario.levdoom_tasks.values()):
@@ -100,6 +100,8 @@ def _check_score(scenario: "Scenario") -> None:
     for field in ("timeouts", "upper_bounds"):
         if not all(getattr(scenario, field).get(profile, 0) > 0 for profile in get_args(Profile)):
             raise TaskError(f"{where}: got {field} {getattr(scenario, field)}, want a positive one for each profile")
+    if not scenario.buttons:
+        raise TaskError(f"{where}: got no button, want one or more")
     if strange := set(scenario.combination_buttons or ()) - set(scenario.buttons):
         raise TaskError(f"{where}, combination_buttons: got {strange}, want some of {', '.join(scenario.buttons)}")
     variables = (*scenario.game_variables, *ALWAYS_READ, *BOOKKEEPING)

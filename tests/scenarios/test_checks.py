@@ -65,6 +65,7 @@ def test_an_attribute_may_have_a_group_of_its_own():
         ({"metric": "kill"}, "metric: got 'kill', want one of frames_alive, kills, goals"),
         ({"suite": "mine"}, "suite: got 'mine', want one of core, extended"),
         ({"buttons": "ATTACK"}, r"buttons: got 'ATTACK', want a list, such as \['ATTACK'\]"),
+        ({"buttons": (), "combination_buttons": None}, "got no button, want one or more"),
         ({"timeouts": 1100}, "timeouts: got 1100, want a mapping"),
         ({"timeouts": {"thesis": 1100.5, "levdoom": 1100}}, r"timeouts\['thesis'\]: got 1100\.5, want int"),
         ({"variety": 3}, "variety: got 3, want Variety"),
