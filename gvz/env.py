@@ -204,6 +204,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         Raises:
             ResetNeeded: no episode is running.
             ValueError: no such action.
+            TaskError: an event of the reward gave no number of at least 0.
             EngineError: the engine crashed too often in a row.
         """
         engine = self._engine
@@ -278,6 +279,9 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             raise TypeError("DoomEnv: a running game can be neither copied nor pickled; close it, or make another one")
         return self.__dict__
 
+    def __copy__(self) -> "DoomEnv":
+        return deepcopy(self)  # two games share nothing, such as the history of their rewards
+
     def _begin(self) -> tuple[Engine, EngineError | None]:
         """Starts the episode, on a new engine if needed; returns the engine, and the error if an engine died."""
         crash = None
@@ -296,7 +300,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
                 self._stop_engine()
                 raise EngineError(
                     f"{self.task.id}: {self._compiled.wad_path} runs a map with magic number {magic:.0f}, "
-                    f"want {map_magic}, that of the map of episode seed {self._episode_seed}"
+                    f"want {map_magic}, that of the map of episode seed {self._episode_seed}, which its script sets in "
+                    "`global int 60`"
                 )
             return self._engine, crash
 

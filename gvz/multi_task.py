@@ -1,6 +1,7 @@
 """Several tasks as one Gymnasium environment: each episode is of one of them."""
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -160,6 +161,9 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         """Ends all engines. Can be repeated."""
         while self._running:
             self._running.pop().close()
+
+    def __copy__(self) -> "MultiTaskEnv":
+        return deepcopy(self)  # as DoomEnv
 
     def _uniform(self, rng: np.random.Generator) -> str:
         return self.tasks[int(rng.integers(len(self._games)))]

@@ -54,6 +54,7 @@ class Segmenter:
     def __init__(self, file: Path | str):
         import onnxruntime  # not before: it takes a third of a second, and most environments show the screen
 
+        self._file = file
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1  # games share the cores by processes
         options.log_severity_level = 4  # what it logs comes as an exception, too
@@ -74,6 +75,9 @@ class Segmenter:
         frame = network_input(screen, self._height, self._width)
         probabilities = np.asarray(self._network.run(None, {self._input: frame[None]})[0])
         return np.moveaxis(probabilities[0], 0, -1)
+
+    def __reduce__(self) -> tuple[type["Segmenter"], tuple[Path | str]]:
+        return Segmenter, (self._file,)
 
 
 def network_input(screen: np.ndarray, height: int = INPUT_HEIGHT, width: int = INPUT_WIDTH) -> np.ndarray:

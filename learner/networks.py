@@ -184,10 +184,10 @@ class QNetwork(nn.Module):
         """Applies the network: by its means, or by each row's own noise, see `draw_noise`."""
         config, dtype = self.config, jnp.dtype(self.config.activation_dtype)
         x = make_encoder(config.encoder)(obs.frames.astype(dtype) / 255, config)
-        B, shape = len(obs.frames), getattr(x, "shape", ())
-        if len(shape) != 2 or shape[0] != B:
+        B, shape, kind = len(obs.frames), getattr(x, "shape", ()), getattr(x, "dtype", type(x).__name__)
+        if len(shape) != 2 or shape[0] != B or not jnp.issubdtype(kind, jnp.floating):
             raise ConfigError(
-                f"agent.encoder: {config.encoder!r} gives features {list(shape)}, want [B, F] with B = {B}"
+                f"agent.encoder: {config.encoder!r} gives features {kind}{list(shape)}, want {dtype}[B, F] with B = {B}"
             )
         if self.num_sights:
             normalized = nn.LayerNorm(use_scale=False, use_bias=False, dtype=dtype)(x)

@@ -96,7 +96,10 @@ def test_a_whole_episode_makes_crashes_forgotten():
 def test_another_map_than_the_tasks_is_an_error():
     env = DoomEnv("defend_the_center/default")
     env._engine_config = DoomEnv("defend_the_center/gore")._engine_config
-    with pytest.raises(EngineError, match=r"default: .* runs a map with magic number \d+, want \d+"):
+    with pytest.raises(
+        EngineError,
+        match=r"default: .* runs a map with magic number \d+, want \d+, .*, which its script sets in `global int 60`",
+    ):
         env.reset(seed=1)
     env.close()
 

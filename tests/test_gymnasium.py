@@ -6,12 +6,14 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+import gvz
 from gvz.core.errors import ConfigError
 from gvz.env import DoomEnv
 from gvz.registration import gymnasium_id, register_envs
@@ -65,14 +67,32 @@ def test_a_scenario_with_the_title_of_another_one_is_refused(monkeypatch: pytest
         register_envs()
 
 
+@pytest.mark.parametrize("task", ["defend_the_center/default", ["defend_the_center/default"]], ids=["one", "several"])
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
-def test_a_running_game_is_not_copied_or_pickled_and_a_closed_one_is(copied: Callable[[DoomEnv], object]):
-    env = DoomEnv("defend_the_center/default")
+def test_a_running_game_is_not_copied_or_pickled_and_a_closed_one_is(copied: Callable[..., object], task: Any):
+    env = gvz.make(task, frames="segmented")
     env.reset(seed=1)
     with pytest.raises(TypeError, match="a running game can be neither copied nor pickled; close it, or make another"):
         copied(env)
     env.close()
     copied(env)
+
+
+@pytest.mark.parametrize("task", ["seek_and_kill/default", ["seek_and_kill/default"]], ids=["one", "several"])
+def test_a_copy_is_a_game_of_its_own(task: Any):
+    """They had one history of rewards: the distance moved was that between the two agents."""
+    env = gvz.make(task)
+    other = copy.copy(env)
+    rewards = []
+    for with_other in (False, True):
+        env.reset(seed=1)
+        if with_other:
+            other.reset(seed=2)
+        rewards.append(env.step(2)[1])
+    assert rewards[0] == rewards[1]
+    env.close()
+    other.step(2)
+    other.close()
 
 
 def test_every_named_task_is_registered():

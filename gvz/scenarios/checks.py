@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, get_args
 
 from gvz.core.env_config import Profile, check_types
@@ -17,6 +18,8 @@ ALWAYS_READ = ("KILLCOUNT", "POSITION_X", "POSITION_Y")
 _NAME = re.compile("[a-z][a-z0-9_]*")
 _TAKEN = ("default", "complete", VARIED, PROCEDURAL)
 """names of tasks and of sets of drawn maps"""
+_MISTYPED = 0.85
+"""least similarity of a group's name to another one that it is taken for: `entity_speed` and `entity_type` have 0.78"""
 
 
 def check_scenario(scenario: "Scenario") -> None:
@@ -24,11 +27,11 @@ def check_scenario(scenario: "Scenario") -> None:
 
     Raises:
         ConfigError: a field of another type.
-        TaskError: a name of an attribute that ids cannot have or that another attribute has; no group; an attribute in
-            `complete` or an exception in `levdoom_tasks` under another name than its own; a set without tasks, or with
-            one that has no name; no base map or textures; a reward of a variable that is not read; a pace that needs an
-            unknown reward or lasts no tic; no time-out or bound of a profile; a combined button that the scenario
-            lacks.
+        TaskError: a name of an attribute that ids cannot have or that another attribute has; no group, or one that no
+            attribute in `complete` has and whose name is nearly that of another group; an attribute in `complete` or an
+            exception in `levdoom_tasks` under another name than its own; a set without tasks, or with one that has no
+            name; no base map or textures; a reward of a variable that is not read; a pace that needs an unknown reward
+            or lasts no tic; no button; no time-out or bound of a profile; a combined button that the scenario lacks.
     """
     check_types(scenario, f"scenario {scenario.id}", convert=False)
     for content in (scenario.content, scenario.levdoom, *scenario.levdoom_tasks.values()):
@@ -78,6 +81,16 @@ def _check_attributes(scenario: "Scenario") -> None:
             if name in owners:
                 raise TaskError(f"{where}: got the name {name!r}, which {owners[name]!r} has; want another one")
             owners[name] = attribute.name
+    groups = {group: attribute for attribute in scenario.attributes for group in attribute.groups}
+    whole = {
+        group for attribute in scenario.attributes if attribute.name in scenario.complete for group in attribute.groups
+    }
+    for group in sorted(groups.keys() - whole):
+        if near := get_close_matches(group, groups.keys() - {group}, n=1, cutoff=_MISTYPED):
+            raise TaskError(
+                f"scenario {scenario.id}, attribute {groups[group].name!r}: got the group {group!r} (did you mean "
+                f"{near[0]!r}?), want one of {', '.join(sorted(whole))}, or a name that is less similar"
+            )
 
 
 def _check_score(scenario: "Scenario") -> None:
@@ -87,6 +100,8 @@ def _check_score(scenario: "Scenario") -> None:
     for field in ("timeouts", "upper_bounds"):
         if not all(getattr(scenario, field).get(profile, 0) > 0 for profile in get_args(Profile)):
             raise TaskError(f"{where}: got {field} {getattr(scenario, field)}, want a positive one for each profile")
+    if not scenario.buttons:
+        raise TaskError(f"{where}: got no button, want one or more")
     if strange := set(scenario.combination_buttons or ()) - set(scenario.buttons):
         raise TaskError(f"{where}, combination_buttons: got {strange}, want some of {', '.join(scenario.buttons)}")
     variables = (*scenario.game_variables, *ALWAYS_READ, *BOOKKEEPING)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gvz.core.env_config import EnvConfig, typed
-from gvz.core.errors import ConfigError, nearest
+from gvz.core.errors import ConfigError, TaskError, nearest
 
 Variables = Mapping[str, float]
 """The game's variables after a decision: name of a game or bookkeeping variable -> value."""
@@ -145,11 +145,24 @@ class Rewarder:
             variables: the variables after the decision; kept, not copied. After the agent's death, the last values
                 that the game gave.
             terminated: the episode terminated (not by a time-out).
+
+        Raises:
+            TaskError: an event gave no number, or one that is negative or not finite.
         """
         assert self._history, "Rewarder.step before reset"
         self._history.append(variables)
         history = self._history  # "0.0 +" turns -0.0 into 0.0 for the logs
-        return {name: 0.0 + weight * float(event(history, terminated)) for name, weight, event in self._terms}
+        return {name: 0.0 + weight * _checked(name, event(history, terminated)) for name, weight, event in self._terms}
+
+
+def _checked(name: str, amount: Any) -> float:
+    try:
+        number = float(amount)
+    except (TypeError, ValueError):
+        number = math.nan
+    if 0.0 <= number < math.inf:
+        return number
+    raise TaskError(f"reward {name!r}: its event gave {amount!r}, want a finite number of at least 0")
 
 
 def return_range(

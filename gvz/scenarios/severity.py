@@ -4,8 +4,8 @@ Numbers go this part of the way. What comes again and again comes so much more r
 the new one this opaque. Of the added things this share stands, evenly spread. A way of drawing (`RenderStyle`) is given
 to this share of the enemies or kits, drawn for each.
 
-An attribute that brings another map or other classes of things has nothing in between. It is whole, but in force only
-in this share of the episodes; an episode's seed says whether.
+An attribute that brings another map or other classes of things has nothing in between, nor has one that sets a property
+to Toward or Chance. It is whole, but in force only in this share of the episodes; an episode's seed says whether.
 """
 
 import dataclasses
@@ -19,7 +19,8 @@ from gvz.scenarios.base import Blend, Chance, Content, Period, Textures, Thing, 
 def is_whole(change: Content) -> bool:
     """Whether an attribute's content cannot be graded."""
     named = any(isinstance(value, str | tuple | bool) for value in change.parameters.values())
-    return named or bool(change.base_wad or change.actors)
+    part = any(isinstance(value, Toward | Chance) for value in (*change.entity.values(), *change.agent.values()))
+    return named or part or bool(change.base_wad or change.actors)
 
 
 def in_force(severity: float, attribute: str, episode_seed: int) -> bool:

@@ -279,6 +279,9 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         del kwargs
         self._end()
 
+    def __getstate__(self) -> dict[str, Any]:
+        raise TypeError("DoomVectorEnv: its worker processes can be neither copied nor pickled; make another one")
+
     def _send(
         self, games: np.ndarray, actions: Sequence[int | list[int] | None], episode_seed: int | None = None
     ) -> None:

@@ -136,11 +136,18 @@ def test_a_run_traces_how_an_agent_acts_once_to_check_it_and_once_for_its_actors
 
 
 @pytest.mark.parametrize(
-    ("features", "shape"), [("x", "[3, 8, 8, 2]"), ("x.mean((1, 2, 3))", "[3]"), ("x.reshape(1, -1)", "[1, 384]")]
+    ("features", "given"),
+    [
+        ("x", "float32[3, 8, 8, 2]"),
+        ("x.mean((1, 2, 3))", "float32[3]"),
+        ("x.reshape(1, -1)", "float32[1, 384]"),
+        ("x.reshape(3, -1).astype('int32')", "int32[3, 128]"),  # weights of integers would be 0
+        ("None", "NoneType[]"),
+    ],
 )
-def test_an_encoder_without_a_row_for_each_image_is_refused(tmp_path: Path, features: str, shape: str):
+def test_an_encoder_without_a_row_of_floats_for_each_image_is_refused(tmp_path: Path, features: str, given: str):
     file = tmp_path / "flat.py"
     file.write_text(f"def ENCODER(x, config):\n    return {features}\nENCODER = ENCODER\n")
     agent = DQN(DQNConfig(encoder=str(file), **SIZES), SPEC)
-    with pytest.raises(ConfigError, match=re.escape(f"flat.py' gives features {shape}, want [B, F] with B = 3")):
+    with pytest.raises(ConfigError, match=re.escape(f"flat.py' gives features {given}, want float32[B, F] with B = 3")):
         agent.network().init(jax.random.key(0), SPEC.zeros(3))

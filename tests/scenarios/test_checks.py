@@ -32,12 +32,22 @@ ICE = Attribute(name="ice", groups=("textures",), content=Content(textures=Textu
             r"content\.things\['defend_the_center\.wad'\]: got Thing\(.*\), want a list, such as \[Thing",
         ),
         ({"groups": ()}, r"got no group"),
+        (
+            {"groups": ("texture",)},
+            r"got the group 'texture' \(did you mean 'textures'\?\), want one of decorations, entity",
+        ),
     ],
 )
 def test_an_attribute_whose_name_or_groups_would_make_another_task_is_refused(changes: dict[str, Any], message: str):
     scenario = scenario_named("defend_the_center")
     with pytest.raises((TaskError, ConfigError), match=f"scenario defend_the_center, attribute .*{message}"):
         dataclasses.replace(scenario, attributes=(*scenario.attributes, dataclasses.replace(ICE, **changes)))
+
+
+def test_an_attribute_may_have_a_group_of_its_own():
+    scenario = scenario_named("defend_the_center")
+    for group in ("weather", "entity_height", "floor_textures"):
+        dataclasses.replace(scenario, attributes=(*scenario.attributes, dataclasses.replace(ICE, groups=(group,))))
 
 
 @pytest.mark.parametrize(
@@ -55,6 +65,7 @@ def test_an_attribute_whose_name_or_groups_would_make_another_task_is_refused(ch
         ({"metric": "kill"}, "metric: got 'kill', want one of frames_alive, kills, goals"),
         ({"suite": "mine"}, "suite: got 'mine', want one of core, extended"),
         ({"buttons": "ATTACK"}, r"buttons: got 'ATTACK', want a list, such as \['ATTACK'\]"),
+        ({"buttons": (), "combination_buttons": None}, "got no button, want one or more"),
         ({"timeouts": 1100}, "timeouts: got 1100, want a mapping"),
         ({"timeouts": {"thesis": 1100.5, "levdoom": 1100}}, r"timeouts\['thesis'\]: got 1100\.5, want int"),
         ({"variety": 3}, "variety: got 3, want Variety"),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from gvz.core.env_config import EnvConfig, Profile
-from gvz.core.errors import ConfigError
+from gvz.core.errors import ConfigError, TaskError
 from gvz.env import DoomEnv
 from gvz.evaluation.players import CLASSES
 from gvz.evaluation.simple import player_env
@@ -134,6 +134,15 @@ def test_an_event_may_give_any_number_type(amount: Any):
     rewarder.reset(ALIVE)
     reward = rewarder.step(ALIVE, False)["mine"]
     assert (type(reward), reward) == (float, 1.5)
+
+
+@pytest.mark.parametrize("amount", [None, math.nan, math.inf, -0.5, [1.0, 2.0], "much"])
+def test_an_event_that_gives_no_amount_is_named(amount: Any):
+    rewarder = Rewarder({"kill": living, "mine": lambda _history, _terminated: amount}, {"kill": 1.0, "mine": 0.0})
+    rewarder.reset(ALIVE)
+    said = f"reward 'mine': its event gave {amount!r}, want a finite number of at least 0"
+    with pytest.raises(TaskError, match=re.escape(said)):
+        rewarder.step(ALIVE, False)
 
 
 def range_of(frame_skip: int, discount: float, weight: float = 1.0, **options) -> tuple[float, float]:

@@ -9,7 +9,7 @@ import gvz
 from gvz.core.errors import TaskError, WadError
 from gvz.evaluation.gallery import task_frame
 from gvz.evaluation.play import episode_seed
-from gvz.scenarios.base import Attribute, Content, Period, Task, Toward, Uniform
+from gvz.scenarios.base import Attribute, Chance, Content, Period, Task, Toward, Uniform
 from gvz.scenarios.compiler import compile_task, map_source, task_content
 from gvz.scenarios.severity import graded, in_force, is_whole
 from gvz.tasks import all_scenarios, parse_task, scenarios
@@ -176,9 +176,11 @@ def test_a_file_has_the_blends_of_all_maps_that_its_episodes_play():
         (Content(parameters={"moves": True}), True),
         (Content(base_wad="basic.wad"), True),
         (Content(actors={"Big": "ACTOR Big : Demon\n{\n}\n"}), True),
+        (Content(entity={"RenderStyle": Chance("STYLE_Add", 0.5)}), True),
+        (Content(agent={"ViewHeight": Toward(60.0, 0.5)}), True),
     ],
 )
-def test_another_map_or_other_classes_have_nothing_in_between(change: Content, whole: bool):
+def test_another_map_other_classes_or_parts_of_properties_have_nothing_in_between(change: Content, whole: bool):
     assert is_whole(change) == whole
 
 

@@ -1,9 +1,11 @@
 """`gvz.make_vec` beside gymnasium's SyncVectorEnv over the same games, and its own way of `send` and `recv`."""
 
 import contextlib
+import copy
 import os
+import pickle
 import resource
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -221,6 +223,14 @@ def test_a_seed_that_nobody_gave_can_be_read_and_used_again(envs: DoomVectorEnv)
     assert len(set(made.np_random_seed)) == 3
     np.testing.assert_array_equal(envs.reset(seed=made.np_random_seed)[1]["episode_seed"], drawn)
     made.close()
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_it_is_not_copied_or_pickled(envs: DoomVectorEnv, copied: Callable[[DoomVectorEnv], object]):
+    """A copy had the same workers, and got answers that were not its own."""
+    with pytest.raises(TypeError, match="its worker processes can be neither copied nor pickled; make another one"):
+        copied(envs)
 
 
 @pytest.mark.engine
