@@ -3,9 +3,10 @@
 import json
 
 import numpy as np
+import pytest
 
 from gvz.evaluation.statistics import bootstrap, difference
-from gvz.reports.scores import Scores, estimate, estimate_groups
+from gvz.reports.scores import estimate, estimate_groups
 from gvz.tasks import named_tasks, scenario_named, scenarios
 from tests.score_tables import (
     PAGE,
@@ -182,52 +183,62 @@ def test_the_findings_say_what_the_networks_of_varied_maps_find():
 
 
 def test_the_findings_say_what_90_minutes_on_varied_maps_gave_with_a_network_of_them():
-    name, updates = "defend_the_center", (10_000, 40_000, 80_000)
-    agent = "rainbow_segmented+varied_network"
-    run = ROOT / "results/general_varied_network/runs" / agent / name / "varied/seed_1111"
-    (steps,) = last_updates(f"general_varied_network/runs/{agent}/{name}/varied/*")
-    episodes = rows_of(run / "episodes.jsonl.gz")
-    means = [
-        np.mean([row["normalized_score"] for row in episodes if first <= row["num_updates"] < first + 10_000])
-        for first in updates
-    ]
-    assert f"{steps:,} gradient steps, {len({row['lane'] for row in episodes})} games at once" in WORDS
-    assert f"Its training episodes have {in_words([f'{mean:.1f}' for mean in means])} in the three" in WORDS
-    varied, _, eight = found = [
-        scores_of(folder, called, name)
-        for folder, called in (
-            ("general_varied_network", agent),
-            ("general_varied", "rainbow_segmented"),
-            ("general", "rainbow_segmented"),
-        )
-    ]
-    rows = (
-        "varied maps | varied maps | 5,400 s",
-        "varied maps | eight tasks | 900 s",
-        "8 tasks | eight tasks | 5,400 s",
-    )
-    for row, scores in zip(rows, found, strict=True):
-        assert f"| {row} | {score_cells(scores, name)} |" in PAGE
+    network, plain = "rainbow_segmented+varied_network", "rainbow_segmented"
+    runs = {"varied maps": f"general_varied_network/runs/{network}", "eight tasks": f"general_varied_long/runs/{plain}"}
+    steps, of_eight = [], []
+    for name in SCENARIOS:
+        title = scenario_named(name).title
+        for called, run in runs.items():
+            episodes = rows_of(ROOT / f"results/{run}/{name}/varied/seed_1111/episodes.jsonl.gz")
+            means = [
+                np.mean([row["normalized_score"] for row in episodes if first <= row["num_updates"] < first + 10_000])
+                for first in (10_000, 40_000, 80_000)
+            ]
+            assert f"| {title} | {called} | {' | '.join(f'{mean:.1f}' for mean in means)} |" in PAGE
+            assert len({row["lane"] for row in episodes}) == {"varied maps": 8, "eight tasks": 16}[called]
+        steps += last_updates(f"general_varied_network/runs/{network}/{name}/varied/*")
+        of_eight += last_updates(f"general/runs/{plain}/{name}/train8/*")
+        for row, folder, agent in (
+            ("varied maps | varied maps | 5,400 s", "general_varied_network", network),
+            ("varied maps | eight tasks | 900 s", "general_varied", plain),
+            ("8 tasks | eight tasks | 5,400 s", "general", plain),
+        ):
+            assert f"| {title} | {row} | {score_cells(scores_of(folder, agent, name), name)} |" in PAGE
+        compositions = scores_of("general_compositions_long", plain, name)
+        varied = scores_of("general_varied_network", network, name)
+        tests = [score_cells(scores, name).split(" | ")[2].split()[0] for scores in (compositions, varied)]
+        said = "have {} on the test tasks of {} after 2,700 seconds, varied maps {} after"
+        assert said.format(tests[0], title, tests[1]) in WORDS
+    assert "{:,} gradient steps in Defend the Center and {:,} in Seek and Kill, 8 games".format(*steps) in WORDS
+    assert f"16 games at once and {min(of_eight):,} to {max(of_eight):,} gradient steps." in WORDS
 
-    def rounded(scores: Scores, *tasks: str) -> list[str]:
-        found = [estimate(scores, [f"{name}/{task}"]).estimate for task in tasks]
-        return [f"{one.value:.0f}" for one in found if one]
 
-    walls = ("default", "mossy_bricks", "stone_wall")
-    assert f"have {in_words(rounded(varied, *walls))}, with eight tasks {in_words(rounded(eight, *walls))}." in WORDS
-    for task in (
-        "flying_enemies",
-        "fast_enemies+flying_enemies",
-        "fast_enemies+gore+resized_enemies",
-        "gore+resized_enemies",
-    ):
-        (ours,), (theirs,) = rounded(varied, task), rounded(eight, task)
-        assert any(f"`{task}`{has} {ours}, not {theirs}" in WORDS for has in (" has", "")), task
-    (ours,), (theirs,) = (rounded(scores, "fuzzy_enemies+gore+stone_wall") for scores in (varied, eight))
-    assert f"`fuzzy_enemies+gore+stone_wall`, where looks alone change, {ours}, not {theirs}." in WORDS
-    compositions = scores_of("general_compositions_long", "rainbow_segmented", name)
-    of_test = [score_cells(scores, name).split(" | ")[2].split()[0] for scores in (compositions, varied)]
-    assert (
-        "have {} on the test tasks of Defend the Center after 2,700 seconds, varied maps {} after".format(*of_test)
-        in WORDS
-    )
+@pytest.mark.parametrize(
+    ("name", "tasks", "said"),
+    [
+        ("defend_the_center", "default mossy_bricks stone_wall", "have {0}, with eight tasks {1}."),
+        ("defend_the_center", "flying_enemies", "`flying_enemies` has {0}, not {1},"),
+        ("defend_the_center", "fast_enemies+flying_enemies", "`fast_enemies+flying_enemies` {0}, not {1}, and"),
+        (
+            "defend_the_center",
+            "fast_enemies+gore+resized_enemies",
+            "the test task `fast_enemies+gore+resized_enemies` {0}, not {1}.",
+        ),
+        ("defend_the_center", "gore+resized_enemies", "`gore+resized_enemies` has {0}, not {1}, and"),
+        ("defend_the_center", "fuzzy_enemies+gore+stone_wall", "where looks alone change, {0}, not {1}."),
+        ("seek_and_kill", "obstacles invulnerable mixed_enemies", "have {0}, with eight tasks {1}."),
+        ("seek_and_kill", "red", "and the agent has not, has {0}, not {1}, and"),
+        ("seek_and_kill", "red+resized_enemies", "`red+resized_enemies` has {0}, not {1}, and"),
+        ("seek_and_kill", "mixed_enemies+red", "`mixed_enemies+red` {0}, not {1}."),
+        ("seek_and_kill", "default blue", "`default` and `blue` have {0}, with eight tasks {1}."),
+        ("seek_and_kill", "blue+shadows", "`blue+shadows` has {0}, not {1}, although"),
+    ],
+)
+def test_the_findings_say_how_an_agent_of_varied_maps_plays_single_tasks(name: str, tasks: str, said: str):
+    both = (("general_varied_network", "rainbow_segmented+varied_network"), ("general", "rainbow_segmented"))
+    means = []
+    for folder, agent in both:
+        scores = scores_of(folder, agent, name)
+        found = [estimate(scores, [f"{name}/{task}"]).estimate for task in tasks.split()]
+        means.append(in_words([f"{one.value:.0f}" for one in found if one]))
+    assert said.format(*means) in WORDS
