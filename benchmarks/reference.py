@@ -28,7 +28,7 @@ from gvz.tasks import LEVELS, named_tasks, scenarios
 
 RECORDS = ROOT / "results" / "reference"
 COMMAND = "python -m benchmarks.reference"
-PAGE = ROOT / "docs" / "BENCHMARK.md"
+PAGE = ROOT / "docs" / "benchmark" / "reference-scores.md"
 EXTENDED_PAGE = ROOT / "docs" / "EXTENDED.md"
 PLAYERS = ("random", "idle", "sweep", "scripted")
 """in the order of the tables' columns"""
@@ -173,7 +173,7 @@ def _own_kills_table(scores: Scores, scenario: Scenario) -> str:
 
 
 def pages() -> dict[Path, str]:
-    """docs/BENCHMARK.md and docs/EXTENDED.md with the tables of all records in their places.
+    """docs/benchmark/reference-scores.md and docs/EXTENDED.md with the tables of all records in their places.
 
     Raises:
         ConfigError: records or markers are missing.

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks.contrast import FILE, contrast, measure_contrast, separation
-from benchmarks.reference import PAGE
 from gvz.scenarios.base import Task
 from gvz.tasks import scenario_named
+from tests.score_tables import words_of
 
 SEEK_AND_KILL = scenario_named("seek_and_kill")
 
@@ -39,7 +39,7 @@ def test_complete_has_the_texture_before_which_enemies_show_most_and_the_page_sa
     assert red["contrast"] > blue["contrast"]
     assert red["separation"] > blue["separation"]
     assert "red" in SEEK_AND_KILL.complete
-    page = " ".join(PAGE.read_text().split())
+    page = words_of("docs/benchmark/differences.md")
     for told in (
         f"differ from their surroundings by {red['contrast']:.2f} standard deviations of luminance",
         f"in front of `blue`, by {blue['contrast']:.2f}",

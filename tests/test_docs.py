@@ -77,7 +77,9 @@ def test_the_index_of_records_has_every_folder():
     assert set(re.findall(r"\[(\w+)\]\(", (ROOT / "results" / "README.md").read_text())) == folders
 
 
-@pytest.mark.parametrize("page", [*PAGES, *RECORDS, *REPORTS], ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "page", [ROOT / "CHANGELOG.md", *PAGES, *RECORDS, *REPORTS], ids=lambda page: str(page.relative_to(ROOT))
+)
 def test_links_lead_somewhere(page):
     for target, heading in re.findall(r"\]\((?!https?://)([^)#]*)#?([^)]*)\)", page.read_text()):
         file = page.parent / target if target else page

@@ -37,7 +37,7 @@ def test_the_quick_runs_are_better_than_chance_on_the_same_episodes():
     by_episode = sorted(rows_of(folder / "evaluation_random.jsonl.gz"), key=lambda row: row["episode"])
     random = bootstrap([np.array([row["score"] for row in by_episode])], num_resamples=1000)  # as benchmarks.reference
     assert f"| random | {random} |" in readme
-    assert f"| default | 0 | {random} |" in (ROOT / "docs" / "BENCHMARK.md").read_text()
+    assert f"| default | 0 | {random} |" in (ROOT / "docs" / "benchmark" / "reference-scores.md").read_text()
     assert f"| rainbow_quick, 15,000 updates | {trained} |" in readme
     for seed, (scores, _) in zip((1111, 2222, 3333), runs, strict=True):
         assert f"| {seed} | {bootstrap([scores])} | {bootstrap([100 * scores / 1100])} |" in page
@@ -95,7 +95,7 @@ def test_the_quick_comparison_says_what_players_that_do_not_learn_have_on_the_sa
 
 def test_the_gap_of_procedural_maps_is_what_its_records_give():
     folder, kept = ROOT / "results" / "procedural_gap", ([], [])
-    readme, page = (folder / "README.md").read_text(), (ROOT / "docs" / "BENCHMARK.md").read_text()
+    readme, page = (file.read_text() for file in (folder / "README.md", ROOT / "docs" / "benchmark" / "drawn-maps.md"))
     for title, maps in (("10 maps", "-10"), ("100 maps", "-100"), ("1,000 maps", "-1000"), ("unlimited", "")):
         training = f"procedural-train{maps}"
         file = folder / "runs" / "rainbow_quick" / "health_gathering" / training / "seed_1111" / "evaluation.jsonl.gz"

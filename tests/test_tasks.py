@@ -267,7 +267,7 @@ def test_attributes_of_different_groups_do_not_fight_over_a_value():
                 if one is other or set(one.groups) & set(other.groups) or "supreme" in (one.name, other.name):
                     continue  # the map `supreme` comes with textures and kits that others then change
                 if {one.name, other.name} == {"fast_enemies", "flying_enemies"}:
-                    continue  # flying_enemies takes back the other's damage factor (docs/BENCHMARK.md, Differences)
+                    continue  # flying_enemies takes back the other's damage factor (docs/benchmark/differences.md)
                 both = one.content.overlaid(other.content)
                 assert both == dataclasses.replace(other.content.overlaid(one.content), things=both.things)
 

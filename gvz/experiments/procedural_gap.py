@@ -5,7 +5,7 @@ from gvz.experiments.base import Experiment
 EXPERIMENT = Experiment(
     name="procedural_gap",
     title="Procedural maps: training on 10, 100, 1,000 or unlimited maps",
-    source="docs/BENCHMARK.md, Procedural maps",
+    source="docs/benchmark/drawn-maps.md, Procedural maps",
     question="How do the scores on training maps and on unseen test maps change with the number of training maps?",
     configs=("rainbow_quick",),
     trainings=("procedural-train-10", "procedural-train-100", "procedural-train-1000", "procedural-train"),
