@@ -54,8 +54,8 @@ class EnvConfig:
     what a network takes each pixel of the screen for"""
     segmenter: str = ""
     """the network of segmented frames: one that comes with GViZDoom, by its name (train4: one for each scenario, which
-    has seen four training tasks; varied: has seen varied maps, in two scenarios), or the path of an ONNX file (gvz
-    segmenter trains one), or of a directory with a file for each scenario; default: that of the scenario's name"""
+    has seen four training tasks; varied: likewise, has also seen varied maps), or the path of an ONNX file (gvz segmenter
+    trains one), or of a directory with a file for each scenario; default: that of the scenario's name"""
     segmenter_temperature: Annotated[float, Range(0.1, 10)] = 1.0
     """the network's probabilities are raised to the power of 1 / this before they become colours: above 1, unlikely
     classes are seen better (temperature scaling, Guo et al. 2017)"""

@@ -1,4 +1,4 @@
-"""`general_segmented_varied_long` in two scenarios, with networks that have seen varied maps."""
+"""`general_segmented_varied_long` with networks that have seen varied maps."""
 
 import dataclasses
 
@@ -9,7 +9,6 @@ EXPERIMENT = dataclasses.replace(
     name="general_segmented_varied_network",
     title="Generalization from varied maps with a segmentation network of varied maps, within 90 minutes of one core",
     question="How well does an agent play unseen tasks if it trains on varied maps and its network has seen such maps?",
-    scenarios=("defend_the_center", "seek_and_kill"),
     variants={"varied_network": {"env.segmenter": "varied"}},
     notes=(
         "The networks come with GViZDoom. Each learned from the engine's labels for 1,500 seconds of processor time, "
