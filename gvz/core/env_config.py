@@ -5,11 +5,11 @@ import math
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from functools import cache
+from functools import cache, partial
 from numbers import Integral, Real
 from pathlib import Path
-from types import UnionType
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from gvz.core.errors import ConfigError
 from gvz.core.ranges import Range, check_ranges
@@ -54,8 +54,9 @@ class EnvConfig:
     what a network takes each pixel of the screen for"""
     segmenter: str = ""
     """the network of segmented frames: one that comes with GViZDoom, by its name (train4: one for each scenario, which
-    has seen four training tasks; varied: likewise, has also seen varied maps), or the path of an ONNX file (gvz segmenter
-    trains one), or of a directory with a file for each scenario; default: that of the scenario's name"""
+    has seen four training tasks; varied: has seen eight training tasks and varied maps), or the path of an ONNX
+    file (gvz segmenter trains one), or of a directory with a file for each scenario; default: that of the scenario's
+    name"""
     segmenter_temperature: Annotated[float, Range(0.1, 10)] = 1.0
     """the network's probabilities are raised to the power of 1 / this before they become colours: above 1, unlikely
     classes are seen better (temperature scaling, Guo et al. 2017)"""
@@ -125,45 +126,51 @@ _LARGEST_EXACT = 2**53
 """integers up to this are floating-point numbers, too"""
 
 
-def typed(kind: Any, value: Any, where: str) -> Any:
+def typed(kind: Any, value: Any, where: str, *, convert: bool = True) -> Any:
     """`value` as the type `kind`, which a field of a configuration is annotated with.
 
     A number of numpy becomes Python's, an integer a float where a float is wanted, a list a tuple, a string a path.
     Nothing else is converted: True is no 1, and 4.0 no 4.
 
     Args:
-        kind: bool, int, float, str, Path, another class, a Literal, a tuple or a Mapping of these, one of several, or
-            one or None. What is Any is not looked at.
+        kind: bool, int, float, str, Path, another class, a Literal, a tuple or a Mapping of these, or one of several
+            and None. What is Any is not looked at.
         value: anything.
         where: the field, for the error.
+        convert: False is for a caller that keeps `value` as it is: then a list is no tuple.
 
     Raises:
         ConfigError: it is of another type, none of the Literal's values, or not finite.
     """
     origin, args = get_origin(kind), get_args(kind)
-    if type(None) in args:
-        return None if value is None else typed(next(a for a in args if a is not type(None)), value, where)
+    part = partial(typed, convert=convert)
     if kind is Any:
         return value
-    if origin is UnionType:
-        for one in args:
+    if origin in (UnionType, Union):
+        kinds = [one for one in args if one is not NoneType]
+        if value is None and len(kinds) < len(args):
+            return None
+        if len(kinds) == 1:
+            return part(kinds[0], value, where)
+        for one in kinds:
             with contextlib.suppress(ConfigError):
-                return typed(one, value, where)
+                return part(one, value, where)
         raise ConfigError(f"{where}: got {value!r}, want {kind}")
     if origin is Mapping:
         if not isinstance(value, Mapping):
             raise ConfigError(f"{where}: got {value!r}, want a mapping")
         of_name, of_value = args
-        return {typed(of_name, n, where): typed(of_value, one, f"{where}[{n!r}]") for n, one in value.items()}
+        return {part(of_name, n, where): part(of_value, one, f"{where}[{n!r}]") for n, one in value.items()}
     if origin is tuple:
-        if not isinstance(value, list | tuple):
-            example = f", such as [{value!r}]" if type(value) is args[0] else ""
-            raise ConfigError(f"{where}: got {value!r}, want a list{example}")
+        if not isinstance(value, list | tuple if convert else tuple):
+            wanted, example = ("a list", f"[{value!r}]") if convert else ("a tuple", f"({value!r},)")
+            such_as = f", such as {example}" if type(value) is args[0] else ""
+            raise ConfigError(f"{where}: got {value!r}, want {wanted}{such_as}")
         if args[-1] is ...:
-            return tuple(typed(args[0], item, where) for item in value)
+            return tuple(part(args[0], item, where) for item in value)
         if len(value) != len(args):
             raise ConfigError(f"{where}: got {value!r}, want {' and '.join(arg.__name__ for arg in args)}")
-        return tuple(typed(arg, item, f"{where}, {value!r}") for arg, item in zip(args, value, strict=True))
+        return tuple(part(arg, item, f"{where}, {value!r}") for arg, item in zip(args, value, strict=True))
     if origin is Literal:
         if not any(type(value) is type(arg) and value == arg for arg in args):  # True and 1.0 equal 1, and are not it
             raise ConfigError(f"{where}: got {value!r}, want one of {', '.join(map(str, args))}")
@@ -205,7 +212,7 @@ def check_types(config: Any, prefix: str, *, convert: bool = True) -> None:
         ConfigError: as `typed`; names the field behind `prefix`.
     """
     for name, kind in _hints(type(config)).items():
-        value = typed(kind, getattr(config, name), f"{prefix}.{name}")
+        value = typed(kind, getattr(config, name), f"{prefix}.{name}", convert=convert)
         if convert:
             object.__setattr__(config, name, value)
 

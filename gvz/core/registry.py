@@ -149,9 +149,13 @@ def _module_in_file(file: Path) -> ModuleType:
 def failed(error: Exception, file: Path) -> ConfigError:
     """The error of a file that was executed: it is the user's own program, and anything may come out of it.
 
-    It names the number of the file's line that `error` came from, if there is one.
+    It names the number of the file's line that `error` came from, if there is one. If the file imported another one of
+    its folder, which failed, it names that one.
     """
-    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(file)]
+    frames = traceback.extract_tb(error.__traceback__)
+    imported = [f.filename for f in frames if f.name == "<module>" and Path(f.filename).parent == file.parent]
+    file = Path(imported[-1]) if imported else file
+    lines = [frame.lineno for frame in frames if frame.filename == str(file)]
     where = f"{file}, line {lines[-1]}" if lines else str(file)
     return ConfigError(
         f"{where}: {error}" if isinstance(error, GvzError) else f"{where}: {type(error).__name__}: {error}"

@@ -108,7 +108,7 @@ class RunConfig:
     log: LogConfig = field(default_factory=LogConfig)
 
     def __post_init__(self) -> None:
-        check_types(self, "CONFIG", convert=False)
+        check_types(self, "CONFIG")
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._+-]*", self.name):
             raise ConfigError(f"name: got {self.name!r}, want letters, digits and . _ + - (it names a directory)")
         if not 0 <= self.seed < 2**31:

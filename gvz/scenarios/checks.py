@@ -33,6 +33,8 @@ def check_scenario(scenario: "Scenario") -> None:
             name; no base map or textures; a reward of a variable that is not read; a pace that needs an unknown reward
             or lasts no tic; no button; no time-out or bound of a profile; a combined button that the scenario lacks.
     """
+    from gvz.scenarios.base import Split  # which imports this module
+
     check_types(scenario, f"scenario {scenario.id}", convert=False)
     for content in (scenario.content, scenario.levdoom, *scenario.levdoom_tasks.values()):
         check_types(content, f"scenario {scenario.id}, content", convert=False)
@@ -40,8 +42,6 @@ def check_scenario(scenario: "Scenario") -> None:
         raise TaskError(f"scenario: got the id {scenario.id!r}, want lower-case letters, digits and '_'")
     if scenario.content.base_wad is None or scenario.content.textures is None:
         raise TaskError(f"scenario {scenario.id}: got a content without base_wad or textures, want both")
-    from gvz.scenarios.base import Split  # which imports this module
-
     _check_attributes(scenario)
     for name in scenario.complete:
         if name != (wanted := scenario.attribute(name).name):

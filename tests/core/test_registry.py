@@ -63,6 +63,13 @@ def test_what_a_module_raises_is_told_in_one_line(package: Path, text: str, mess
         named("found_by_name", "KIND", "id")
 
 
+def test_an_error_of_a_module_that_another_one_imports_is_told_with_its_own_line(package: Path):
+    (package / "broken.py").write_text("\nKIND = dict(1)\n")
+    (package / "ant.py").write_text("from found_by_name.broken import KIND\n")
+    with pytest.raises(ConfigError, match=r"broken\.py, line 2: TypeError: 'int' object is not iterable$"):
+        discover("found_by_name")
+
+
 def test_a_module_that_is_no_package_is_refused():
     with pytest.raises(ValueError, match=r"'gvz\.core\.registry' is a module, want a package"):
         discover("gvz.core.registry")

@@ -176,8 +176,9 @@ def test_settings_change_their_fields_alone_and_another_agent_comes_first():
     [
         ({"seeds": ()}, r"experiment quick_comparison: seeds: got \(\), want at least one, each once"),
         ({"seeds": (1, 1)}, "want at least one, each once"),
-        ({"configs": "dqn_quick"}, r"configs: got 'dqn_quick', want a list, such as \['dqn_quick'\]"),
-        ({"players": "random"}, r"players: got 'random', want a list, such as \['random'\]"),
+        ({"configs": "dqn_quick"}, r"configs: got 'dqn_quick', want a tuple, such as \('dqn_quick',\)"),
+        ({"players": "random"}, r"players: got 'random', want a tuple, such as \('random',\)"),
+        ({"players": ["random"]}, r"players: got \['random'\], want a tuple$"),
         ({"total_updates": 2e5}, "total_updates: got 200000.0, want int"),
         ({"seeds": (1.5,)}, "seeds: got 1.5, want int"),
         ({"variants": ("a",)}, r"variants: got \('a',\), want a mapping"),

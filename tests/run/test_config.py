@@ -6,7 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 
@@ -218,6 +218,8 @@ def test_the_fewest_warmup_decisions_are_n_steps_a_game():
 def test_tasks_may_be_named():
     run = parse(["--tasks", "defend_the_center/gore", "defend_the_center/gore+mossy_bricks"]).run
     assert list(run.table.ids) == ["defend_the_center/gore", "defend_the_center/gore+mossy_bricks"]
+    listed: Any = list(run.tasks or ())
+    assert RunConfig(name="listed", tasks=listed).table.ids == run.table.ids
 
 
 BAD = {

@@ -22,15 +22,21 @@ ICE = Attribute(name="ice", groups=("textures",), content=Content(textures=Textu
         ({"name": "ice=1"}, r"got the name 'ice=1', want lower-case"),
         ({"name": "Ice"}, r"got the name 'Ice', want lower-case"),
         ({"name": "varied"}, r"got the name 'varied', want .* none of default, complete, varied, procedural"),
-        ({"groups": "map"}, r"\.groups: got 'map', want a list, such as \['map'\]"),
-        ({"aliases": "ice_cold"}, r"\.aliases: got 'ice_cold', want a list"),
+        ({"groups": "map"}, r"\.groups: got 'map', want a tuple, such as \('map',\)"),
+        ({"groups": ["map"]}, r"\.groups: got \['map'\], want a tuple$"),
+        ({"aliases": "ice_cold"}, r"\.aliases: got 'ice_cold', want a tuple"),
         ({"content": {"textures": ICE.content.textures}}, r"\.content: got {.*}, want Content"),
         ({"content": Content(textures=("A", "B", "C"))}, r"content\.textures: got \('A', 'B', 'C'\), want Textures"),
         ({"content": Content(entity={"ScaleX": None})}, r"content\.entity\['ScaleX'\]: got None, want bool \| int"),
         (
             {"content": Content(things={"defend_the_center.wad": Thing(35, 0, 0)})},
-            r"content\.things\['defend_the_center\.wad'\]: got Thing\(.*\), want a list, such as \[Thing",
+            r"content\.things\['defend_the_center\.wad'\]: got Thing\(.*\), want a tuple, such as \(Thing",
         ),
+        (
+            {"content": Content(things={"defend_the_center.wad": [Thing(35, 0, 0)]})},
+            r"content\.things\['defend_the_center\.wad'\]: got \[Thing\(.*\)\], want a tuple$",
+        ),
+        ({"content": Content(parameters={"places": [1.0, 2.0]})}, r"parameters\['places'\]: got \[1\.0, 2\.0\], want"),
         ({"groups": ()}, r"got no group"),
         (
             {"groups": ("texture",)},
@@ -64,7 +70,7 @@ def test_an_attribute_may_have_a_group_of_its_own():
         ({"content": Content(textures=ICE.content.textures)}, "got a content without base_wad or textures"),
         ({"metric": "kill"}, "metric: got 'kill', want one of frames_alive, kills, goals"),
         ({"suite": "mine"}, "suite: got 'mine', want one of core, extended"),
-        ({"buttons": "ATTACK"}, r"buttons: got 'ATTACK', want a list, such as \['ATTACK'\]"),
+        ({"buttons": "ATTACK"}, r"buttons: got 'ATTACK', want a tuple, such as \('ATTACK',\)"),
         ({"buttons": (), "combination_buttons": None}, "got no button, want one or more"),
         ({"timeouts": 1100}, "timeouts: got 1100, want a mapping"),
         ({"timeouts": {"thesis": 1100.5, "levdoom": 1100}}, r"timeouts\['thesis'\]: got 1100\.5, want int"),
@@ -89,6 +95,10 @@ def test_an_attribute_may_have_a_group_of_its_own():
         (
             {"rewards": {"alive": Reward(event=living, weight=1.0, levdoom=1.0, paces=(Pace(needs="ammo"),))}},
             "reward 'alive': got a pace that needs 'ammo', want one of alive",
+        ),
+        (
+            {"rewards": {"alive": Reward(event=living, weight=1.0, levdoom=1.0, paces=(Pace(tics=0),))}},
+            r"reward 'alive': got Pace\(tics=0, .*\), want more than 0 tics and more than 0 times",
         ),
     ],
 )
