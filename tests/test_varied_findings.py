@@ -170,7 +170,7 @@ def test_the_findings_say_what_a_network_gave_that_has_seen_varied_maps():
 
 def test_the_findings_say_what_the_networks_of_varied_maps_find():
     unseen = json.loads((ROOT / "results" / "gates" / "segmenters" / "varied_networks.json").read_text())
-    steps = []
+    steps, of_eight = [], []
     for name in scenarios():
         found = unseen["average_precision"][f"{name}/varied"]
         for thing in found["varied"]:
@@ -184,13 +184,15 @@ def test_the_findings_say_what_the_networks_of_varied_maps_find():
                 assert network["processor_s"] // 10 == seconds // 10
             assert network["tints_and_patches"] == (name == "health_gathering")
         steps.append(f"{network['gradient_steps']:,}")
+        of_eight.append(f"{json.loads((ROOT / 'gvz' / 'segmenters' / f'{name}.json').read_text())['gradient_steps']:,}")
     assert f"made {in_words(steps)} gradient steps in the 1,500 seconds" in WORDS
+    assert f"and fewer gradient steps: {in_words(of_eight)}." in WORDS
 
 
 def test_the_findings_say_what_90_minutes_on_varied_maps_gave_with_a_network_of_them():
     network, plain = "rainbow_segmented+varied_network", "rainbow_segmented"
     runs = {"varied maps": f"general_varied_network/runs/{network}", "eight tasks": f"general_varied_long/runs/{plain}"}
-    steps, of_eight = [], []
+    steps, of_eight, lower = [], [], []
     for name in SCENARIOS:
         title = scenario_named(name).title
         for called, run in runs.items():
@@ -214,6 +216,21 @@ def test_the_findings_say_what_90_minutes_on_varied_maps_gave_with_a_network_of_
         tests = [score_cells(scores, name).split(" | ")[2].split()[0] for scores in (compositions, varied)]
         said = "have {} on the test tasks of {} after 2,700 seconds, varied maps {} after"
         assert said.format(tests[0], title, tests[1]) in WORDS
+        found = [(varied, task_sets(name)[1]), (scores_of("general", plain, name), task_sets(name)[1])]
+        gap = estimate_groups(found, difference).estimate
+        assert gap
+        lower.append(f"{gap.value:.1f}")
+    short = scores_of("general_varied", plain, SCENARIOS[0])
+    of_gate_and_test = [
+        score_cells(scores, SCENARIOS[0]).split(" | ")[column].split()[0]
+        for scores in (scores_of("general_varied_network", network, SCENARIOS[0]), short)
+        for column in (1, 2)
+    ]
+    assert "have {} and {}, not {} and {} as after 900 seconds".format(*of_gate_and_test) in WORDS
+    wall = estimate(short, ["defend_the_center/fuzzy_enemies+gore+stone_wall"]).estimate
+    assert wall
+    assert f"on the network of eight tasks, the latter had {wall.value:.0f}." in WORDS
+    assert f"not eight tasks and their networks | {lower[0]} | | | {lower[1]} | no |" in WORDS
     assert "{:,} gradient steps in Defend the Center and {:,} in Seek and Kill, 8 games".format(*steps) in WORDS
     assert f"16 games at once and {min(of_eight):,} to {max(of_eight):,} gradient steps." in WORDS
 
@@ -231,6 +248,7 @@ def test_the_findings_say_what_90_minutes_on_varied_maps_gave_with_a_network_of_
         ),
         ("defend_the_center", "gore+resized_enemies", "`gore+resized_enemies` has {0}, not {1}, and"),
         ("defend_the_center", "fuzzy_enemies+gore+stone_wall", "where looks alone change, {0}, not {1}."),
+        ("defend_the_center", "gore+mossy_bricks", "`gore+mossy_bricks` has {0}, with eight tasks {1}."),
         ("seek_and_kill", "obstacles invulnerable mixed_enemies", "have {0}, with eight tasks {1}."),
         ("seek_and_kill", "red", "and the agent has not, has {0}, not {1}, and"),
         ("seek_and_kill", "red+resized_enemies", "`red+resized_enemies` has {0}, not {1}, and"),
