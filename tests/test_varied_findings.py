@@ -272,6 +272,7 @@ def test_the_findings_say_what_90_minutes_on_varied_maps_gave_with_a_network_of_
         ("seek_and_kill", "mixed_enemies+red", "`mixed_enemies+red` {0}, not {1}."),
         ("seek_and_kill", "default blue", "`default` and `blue` have {0}, with eight tasks {1}."),
         ("seek_and_kill", "blue+shadows", "`blue+shadows` has {0}, not {1}, although"),
+        ("seek_and_kill", "blue shadows", "although each alone has {0}, with eight tasks {1}."),
     ],
 )
 def test_the_findings_say_how_an_agent_of_varied_maps_plays_single_tasks(name: str, tasks: str, said: str):

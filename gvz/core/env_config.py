@@ -200,6 +200,9 @@ def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield prefix + field.name, value
 
 
+_hints = cache(get_type_hints)
+
+
 def check_types(config: Any, prefix: str, *, convert: bool = True) -> None:
     """Gives each field of a frozen dataclass the type that it is annotated with; for its `__post_init__`.
 
@@ -216,8 +219,6 @@ def check_types(config: Any, prefix: str, *, convert: bool = True) -> None:
         if convert:
             object.__setattr__(config, name, value)
 
-
-_hints = cache(get_type_hints)
 
 EPISODE_SEEDS = 2**31
 """an episode's seed is smaller than this"""

@@ -86,10 +86,11 @@ def _check_attributes(scenario: "Scenario") -> None:
         group for attribute in scenario.attributes if attribute.name in scenario.complete for group in attribute.groups
     }
     for group in sorted(groups.keys() - whole):
-        if near := get_close_matches(group, groups.keys() - {group}, n=1, cutoff=_MISTYPED):
+        others = sorted(groups.keys() - {group})
+        if near := get_close_matches(group, others, n=1, cutoff=_MISTYPED):
             raise TaskError(
                 f"scenario {scenario.id}, attribute {groups[group].name!r}: got the group {group!r} (did you mean "
-                f"{near[0]!r}?), want one of {', '.join(sorted(whole))}, or a name that is less similar"
+                f"{near[0]!r}?), want one of {', '.join(others)}, or a name that is less similar"
             )
 
 
