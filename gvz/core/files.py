@@ -26,18 +26,18 @@ def written_whole(path: Path) -> Generator[Path]:
     writing = path.with_name(f".writing-{path.name}")
     if path.is_dir():
         raise ConfigError(f"{path} is a directory; want the name of a file")
-    with _opened(writing, path) as file:
-        try:
+    try:
+        with _opened(writing, path) as file:
             if not _is_ours(file, writing):
                 raise ConfigError(f"{path} is being written by another process; wait for its end, or give another name")
             file.truncate(0)  # of what a killed process left
             yield writing
             writing.replace(path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                if _is_ours(file, writing):
-                    writing.unlink()
-            raise
+    except BaseException:  # perhaps a Ctrl-C that came while the file was made
+        with contextlib.suppress(OSError), writing.open("rb+") as file:
+            if _is_ours(file, writing):
+                writing.unlink()
+        raise
 
 
 def _is_ours(file: IO[bytes], writing: Path) -> bool:

@@ -111,6 +111,20 @@ def test_an_interruption_while_it_is_made_leaves_nothing(tmp_path, monkeypatch):
     assert file.read_text() == "ours"
 
 
+def test_an_interruption_as_soon_as_it_exists_leaves_nothing(tmp_path, monkeypatch):
+    open_file = Path.open
+
+    def interrupted(path, mode):
+        monkeypatch.setattr(Path, "open", open_file)  # once
+        path.open(mode).close()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "open", interrupted)
+    with pytest.raises(KeyboardInterrupt), written_whole(tmp_path / "report.md"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_one_process_at_a_time_writes_a_file(tmp_path):
     file = tmp_path / "report.md"
     with written_whole(file) as writing:
