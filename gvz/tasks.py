@@ -13,9 +13,10 @@ from gvz.scenarios.map_set import VARIED, names_map_set, parse_map_set
 
 LEVELS = range(MAX_LEVEL + 1)
 """levels of tasks, the easiest first"""
-TrainingSet = Literal["train1", "train4", "train8", "pairs", "compositions"]
+TrainingSet = Literal["train1", "train4", "train8", "pairs", "compositions", "train8_varied"]
 """tasks to train on; pairs: the eight of train8, and each two of their attributes that go together and are no named
-task; compositions: likewise any number of their attributes"""
+task; compositions: likewise any number of their attributes; train8_varied: the eight, and those of them that change no
+texture on varied maps"""
 TaskSet = Literal[TrainingSet, "test", "gate"]
 """a training set, the test set, or the gate set: the named tasks of GATE_LEVEL that are in neither"""
 GATE_LEVEL = 2
@@ -118,7 +119,7 @@ def named_tasks(
 ) -> tuple[Task, ...]:
     """The named tasks of a suite or scenario: scenarios in alphabetical order, tasks in the order of their file.
 
-    The sets `pairs` and `compositions` are those that have tasks without a name in the benchmark, too.
+    The sets `pairs`, `compositions` and `train8_varied` have tasks without a name in the benchmark, too.
 
     Args:
         scenario: only tasks of this scenario, whatever its suite.
@@ -127,7 +128,7 @@ def named_tasks(
         suite: whose scenarios, if none is named.
 
     Raises:
-        TaskError: an unknown scenario, level or split.
+        TaskError: an unknown scenario, level or split; or a set on varied maps, and the scenario has no such maps.
     """
     if level is not None and level not in LEVELS:
         raise TaskError(f"level: got {level!r}, want 0..{MAX_LEVEL}")
@@ -170,6 +171,11 @@ def _names(scenario: Scenario, split: TaskSet | None) -> tuple[str, ...]:
     if split == "gate":
         used = {name for names in scenario.splits.values() for name in names}
         return tuple(name for name in scenario.tasks if name not in used)
+    if split == "train8_varied":
+        eight = scenario.splits["train8"]
+        textures = {attribute.name for attribute in scenario.attributes if "textures" in attribute.groups}
+        kept = [name for name in eight if textures.isdisjoint(name.split("+"))]
+        return (*eight, *(VARIED if name == "default" else f"{VARIED}+{name}" for name in kept))
     if split in ("pairs", "compositions"):
         eight, named = scenario.splits["train8"], named_tasks(scenario.id)
         composed = _compositions(scenario, eight, 2 if split == "pairs" else len(eight))

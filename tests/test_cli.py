@@ -93,7 +93,7 @@ def test_tasks_lists_all_named_tasks(capsys):
     assert (gore["level"], gore["attributes"], gore["sets"]) == (
         1,
         ["gore"],
-        ["train4", "train8", "pairs", "compositions"],
+        ["train4", "train8", "pairs", "compositions", "train8_varied"],
     )
 
 
@@ -107,7 +107,7 @@ def test_tasks_prints_a_table(capsys):
         *("4", "test", "seek_and_kill/complete", "=", "mixed_enemies+obstacles+red+resized_enemies+shadows")
     ]
     assert {len(line) > 80 for line in lines[:-1]} == {False}
-    others = ["seek_and_kill/blue=0.5+shadows", "seek_and_kill/varied+shadows"]
+    others = ["seek_and_kill/blue=0.5+shadows", "seek_and_kill/varied-10+shadows"]
     assert cli.main(["tasks", "--tasks", *others]) == 0
     assert [line.split()[1:] for line in capsys.readouterr().out.splitlines()[1:]] == [[task] for task in others]
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 import gvz
 import gvz.scenarios
+from gvz.commands.tasks import task_row
 from gvz.core.errors import TaskError
 from gvz.scenarios.base import Attribute, Content, Task, Textures
 from gvz.scenarios.compiler import task_content
@@ -252,11 +253,29 @@ def test_unknown_selections_of_named_tasks_are_refused():
     with pytest.raises(TaskError, match=r"level: got 5, want 0\.\.4"):
         named_tasks(level=5)
     with pytest.raises(
-        TaskError, match="split: got 'train2', want one of train1, train4, train8, pairs, compositions, test"
+        TaskError,
+        match="split: got 'train2', want one of train1, train4, train8, pairs, compositions, train8_varied, test",
     ):
         named_tasks(split="train2")
     with pytest.raises(TaskError, match="unknown scenario 'seek'"):
         named_tasks("seek")
+
+
+def test_the_set_on_varied_maps_has_the_eight_tasks_and_those_without_textures_on_varied_maps():
+    found = [task.id for task in named_tasks("seek_and_kill", split="train8_varied")]
+    assert found[:8] == [task.id for task in named_tasks("seek_and_kill", split="train8")]
+    assert found[1:3] == ["seek_and_kill/blue", "seek_and_kill/red"], "of textures alone"
+    names = ("", "+obstacles", "+resized_enemies", "+shadows", "+mixed_enemies", "+invulnerable")
+    assert found[8:] == [f"seek_and_kill/varied{name}" for name in names]
+    assert not set(named_tasks(split="train8_varied")) & {*named_tasks(split="test"), *named_tasks(split="gate")}
+
+
+def test_a_scenario_without_varied_maps_has_no_set_on_them(monkeypatch: pytest.MonkeyPatch):
+    plain = dataclasses.replace(scenario_named("seek_and_kill"), variety=None)
+    monkeypatch.setattr("gvz.tasks.all_scenarios", lambda: {plain.id: plain})
+    assert task_row(Task(plain))["sets"] == ["train1", "train4", "train8", "pairs", "compositions"]
+    with pytest.raises(TaskError, match="seek_and_kill: got varied, but the scenario has no variety; set it"):
+        named_tasks(plain.id, split="train8_varied")
 
 
 def test_attributes_of_different_groups_do_not_fight_over_a_value():

@@ -17,7 +17,6 @@ from gvz.core.control_groups import keep_xla_to_quota
 from gvz.core.errors import ConfigError
 from gvz.core.files import written_whole
 
-TrainSet = Literal["train4", "train8", "varied"]
 _LOOK_PERIOD_STEPS = 20
 """between two looks at the time"""
 _BATCHES_AHEAD = 4
@@ -41,9 +40,8 @@ class TrainSegmenter:
     """whose tasks"""
     out: Path
     """the ONNX file to write; beside it comes a .json file with what it was trained on, and its scores"""
-    training_set: TrainSet = "train8"
-    """the tasks that it learns from; varied: train8, and varied maps, alone and with each attribute of train8 but
-    textures"""
+    training_set: Literal["train4", "train8", "train8_varied"] = "train8"
+    """the tasks that it learns from; train8_varied: the eight, and those that change no texture on varied maps, too"""
     frames: int = 1500
     """labelled frames of each training task"""
     gate_frames: int = 300
@@ -87,7 +85,7 @@ class TrainSegmenter:
         from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH, Segmenter
         from learner.segmentation import train_segmentation, write_onnx
 
-        tasks = segmentation.training_tasks(self.scenario, self.training_set)
+        tasks = named_tasks(self.scenario, split=self.training_set)
         of_machine = machine.describe()  # with the commit of the code that is loaded now
         begun_s = machine.processor_s()
         with contextlib.ExitStack() as until_trained, Bars(line_period_s=10.0) as bars:

@@ -42,7 +42,8 @@ def task_row(task: Task) -> dict[str, Any]:
     from gvz.registration import gymnasium_id
 
     scenario = task.scenario
-    sets = [name for name in get_args(TaskSet) if task in named_tasks(scenario.id, split=name)]
+    possible = [name for name in get_args(TaskSet) if scenario.variety is not None or name != "train8_varied"]
+    sets = [name for name in possible if task in named_tasks(scenario.id, split=name)]
     return {
         "task": task.id,
         "scenario": scenario.id,

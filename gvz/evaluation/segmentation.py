@@ -7,7 +7,7 @@ from concurrent.futures import Executor, Future
 from contextlib import closing
 from functools import cache, partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,9 +18,7 @@ from gvz.evaluation.play import episode_seed
 from gvz.evaluation.players import Player, RandomPlayer, ScriptedPlayer
 from gvz.scenarios.base import Task, Textures
 from gvz.scenarios.compiler import task_content
-from gvz.scenarios.map_set import VARIED
 from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH
-from gvz.tasks import TaskSet, named_tasks, parse_task, scenario_named
 from learner.segmentation import CELL
 from learner.segmentation_views import (
     OUTLINES,
@@ -76,24 +74,6 @@ _TRIES = 3
 """surroundings that are drawn; those are taken that hide least and show least of their own"""
 _MIN_CELLS = 100
 """that show a class, for a score of it"""
-
-
-def training_tasks(scenario: str, training_set: TaskSet | Literal["varied"]) -> list[Task]:
-    """The tasks that a network learns from.
-
-    Args:
-        scenario: whose tasks.
-        training_set: a training set; or varied: train8, and its tasks without other textures on varied maps.
-
-    Raises:
-        TaskError: no such scenario, or it has no such set.
-    """
-    if training_set != VARIED:
-        return list(named_tasks(scenario, split=training_set))
-    eight, attribute = named_tasks(scenario, split="train8"), scenario_named(scenario).attribute
-    kept = [task for task in eight if not any("textures" in attribute(name).groups for name in task.attributes)]
-    names = ("+".join((VARIED, *task.attributes)) for task in kept)
-    return [*eight, *(parse_task(f"{scenario}/{name}") for name in names)]
 
 
 def labelled_frames(task: Task, num_frames: int) -> Labelled:

@@ -60,7 +60,7 @@ class TrainingRun:
     """file in configs/"""
     scenario: str
     training: str
-    """train1, train4, train8, pairs, compositions, or the name of the one task trained on"""
+    """a training set (gvz.tasks), or the name of the one task trained on"""
     tasks: tuple[str, ...]
     """ids of the tasks trained on"""
     seed: int
@@ -120,7 +120,7 @@ class Experiment:
     scenarios: tuple[str, ...] = ()
     """default: those that numbers were published of, or else all"""
     trainings: tuple[str, ...]
-    """train1, train4, train8, pairs, compositions: a training set; varied-100, procedural-train-100: such a task; each:
+    """a training set (gvz.tasks.TrainingSet), such as train4; varied-100, procedural-train-100: such a task; each:
     every named task alone"""
     seeds: tuple[int, ...] = (1111, 2222, 3333)
     total_updates: int = 200_000

@@ -23,6 +23,7 @@ TRAINING_SETS: dict[TrainingSet, str] = {
     "train8": "8 tasks",
     "pairs": "8 tasks and pairs",
     "compositions": "8 tasks and compositions",
+    "train8_varied": "8 tasks, also on varied maps",
 }
 """what to call a training set: "4 tasks" for train4"""
 

@@ -63,14 +63,6 @@ def test_a_cell_shows_a_class_if_an_eighth_of_its_pixels_do():
     assert segmentation.score(probabilities, labels)["enemy"] == pytest.approx(expected)
 
 
-def test_the_tasks_of_varied_maps_have_the_attributes_that_are_no_textures():
-    found = [task.id for task in segmentation.training_tasks("seek_and_kill", "varied")]
-    names = ("", "+obstacles", "+resized_enemies", "+shadows", "+mixed_enemies", "+invulnerable")
-    assert found[8:] == [f"seek_and_kill/varied{name}" for name in names]
-    assert found[:8] == [task.id for task in segmentation.training_tasks("seek_and_kill", "train8")]
-    assert found[1:3] == ["seek_and_kill/blue", "seek_and_kill/red"], "of textures alone"
-
-
 @pytest.mark.engine
 def test_frames_of_varied_maps_show_many_of_them(monkeypatch):
     begun: list[str] = []

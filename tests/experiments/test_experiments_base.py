@@ -193,7 +193,7 @@ def test_settings_change_their_fields_alone_and_another_agent_comes_first():
         ({"num_checkpoints": 4, "total_updates": 3}, "num_checkpoints 4, total_updates 3, want each at most the next"),
         (
             {"trainings": ("test",)},
-            "trainings: got 'test', want train1, train4, train8, pairs, compositions, varied, varied-<number",
+            "want train1, train4, train8, pairs, compositions, train8_varied, varied, varied-<number",
         ),
         ({"variants": {"a b": {}}}, r"variants: got 'a b', want letters, digits and \. _ - \(it names"),
         ({"variants": {"a": {"seed": 1, "learner.batch_size": 1}}}, "variant a sets seed, which the experiment sets"),
