@@ -372,7 +372,8 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
             assert self._state is not None
             info["sight"] = observe_sight(self._state, self.config)
         if terminated or truncated:
-            info["solved_episode"] = scenario.metric == "frames_alive" and self._frames >= self._timeout_frames
+            survived = truncated and self._frames >= self._timeout_frames
+            info["solved_episode"] = survived and scenario.metric == "frames_alive"
         return info
 
     def _show(self, tics: int) -> None:

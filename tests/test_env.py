@@ -181,7 +181,9 @@ def test_death_terminates_with_the_frame_of_its_moment(shared: DoomEnv):
     scenario = dataclasses.replace(shared.task.scenario, timeouts=timeouts)
     with closing(DoomEnv(dataclasses.replace(shared.task, scenario=scenario))) as env:
         env.reset(seed=1)
-        assert idle_to_the_end(env)[-1][2:4] == (True, False), "also in the frame of the time-out"
+        *_, terminated, truncated, info = idle_to_the_end(env)[-1]
+        assert (terminated, truncated) == (True, False), "also in the frame of the time-out"
+        assert info["solved_episode"] is False, "it did not survive that frame"
 
 
 @pytest.mark.parametrize(("frame_skip", "decisions"), [(4, 275), (7, 158)])

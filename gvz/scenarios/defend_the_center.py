@@ -16,7 +16,7 @@ import random
 from dataclasses import replace
 from functools import partial
 
-from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
+from gvz.scenarios.base import Attribute, Chance, Content, Scenario, Textures, Uniform, Variety, words
 from gvz.scenarios.layout import WAY, Layout, Place, draw_pillar, ring, vary
 from gvz.scenarios.parts import COUNTED_MARINE, RESIZED_ENEMIES, rendered, retextured, things_at
 from gvz.scenarios.rewards import Fell, Pace, Reward, Rose, death
@@ -199,8 +199,9 @@ SCENARIO = Scenario(
         "fast_enemies+gore+resized_enemies": Content(agent={"DamageFactor": 0.85}),
         "complete": Content(
             textures=Textures("RROCK02", "FWATER1", "AQF062"),
-            parameters={"classes": ("MarineChainsawVzd", "Demon", "LostSoul"), "num_enemies": 6},
-            entity={"Speed": 20.0},
+            # its map has six, each two of a kind at one place, where the second marine never appears
+            parameters={"classes": ("MarineChainsawVzd", "Demon", "LostSoul", "Demon", "LostSoul")},
+            entity={"Speed": 20.0, "RenderStyle": Chance("STYLE_Fuzzy", 0.5)},
             agent={"DamageFactor": 1.0},
         ),
     },

@@ -4,8 +4,8 @@ Ability tested: finding health kits, avoiding poison, walking round obstacles.
 Actions: MOVE_FORWARD, TURN_LEFT, TURN_RIGHT.
 Observation: the screen with HUD, no weapon; variable HEALTH.
 Reward (eq. 3.4): 0.01 - [death] - [poison picked up] + [health rose].
-Start: one of 9 places at a random angle (levdoom: the centre, facing east; on the map of `supreme` one of its 12
-    places). The floor takes 8 of 100 health every 32 tics. 16 kits lie on the floor; one is added at once and
+Start: one of 9 places at a random angle (levdoom: the centre, facing east); on the map of `supreme` one of its 12
+    places. The floor takes 8 of 100 health every 32 tics. 16 kits lie on the floor; one is added at once and
     every 30 tics.
 Termination: the agent dies. Truncation: after 2100 tics.
 Metric: frames alive, at most the time-out.

@@ -218,7 +218,6 @@ SCENARIO = Scenario(
                 parameters={"classes": MIXED, "num_per_class": 3, "first_delay": 180, "spawn_delay": 180},
                 actors=COUNTED_MARINE,
             ),
-            levdoom=Content(parameters={"first_delay": 0}),
         ),
         Attribute(
             name="invulnerable",
@@ -228,7 +227,7 @@ SCENARIO = Scenario(
                 agent={"Invulnerable": "TRUE"},
                 actors=_born_soul(1),
             ),
-            levdoom=Content(parameters={"first_delay": 0}, actors=_born_soul(100)),
+            levdoom=Content(actors=_born_soul(100)),
         ),
     ),
     complete=("red", "obstacles", "resized_enemies", "shadows", "mixed_enemies"),

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from gvz.scenarios.base import Uniform
+from gvz.scenarios.base import Chance, Uniform
 from gvz.scenarios.compiler import map_source, task_content
 from gvz.tasks import named_tasks, parse_task
 from gvz.wad.lumps import MAP_NAME, read_maps, read_wad
@@ -55,7 +55,10 @@ FILES = {
 COUNTING_MARINE = "its MarineChainsaw does not count as a kill; ours is a child of it that does"
 DEAD_CODE = "its damage factor stands behind an endless loop and is never set"
 DIFFERENCES = {
-    ("defend_the_center/complete", "fuzzy_share"): "its enemies are fuzzy with probability 1/2, ours always",
+    **{
+        ("defend_the_center/complete", key): "its second marine never appears: the first stands at its place"
+        for key in ("classes", "num_enemies")
+    },
     ("dodge_projectiles/complete", "things"): "one skull stands 32 units off its place in flaming_skulls",
     ("health_gathering/resized_kits", "entity"): "it also shades the kit that is not there yet: no effect",
     ("health_gathering/complete", "things"): "its sixth obstacle stands where an agent starts; ours leaves it out",
@@ -164,6 +167,7 @@ def author_says(scenario: str, script: Script, decorate: str) -> dict[str, Any]:
         says |= {
             "classes": script.classes() or ("Demon",),
             "num_per_class": script.value("start_monsters_quantity"),
+            "first_delay": script.value("spawn_delay") if re.search(r"while ?\(1\) ?{\s*delay", script.text) else 0,
             "spawn_delay": script.value("spawn_delay"),
             "map_size": script.value("map_size"),
             "last_spot": script.number(r"target_id = random\(10, ?(\d+)\)"),
@@ -184,9 +188,11 @@ def author_says(scenario: str, script: Script, decorate: str) -> dict[str, Any]:
 def ours(task_id: str) -> dict[str, Any]:
     content = task_content(parse_task(task_id), "levdoom")
     said: dict[str, Any] = {**content.parameters}
-    said["entity"] = {k: v.upper() if isinstance(v, str) else v for k, v in content.entity.items()}
+    style = content.entity.get("RenderStyle")
+    said["fuzzy_share"] = style.share if isinstance(style, Chance) else 1
+    entity = {name: value.value if isinstance(value, Chance) else value for name, value in content.entity.items()}
+    said["entity"] = {k: v.upper() if isinstance(v, str) else v for k, v in entity.items()}
     said["agent"] = {name: value for name, value in content.agent.items() if (name, value) != FULL_DAMAGE}
-    said["fuzzy_share"] = 1
     script = parse_task(task_id).scenario.script
     if bullets := re.search(r'"(?:ClipBox|Clip)", (\d+)', script):
         said["bullets"] = int(bullets[1])
