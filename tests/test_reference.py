@@ -154,7 +154,7 @@ def test_the_page_of_later_scenarios_says_what_players_reach():
     deaths = [f"{100 * found('scripted', f'find_ammunition/{name}', 'terminated'):.0f}" for name in fast]
     assert round(1 / goal[0]) == 11
     for told in (
-        f"a blind walk in circles leaves {key[0]:.1f} times in `default`, {key[1]} of the bound",
+        f" blind walk in circles leaves {key[0]:.1f} times in `default`, {key[1]} of the bound",
         f"where it sees nothing and leaves {found('scripted', 'find_the_key/maze'):.1f} times",
         f"reaches a goal in one episode of eleven, {goal[1]} of the bound",
         f"until its rockets are spent kills {rockets[0]:.1f} of 45 in `default`, {rockets[1]} of the bound",

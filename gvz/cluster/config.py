@@ -7,7 +7,7 @@ from gvz.core.errors import ConfigError
 from gvz.core.ranges import Range, check_ranges
 
 MAX_HOSTS = 64
-"""of one learner; beyond some sixteen, several learners are faster (docs/CLUSTER.md)"""
+"""of one learner; its core is the limit long before, by the plan of docs/CLUSTER.md at two to five hosts of 16 cores"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import polars as pl
 
-from gvz.reports.runs import Run
+from gvz.reports.runs import TRAINING_SETS, Run
 from gvz.run.resume import may_change
+from gvz.scenarios.map_set import names_map_set
 from gvz.tasks import all_scenarios
 
 EACH = "each task alone"
@@ -149,8 +150,9 @@ def _of_other_budgets(of_agent: Sequence[Run]) -> Iterator[str]:
 
 
 def _is_of_a_set(run: Run) -> bool:
-    """An experiment has trained it on a training set, if only of one task."""
-    return "/train" in run.id
+    """An experiment has trained it on a training set, if only of one task, or on drawn maps."""
+    scenario, training = ["", "", *run.id.split("/")][-3:-1]
+    return scenario in all_scenarios() and (training in TRAINING_SETS or names_map_set(training))
 
 
 def with_agents(episodes: pl.DataFrame, agents: dict[str, str]) -> pl.DataFrame:

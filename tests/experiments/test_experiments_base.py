@@ -1,7 +1,6 @@
 """Experiments as data: every one there is, the published numbers by their own averages, and what is refused."""
 
 import dataclasses
-import re
 from pathlib import Path
 
 import numpy as np
@@ -226,13 +225,6 @@ def test_the_page_lists_every_experiment_with_its_size():
     page = (Path(__file__).parents[2] / "docs" / "EXPERIMENTS.md").read_text()
     for experiment in experiments().values():
         lines = [line for line in page.splitlines() if line.startswith(f"| `{experiment.name}` |")]
-        assert len(lines) == 1, f"want one row of {experiment.name} in the first table of docs/EXPERIMENTS.md"
-        assert lines[0].endswith(f"| {len(experiment.runs())} | {experiment.total_updates:,} |")
-
-
-def test_the_page_says_which_processor_time_a_run_of_each_experiment_has():
-    page = (Path(__file__).parents[2] / "docs" / "EXPERIMENTS.md").read_text()
-    rows = re.findall(r"^\| ([\d,]+ s|no limit) \| (.*) \|$", page, flags=re.MULTILINE)
-    said = sorted((name, limit) for limit, names in rows for name in names.replace("`", "").split(", "))
-    limits = {name: experiment.max_processor_s for name, experiment in experiments().items()}
-    assert said == sorted((name, "no limit" if s is None else f"{s:,.0f} s") for name, s in limits.items())
+        assert len(lines) == 1, f"want one row of {experiment.name} in a table of docs/EXPERIMENTS.md"
+        seconds = "-" if experiment.max_processor_s is None else f"{experiment.max_processor_s:,.0f}"
+        assert lines[0].endswith(f" | {seconds} | {len(experiment.runs())} | {experiment.total_updates:,} |")

@@ -193,16 +193,21 @@ def test_reward_weights_tell_agents_apart_unless_they_are_of_other_scenarios(cop
         assert agents[str(tmp_path / "r" / str(number))] == f"rainbow_4task (env.reward_weights {weights})"
 
 
-def test_runs_of_an_experiment_with_other_settings_are_put_together_and_named(small, tmp_path):
-    shutil.copytree(small, tmp_path / "r")
-    runs = sorted((tmp_path / "r" / "runs" / "rainbow_4task" / "defend_the_center" / "train4").iterdir())
-    other = runs[0].with_name("seed_2222")
-    shutil.copytree(runs[0], other)
+@pytest.mark.parametrize("experiment", ["training_set_size", "general_pairs", "general_compositions", "general"])
+def test_runs_of_an_experiment_with_other_settings_are_put_together_and_named(tmp_path, experiments_writer, experiment):
+    plan = Plan.of(experiment, scale=0.0001, scenarios=("defend_the_center",))
+    experiments_writer(tmp_path, plan, lambda _: 50.0)
+    run = run_directory(tmp_path, plan.runs()[-1])
+    names = {*read_results([tmp_path]).agents.values()}
+    other = run.with_name("seed_2222")
+    shutil.copytree(run, other)
     saved = json.loads((other / "config.json").read_text())
     saved["config"]["agent"]["discount"], saved["config"]["seed"] = 0.5, 2222
     (other / "config.json").write_text(json.dumps(saved))
-    (problem, _) = read_results([tmp_path / "r"]).problems
-    assert problem.endswith(" with other runs of rainbow_4task (4 tasks), which have another agent.discount 0.99")
+    results = read_results([tmp_path])
+    assert {*results.agents.values()} == names
+    (problem,) = (text for text in results.problems if text.startswith(f"{other}: put together"))
+    assert " which have another agent.discount 0." in problem
 
 
 def test_seeds_that_learned_with_other_networks_are_named(small, tmp_path):
