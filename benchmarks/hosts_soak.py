@@ -18,11 +18,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import psutil
 import tyro
 from rich.console import Console
 
-from benchmarks.soak import DIRECTORY, Watched, about, growth, ticks
+from benchmarks.soak import DIRECTORY, KINDS, Watched, about, growth, processes, ticks
 from gvz.core import janitor, records
 from gvz.run import machine
 
@@ -30,8 +29,6 @@ if TYPE_CHECKING:
     from tests.cluster.conftest import RayCluster
 
 _STOP_TIMEOUT_S, _CLEARED_S, _MENDED_S = 120.0, 60.0, 120.0
-_KINDS = {"RemoteHost": "host", "actors.worker": "actor", "+viz_instance_id": "engine"}
-"""a word of the command line, and which process that is"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,22 +129,8 @@ def table(made: dict[str, Any] | None) -> str:
     )
 
 
-def processes(kind: str | None = None) -> list[psutil.Process]:
-    """Hosts, actors or engines (or all) below this process, oldest first."""
-    found: list[psutil.Process] = []
-    for process in psutil.Process().children(recursive=True):
-        try:
-            words = " ".join(process.cmdline())
-            is_one = any(mark in words and kind in (None, name) for mark, name in _KINDS.items())
-            if is_one and process.status() != psutil.STATUS_ZOMBIE:
-                found.append(process)
-        except psutil.Error:  # it has just ended
-            continue
-    return sorted(found, key=lambda process: process.create_time())
-
-
 def _counts() -> dict[str, float]:
-    return {f"{kind}s": len(processes(kind)) for kind in _KINDS.values()}
+    return {f"{kind}s": len(processes(kind)) for kind in KINDS.values()}
 
 
 def _restarts(run: Watched) -> int:

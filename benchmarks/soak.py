@@ -39,6 +39,8 @@ DIRECTORY = record.ROOT / "results" / "reliability"
 _START_TIMEOUT_S, _STOP_TIMEOUT_S, _CLEARED_S = 900.0, 120.0, 60.0
 _FIRST_UPDATES = 20
 """gradient steps after which a run is warm"""
+KINDS = {"RemoteHost": "host", "actors.worker": "actor", "+viz_instance_id": "engine"}
+"""a word of the command line, and which process that is"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,15 +107,6 @@ class Watched:
         """Rows of metrics.jsonl so far."""
         return records.read_stored(self.directory / "metrics.jsonl")[0]
 
-    def actors(self) -> list[psutil.Process]:
-        """Living actor processes, oldest first."""
-        found = []
-        for child in self._root.children(recursive=True):
-            with contextlib.suppress(psutil.NoSuchProcess):
-                if "actors.worker" in child.cmdline() and child.status() != psutil.STATUS_ZOMBIE:
-                    found.append(child)
-        return sorted(found, key=lambda process: process.create_time())
-
     def sample(self) -> dict[str, float]:
         """The run's present use: bytes of memory, counts of descriptors, processes and files in /dev/shm."""
         sizes = []
@@ -162,7 +155,7 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
                     run.check()
                     samples.append({"time_s": round(time.time() - begin, 1), **run.sample()})
                     due = kind == "kills" and now >= options.kill_every_s * _killed_since(kills, stretch)
-                    if due and (actors := run.actors()):
+                    if due and (actors := processes("actor")):
                         actors[0].kill()  # the oldest, so that they take turns
                         kills.append(round(time.time() - begin, 1))
                 stretches.append({**stretch, "end_s": time.time() - begin})
@@ -187,6 +180,20 @@ def soak(options: Soak, console: Console) -> dict[str, Any]:
             "damaged_rows": len(problems),
             "left_behind": run.left_behind(),
         }
+
+
+def processes(kind: str | None = None) -> list[psutil.Process]:
+    """Hosts, actors or engines (or all) below this process, oldest first."""
+    found: list[psutil.Process] = []
+    for process in psutil.Process().children(recursive=True):
+        try:
+            words = " ".join(process.cmdline())
+            is_one = any(mark in words and kind in (None, name) for mark, name in KINDS.items())
+            if is_one and process.status() != psutil.STATUS_ZOMBIE:
+                found.append(process)
+        except psutil.Error:  # it has just ended
+            continue
+    return sorted(found, key=lambda process: process.create_time())
 
 
 def summary(made: dict[str, Any]) -> dict[str, float]:

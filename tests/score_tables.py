@@ -42,6 +42,11 @@ def scores_of(folder: str, agent: str, scenario: str) -> Scores:
     return agent_scores(results_of(folder).episodes.filter(scenario=scenario), agent)
 
 
+def task_mean(scores: Scores, task: str) -> float:
+    """The mean over the runs of an agent."""
+    return float(np.mean([by_task[task].mean() for by_task in scores.runs.values()]))
+
+
 def mean_score(episodes: polars.DataFrame, **chosen: Any) -> str:
     """The mean percentage of these episodes, rounded."""
     return f"{episodes.filter(**chosen)['normalized_score'].mean():.0f}"
@@ -98,6 +103,16 @@ def of_first_seed(episodes: polars.DataFrame) -> polars.DataFrame:
 def metrics_of(run: Path) -> list[dict[str, Any]]:
     """The rows of a run's metrics."""
     return rows_of(run / "metrics.jsonl.gz")
+
+
+def segmenter(name: str) -> dict[str, Any]:
+    """The record of a network in gvz/segmenters."""
+    return json.loads((ROOT / "gvz" / "segmenters" / f"{name}.json").read_text())
+
+
+def learned(rows: list[dict[str, Any]], first: int, end: int) -> float:
+    """The mean score of those training episodes that ended after so many gradient steps, and before so many."""
+    return float(np.mean([row["normalized_score"] for row in rows if first <= row["num_updates"] < end]))
 
 
 def training_episodes(run: Path, low_s: float, high_s: float) -> list[dict[str, Any]]:

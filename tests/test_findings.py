@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from gvz.reports.experiment_section import comparison_table, result_table
-from gvz.reports.results import read_results
 from gvz.reports.scores import agent_scores, estimate
 from gvz.tasks import named_tasks, scenario_named, scenarios
 from tests.score_tables import (
@@ -18,6 +17,7 @@ from tests.score_tables import (
     WORDS,
     gain,
     last_updates,
+    learned,
     mean_score,
     metrics_of,
     results_of,
@@ -52,7 +52,7 @@ def test_the_findings_compare_the_general_agents_as_their_records_do(words, othe
 
 def test_the_findings_say_what_anyone_reaches_on_level_4():
     agents = results_of("general_short").episodes
-    script = read_results([ROOT / "results" / "reference" / "scripted.jsonl.gz"]).episodes
+    script = results_of("reference/scripted.jsonl.gz").episodes
     found = []
     for episodes, agent, num_seeds in (
         (agents, "rainbow_segmented", 3),
@@ -204,10 +204,8 @@ def test_the_findings_say_how_training_went_on_in_the_gates_of_the_replay_and_th
         found = []
         for file in runs:
             rows = rows_of(file)
-            last = max(row["num_updates"] for row in rows) - 2_000
-            early = [row["normalized_score"] for row in rows if 6_000 <= row["num_updates"] < 8_000]
-            late = [row["normalized_score"] for row in rows if row["num_updates"] >= last]
-            found.append((np.mean(early), np.mean(late)))
+            end = max(row["num_updates"] for row in rows)
+            found.append((learned(rows, 6_000, 8_000), learned(rows, end - 2_000, end + 1)))
         return np.array(found)
 
     small, large = scores_of_training("replay_100k"), scores_of_training("replay_400k")

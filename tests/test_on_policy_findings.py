@@ -18,6 +18,7 @@ from tests.score_tables import (
     metrics_of,
     score_row,
     scores_of,
+    task_mean,
     task_sets,
     training_episodes,
 )
@@ -101,7 +102,7 @@ def test_the_findings_say_how_ppo_learned_beside_segmented_frames(scenario):
 )
 def test_the_findings_say_where_ppo_is_better_or_worse_than_rainbow(task, said):
     scenario, _, name = task.partition("/")
-    had, has = (np.mean([by_task[task].mean() for by_task in scores.runs.values()]) for scores in both(scenario))
+    had, has = (task_mean(scores, task) for scores in both(scenario))
     assert said.format(name, has, had) in WORDS
 
 
@@ -122,10 +123,7 @@ def test_the_findings_say_what_a_longer_horizon_and_more_entropy_gave_ppo():
     assert costs == "-2.5 [-4.2, -0.9]"
     assert f"alone gives {of_entropy} there, and costs the training tasks 2.5 [0.9, 4.2]." in WORDS
     for task, verb in (("fast_enemies+flying_enemies", " has"), ("gore+resized_enemies", "")):
-        has, had = (
-            np.mean([of_run[f"{name}/{task}"].mean() for of_run in scores.runs.values()])
-            for scores in (others[-1], plain)
-        )
+        has, had = (task_mean(scores, f"{name}/{task}") for scores in (others[-1], plain))
         assert f"`{task}`{verb} {has:.0f} instead of {had:.0f}" in WORDS
     columns, decisions = [], []
     for variant in variants:

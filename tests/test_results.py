@@ -14,10 +14,9 @@ from gvz.evaluation.statistics import bootstrap, bootstrap_runs
 from gvz.experiments.base import experiments
 from gvz.reports.experiment_section import result_table
 from gvz.reports.joint_section import joint_sections
-from gvz.reports.results import read_results
-from gvz.reports.scores import agent_scores, estimate
+from gvz.reports.scores import estimate
 from gvz.tasks import LEVELS, Task, TaskSet, named_tasks, scenarios
-from tests.score_tables import PAGE, ROOT, WORDS, metrics_of, results_of, rows_of, words_of
+from tests.score_tables import PAGE, ROOT, WORDS, learned, metrics_of, results_of, rows_of, scores_of, words_of
 
 
 def test_the_quick_runs_are_better_than_chance_on_the_same_episodes():
@@ -66,7 +65,7 @@ def test_the_quick_comparison_says_what_players_that_do_not_learn_have_on_the_sa
     folder, scenario = ROOT / "results" / "quick_comparison", "defend_the_center"
 
     def first_episodes(player: str) -> list[dict[str, Any]]:
-        played = read_results([ROOT / "results" / "reference" / f"{player}.jsonl.gz"]).episodes
+        played = results_of(f"reference/{player}.jsonl.gz").episodes
         return played.filter(polars.col("episode") < 25, scenario=scenario).to_dicts()
 
     def mean(rows: list[dict[str, Any]], tasks: list[Task]) -> float:
@@ -143,7 +142,7 @@ def test_the_joint_run_says_what_its_records_give():
         alone[name] = f"{np.mean(scores):.1f}"
     said = "(`rainbow_general`, eight training tasks) have {defend_the_center} and {seek_and_kill} on the same tasks"
     assert said.format(**alone) in WORDS
-    sweep = read_results([ROOT / "results" / "reference" / "sweep.jsonl.gz"]).episodes
+    sweep = results_of("reference/sweep.jsonl.gz").episodes
     of_scenarios = sweep.filter(polars.col("task").is_in([task.id for task in named_tasks(split="test")]))
     nothing = of_scenarios.group_by("scenario").agg(polars.col("normalized_score").mean())["normalized_score"].mean()
     assert f"the sweep has {nothing:.1f}." in WORDS
@@ -157,20 +156,18 @@ def test_the_hour_of_the_main_job_says_what_its_records_give():
     last = metrics_of(folder / "seed_1111")[-1]
     updates, decisions = f"{last['num_updates']:,} gradient steps", f"{round(last['actors/env_steps'], -3):,} decisions"
     assert f"{updates}, {decisions} and {last['run/processor_s']:,.0f} seconds of processor time" in page
-    random = read_results([ROOT / "results" / "reference" / "random.jsonl.gz"]).episodes
     said = []
     for split, title in (("train4", "4 training tasks"), ("test", "7 test tasks")):
         tasks = [task.id for task in named_tasks("defend_the_center", split=split)]
-        found = [(results_of("rainbow_4task").episodes, "rainbow_4task"), (random, "random")]
-        said.append([estimate(agent_scores(episodes, agent), tasks).text for episodes, agent in found])
+        found = [("rainbow_4task", "rainbow_4task"), ("reference/random.jsonl.gz", "random")]
+        said.append([estimate(scores_of(*one, "defend_the_center"), tasks).text for one in found])
         assert f"| {title} | {' | '.join(said[-1])} |" in page
     (trained, _), (unseen, chance) = said
     assert f"after {updates}, it has {trained} on its four training tasks and {unseen} on the" in guide
     assert f"(random: {chance.split()[0]};" in guide
     rows, learning = rows_of(folder / "seed_1111" / "episodes.jsonl.gz"), []
     for low, high in ((0, 5_000), (15_000, 20_000), (40_000, 44_091)):
-        scores = [row["normalized_score"] for row in rows if low <= row["num_updates"] < high]
-        learning.append(f"{np.mean(scores):.0f}")
+        learning.append(f"{learned(rows, low, high):.0f}")
     assert (
         "{} percent of the bound in the first 5,000 gradient steps, {} at 15,000 to 20,000, and {} in the last 4,090."
     ).format(*learning) in page

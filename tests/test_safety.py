@@ -31,6 +31,7 @@ from gvz.run.telemetry import Telemetry
 from gvz.wad.acs import compile_acs
 from gvz.wad.lumps import Lump, read_wad, write_wad
 from learner import checkpoint
+from tests.learner.test_checkpoint import forged
 from tests.waiting import wait_until
 
 ROOT = Path(__file__).parent.parent
@@ -190,14 +191,6 @@ class Bomb:
         return Path.touch, (self._mark,)
 
 
-def forge(directory: Path, victim: Path, data: bytes) -> None:
-    """Replaces a file of a checkpoint and makes its manifest fit."""
-    victim.write_bytes(data)
-    manifest = json.loads((directory / "manifest.json").read_text())
-    manifest["files"][str(victim.relative_to(directory))] = [len(data), checkpoint._digest(victim)]
-    (directory / "manifest.json").write_text(json.dumps(manifest))
-
-
 def test_a_bomb_goes_off_when_it_is_unpickled(tmp_path: Path):
     pickle.loads(pickle.dumps(Bomb(tmp_path / "mark")))
     assert (tmp_path / "mark").exists()
@@ -214,7 +207,7 @@ def test_a_checkpoint_full_of_pickles_is_refused_and_not_unpickled(tmp_path: Pat
         files = sorted(file for file in directory.rglob("*") if file.is_file() and file.name != "manifest.json")
         if index == len(files):
             break
-        forge(directory, files[index], bomb)
+        forged(str(files[index].relative_to(directory)), bomb)(directory)
         try:
             arrays, _ = checkpoint.read(directory, template)
         except CheckpointError:

@@ -12,6 +12,7 @@ from tests.score_tables import (
     ROOT,
     WORDS,
     last_updates,
+    learned,
     mean_score,
     means,
     metrics_of,
@@ -92,10 +93,8 @@ def test_the_findings_say_what_a_loss_of_sight_gave():
     ]
     assert "({}; {} with a loss of sight, {} without)".format(*of_gates) in WORDS
     run = ROOT / "results/general_short/runs" / SIGHT / "seek_and_kill/train8/seed_1111"
-    learning = [
-        row["normalized_score"] for row in rows_of(run / "episodes.jsonl.gz") if 17_000 <= row["num_updates"] < 18_000
-    ]
-    assert f"a loss of sight they had {np.mean(learning):.0f} at 17,000 to 18,000." in WORDS
+    learning = learned(rows_of(run / "episodes.jsonl.gz"), 17_000, 18_000)
+    assert f"a loss of sight they had {learning:.0f} at 17,000 to 18,000." in WORDS
     norms: dict[str, list[float]] = {}
     for agent in ("sight_loss", "plain"):
         runs = sorted((ROOT / "results/gates/runs" / f"rainbow_general+{agent}" / "seek_and_kill/train8").iterdir())

@@ -13,6 +13,7 @@ from tests.score_tables import (
     WORDS,
     gain,
     last_updates,
+    learned,
     mean_score,
     of_first_seed,
     results_of,
@@ -59,13 +60,9 @@ def test_the_findings_say_what_segmented_agents_have_on_single_tasks():
     )
     assert f"`blue+shadows` has {shadows} instead of 14, `complete` {hard} instead of 18." in WORDS
     assert f"Frames of classes have {' and '.join(of_classes)}." in WORDS
-    learning = []
-    for file in (ROOT / "results" / "general_short" / "runs" / "rainbow_segmented" / "seek_and_kill").glob(
-        "**/episodes.jsonl.gz"
-    ):
-        rows = rows_of(file)
-        learning += [row["normalized_score"] for row in rows if 8_000 <= row["num_updates"] < 10_000]
-    assert f"training episodes had {np.mean(learning):.0f} points at 8,000 to 10,000 gradient steps" in WORDS
+    files = (ROOT / "results/general_short/runs/rainbow_segmented/seek_and_kill").glob("**/episodes.jsonl.gz")
+    learning = learned([row for file in files for row in rows_of(file)], 8_000, 10_000)
+    assert f"training episodes had {learning:.0f} points at 8,000 to 10,000 gradient steps" in WORDS
     level_4 = [score(f"{name}/complete") for name in scenarios()]
     assert f"{', '.join(level_4[:3])} and {level_4[3]} on the four tasks `complete`" in WORDS
 
@@ -296,8 +293,7 @@ def test_the_findings_say_how_segmented_agents_learned_in_six_times_the_time():
         rows = rows_of(file)
         last = rows[-1]["num_updates"]
         for low, high in ((30_000, 40_000), (60_000, 70_000), (last - 10_000, last + 1)):
-            scores = [row["normalized_score"] for row in rows if low <= row["num_updates"] < high]
-            learning.append(f"{np.mean(scores):.0f}")
+            learning.append(f"{learned(rows, low, high):.0f}")
     assert (
         "{} points at 30,000 to 40,000 gradient steps, {} at 60,000 to 70,000, and {} in the last 10,000. "
         "Seek and Kill had {}, {} and {}, Dodge Projectiles {}, {} and {}, and Health Gathering {}, {} and {}."

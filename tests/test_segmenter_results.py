@@ -3,12 +3,12 @@
 import json
 
 from gvz.tasks import named_tasks, scenarios
-from tests.score_tables import PAGE, ROOT, WORDS
+from tests.score_tables import PAGE, ROOT, WORDS, segmenter
 
 
 def test_the_findings_say_how_well_segmentation_networks_find_things():
     for name in scenarios():
-        record = json.loads((ROOT / "gvz" / "segmenters" / f"{name}.json").read_text())
+        record = segmenter(name)
         assert record["tasks"] == [task.id for task in named_tasks(name, split="train8")], "no gate or test task"
         assert list(record["average_precision"]) == [task.id for task in named_tasks(name, split="gate")]
         for task, found in record["average_precision"].items():
@@ -57,7 +57,7 @@ def test_the_findings_say_what_putting_frames_together_gave():
         assert f" s | {cells} |" in PAGE
     found = record["networks"]["three_frames_more"]["tasks"]
     for name in ("defend_the_center", "seek_and_kill"):  # which have networks of this form
-        used = json.loads((ROOT / "gvz" / "segmenters" / f"{name}.json").read_text())["average_precision"]
+        used = segmenter(name)["average_precision"]
         assert used == {task: found[task]["average_precision"] for task in used}
     count = record["put_together"]["enemies_per_frame"]
     assert f"too few enemies**: {count['one_frame']:.1f} a frame before red walls" in PAGE
@@ -74,7 +74,6 @@ def test_the_findings_say_what_putting_frames_together_gave():
 
 def test_the_findings_say_what_the_trials_of_health_gathering_found():
     trials = json.loads((ROOT / "results" / "gates" / "segmenters" / "health_gathering_trials.json").read_text())
-    used = json.loads((ROOT / "gvz" / "segmenters" / "health_gathering.json").read_text())
     forms = {
         "one_frame": "things of one frame in each",
         "base": "three frames: things of three in each",
@@ -89,7 +88,7 @@ def test_the_findings_say_what_the_trials_of_health_gathering_found():
     }
     assert list(trials["networks"]) == list(forms)
     rows = [(forms[form], one) for form, one in trials["networks"].items()]
-    rows.append(("used: three frames, surfaces with tints and patches", used))
+    rows.append(("used: three frames, surfaces with tints and patches", segmenter("health_gathering")))
     for title, network in rows:
         found = network["average_precision"]
         assert list(found) == [task.id for task in named_tasks("health_gathering", split="gate")]

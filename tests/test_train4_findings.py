@@ -1,6 +1,5 @@
 """What the findings say of four training tasks is what the records of these agents and their networks give."""
 
-import json
 from collections.abc import Callable
 
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 from gvz.reports.scores import Scores
 from gvz.tasks import scenario_named, scenarios
 from tests.score_tables import (
-    ROOT,
     WORDS,
     gain,
     in_words,
@@ -20,6 +18,8 @@ from tests.score_tables import (
     score_cells,
     score_row,
     scores_of,
+    segmenter,
+    task_mean,
     task_sets,
 )
 
@@ -68,10 +68,7 @@ def test_the_findings_say_what_agents_of_four_training_tasks_have(scores: dict[t
 
 def test_the_findings_say_what_networks_of_four_training_tasks_find():
     for name in scenarios():
-        four, eight = (
-            json.loads((ROOT / "gvz" / "segmenters" / folder / f"{name}.json").read_text())["average_precision"]
-            for folder in ("train4", "")
-        )
+        four, eight = (segmenter(network)["average_precision"] for network in (f"train4/{name}", name))
         assert list(four) == list(eight)
         if name == "seek_and_kill":
             pairs = [
@@ -121,12 +118,9 @@ def test_the_findings_say_what_six_times_the_time_gave_on_four_training_tasks(sc
     assert f"test tasks {differences(more_time, 2)}" in WORDS
     assert f"with the same time: {differences(fewer_tasks, 2)}" in WORDS
 
-    def mean(of_agent: Scores, task: str) -> float:
-        return float(np.mean([by_task[task].mean() for by_task in of_agent.runs.values()]))
-
     for name, task in SAID:
         four_short, four, eight = (
-            mean(of[name, called], f"{name}/{task}")
+            task_mean(of[name, called], f"{name}/{task}")
             for of, called in ((scores, "4 tasks"), (longer, "4 tasks"), (longer, "8 tasks"))
         )
         said = f"`{task}` has {four:.0f} (after 900 seconds {four_short:.0f}, with eight tasks {eight:.0f})"

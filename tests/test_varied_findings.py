@@ -5,21 +5,25 @@ import json
 import numpy as np
 import pytest
 
-from gvz.evaluation.statistics import bootstrap, difference
-from gvz.reports.scores import estimate, estimate_groups
+from gvz.evaluation.statistics import bootstrap
+from gvz.reports.scores import estimate
 from gvz.tasks import named_tasks, scenario_named, scenarios
 from tests.score_tables import (
     PAGE,
     ROOT,
     WORDS,
+    gain,
     in_words,
     last_updates,
+    learned,
     mean_score,
     results_of,
     rows_of,
     score_cells,
     score_row,
     scores_of,
+    segmenter,
+    task_mean,
     task_sets,
 )
 
@@ -38,16 +42,11 @@ def test_the_findings_say_what_agents_of_varied_maps_have():
 
     def lower(name: str, column: int) -> str:
         """By how much varied maps are below eight tasks, on a column of the table."""
-        tasks = task_sets(name)[column]
-        found = estimate_groups([(scores[name, called], tasks) for called in AGENTS], difference).estimate
-        assert found
-        return f"{-found.value:.1f}"
+        return gain(scores[name, "8 tasks"], scores[name, "varied maps"], task_sets(name)[column]).split()[0]
 
     def on(task: str) -> tuple[float, float]:
         """Scores of varied maps and of eight tasks."""
-        name = task.partition("/")[0]
-        found = [estimate(scores[name, called], [task]).estimate for called in AGENTS]
-        varied, eight = (one.value for one in found if one)
+        varied, eight = (task_mean(scores[task.partition("/")[0], called], task) for called in AGENTS)
         return varied, eight
 
     steps = []
@@ -85,8 +84,7 @@ def test_the_findings_say_what_six_times_the_time_on_varied_maps_gave():
             of_first, *_ = sorted((ROOT / "results" / run.format(name)).glob("seed_*"))
             episodes = rows_of(of_first / "episodes.jsonl.gz")
             for first in (10_000, 40_000, 80_000):
-                found = [row["normalized_score"] for row in episodes if first <= row["num_updates"] < first + 10_000]
-                means[name, called, first] = float(np.mean(found))
+                means[name, called, first] = learned(episodes, first, first + 10_000)
             cells = " | ".join(f"{means[name, called, first]:.1f}" for first in (10_000, 40_000, 80_000))
             assert f"| {title} | {called} | {cells} |" in WORDS
         run = ROOT / "results" / runs["varied maps"].format(name) / "seed_1111"
@@ -107,13 +105,11 @@ def test_the_findings_say_what_six_times_the_time_on_varied_maps_gave():
     def lower(name: str) -> float:
         return means[name, "8 tasks", 80_000] - means[name, "varied maps", 80_000]
 
-    learned, (center, seek) = ("dodge_projectiles", "health_gathering"), SCENARIOS
-    assert all(lower(name) <= 0 for name in learned)
-    gain = means[seek, "varied maps", 80_000] - means[seek, "varied maps", 40_000]
-    said = (
-        f"stand {lower(center):.0f} and {lower(seek):.0f} points lower, and Seek and Kill gains only {gain:.0f} points"
-    )
-    assert said in WORDS
+    center, seek = SCENARIOS
+    assert all(lower(name) <= 0 for name in ("dodge_projectiles", "health_gathering"))
+    gained = means[seek, "varied maps", 80_000] - means[seek, "varied maps", 40_000]
+    said = f"stand {lower(center):.0f} and {lower(seek):.0f} points lower, and Seek and Kill gains only {gained:.0f}"
+    assert f"{said} points" in WORDS
 
 
 def test_the_findings_say_what_networks_of_eight_tasks_find_on_varied_maps():
@@ -127,7 +123,7 @@ def test_the_findings_say_what_networks_of_eight_tasks_find_on_varied_maps():
 def test_the_findings_say_what_a_network_gave_that_has_seen_varied_maps():
     folder, name = ROOT / "results" / "gates" / "segmenters" / "seek_and_kill_varied", "seek_and_kill"
     network = json.loads((folder / "network.json").read_text())
-    of_eight = json.loads((ROOT / "gvz" / "segmenters" / f"{name}.json").read_text())["average_precision"]
+    of_eight = segmenter(name)["average_precision"]
     gate = [found[task]["enemy"] for found in (network["average_precision"], of_eight) for task in task_sets(name)[1]]
     of_unseen = network["average_precision_on_unseen_maps"]
     unseen, shadows = (of_unseen[f"{name}/{task}"]["enemy"] for task in ("varied", "varied+shadows"))
@@ -158,10 +154,7 @@ def test_the_findings_say_what_a_network_gave_that_has_seen_varied_maps():
     assert f"{said} {with_eight_tasks(sized)}, as agents of eight tasks have." in WORDS
     assert sorted(scores, key=lambda task: np.mean(scores[task]))[:2] == [sized, red]
     blind = ROOT / "results" / "general_varied" / "runs" / "rainbow_segmented" / name / "varied" / "seed_1111"
-    trained = [
-        np.mean([row["normalized_score"] for row in rows_of(run / "episodes.jsonl.gz") if row["num_updates"] >= 10_000])
-        for run in (folder, blind)
-    ]
+    trained = [learned(rows_of(run / "episodes.jsonl.gz"), 10_000, 10**9) for run in (folder, blind)]
     said = "have {:.0f} points from 10,000 gradient steps on, where the agent that hardly saw had {:.0f}, and".format(
         *trained
     )
@@ -177,7 +170,7 @@ def test_the_findings_say_what_the_networks_of_varied_maps_find():
         found = unseen["average_precision"][f"{name}/varied"]
         for thing in found["varied"]:
             for called, key, directory in (("eight tasks", "eight_tasks", "."), ("varied maps", "varied", "varied")):
-                network = json.loads((ROOT / "gvz" / "segmenters" / directory / f"{name}.json").read_text())
+                network = segmenter(f"{directory}/{name}")
                 of_gate = network["average_precision"].values()
                 gate = ", ".join(f"{of_task[thing]:.2f}" for of_task in of_gate if thing in of_task)
                 title = scenario_named(name).title
@@ -186,7 +179,7 @@ def test_the_findings_say_what_the_networks_of_varied_maps_find():
                 assert network["processor_s"] // 10 == seconds // 10
             assert network["tints_and_patches"] == (name == "health_gathering")
         steps.append(f"{network['gradient_steps']:,}")
-        of_eight.append(f"{json.loads((ROOT / 'gvz' / 'segmenters' / f'{name}.json').read_text())['gradient_steps']:,}")
+        of_eight.append(f"{segmenter(name)['gradient_steps']:,}")
     assert f"made {in_words(steps)} gradient steps in the 1,500 seconds" in WORDS
     assert f"and fewer gradient steps: {in_words(of_eight)}." in WORDS
 
@@ -199,11 +192,8 @@ def test_the_findings_say_what_90_minutes_on_varied_maps_gave_with_a_network_of_
         title = scenario_named(name).title
         for called, run in runs.items():
             episodes = rows_of(ROOT / f"results/{run}/{name}/varied/seed_1111/episodes.jsonl.gz")
-            means = [
-                np.mean([row["normalized_score"] for row in episodes if first <= row["num_updates"] < first + 10_000])
-                for first in (10_000, 40_000, 80_000)
-            ]
-            assert f"| {title} | {called} | {' | '.join(f'{mean:.1f}' for mean in means)} |" in PAGE
+            cells = (f"{learned(episodes, first, first + 10_000):.1f}" for first in (10_000, 40_000, 80_000))
+            assert f"| {title} | {called} | {' | '.join(cells)} |" in PAGE
             assert len({row["lane"] for row in episodes}) == {"varied maps": 8, "eight tasks": 16}[called]
         steps += last_updates(f"general_varied_network/runs/{network}/{name}/varied/*")
         of_eight += last_updates(f"general/runs/{plain}/{name}/train8/*")
@@ -220,15 +210,12 @@ def test_the_findings_say_what_90_minutes_on_varied_maps_gave_with_a_network_of_
         tests = [score_cells(scores, name).split(" | ")[2].split()[0] for scores in (compositions, varied)]
         said = "have {} on the test tasks of {} after 2,700 seconds, varied maps {} after"
         assert said.format(tests[0], title, tests[1]) in WORDS
-        found = [(varied, task_sets(name)[1]), (scores_of("general", plain, name), task_sets(name)[1])]
-        gap = estimate_groups(found, difference).estimate
-        assert gap
-        lower.append(f"{gap.value:.1f}")
+        lower.append(gain(varied, scores_of("general", plain, name), task_sets(name)[1]).split()[0])
     kits = scores_of("general_varied_network", network, "health_gathering")
     changes_rules = {"poison", "supreme", "short_agent"}
     tasks = [task for task in named_tasks("health_gathering") if not changes_rules & set(task.attributes)]
     assert len(tasks) > 10
-    assert {f"{one.value:.0f}" for task in tasks if (one := estimate(kits, [task.id]).estimate)} == {"100"}
+    assert {f"{task_mean(kits, task.id):.0f}" for task in tasks} == {"100"}
     short = scores_of("general_varied", plain, SCENARIOS[0])
     of_gate_and_test = [
         score_cells(scores, SCENARIOS[0]).split(" | ")[column].split()[0]
@@ -236,9 +223,8 @@ def test_the_findings_say_what_90_minutes_on_varied_maps_gave_with_a_network_of_
         for column in (1, 2)
     ]
     assert "have {} and {}, not {} and {} as after 900 seconds".format(*of_gate_and_test) in WORDS
-    wall = estimate(short, ["defend_the_center/fuzzy_enemies+gore+stone_wall"]).estimate
-    assert wall
-    assert f"on the network of eight tasks, the latter had {wall.value:.0f}." in WORDS
+    wall = task_mean(short, "defend_the_center/fuzzy_enemies+gore+stone_wall")
+    assert f"on the network of eight tasks, the latter had {wall:.0f}." in WORDS
     assert "not eight tasks and their networks | {} | | {} | {} | no |".format(*lower) in WORDS
     said = "{:,} gradient steps in Defend the Center, {:,} in Health Gathering and {:,} in Seek and Kill, 8 games"
     assert said.format(*steps) in WORDS
@@ -280,6 +266,5 @@ def test_the_findings_say_how_an_agent_of_varied_maps_plays_single_tasks(name: s
     means = []
     for folder, agent in both:
         scores = scores_of(folder, agent, name)
-        found = [estimate(scores, [f"{name}/{task}"]).estimate for task in tasks.split()]
-        means.append(in_words([f"{one.value:.0f}" for one in found if one]))
+        means.append(in_words([f"{task_mean(scores, f'{name}/{task}'):.0f}" for task in tasks.split()]))
     assert said.format(*means) in WORDS

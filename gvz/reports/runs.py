@@ -162,18 +162,15 @@ def _task_ids(scenario: str, split: TrainingSet) -> set[str]:
 
 _METRICS = {
     "num_updates": pl.Int64(),
-    "time_s": pl.Float64(),
     "learner/updates_per_s": pl.Float64(),
     "actors/decisions_per_s": pl.Float64(),
     "actors/frames_per_s": pl.Float64(),
     "actors/env_steps": pl.Int64(),
-    "actors/restarts": pl.Int64(),
     PROCESSOR_S: pl.Float64(),
 }
 _TRAINING_EPISODES = {
     "num_updates": pl.Int64(),
     "task": pl.String(),
-    "score": pl.Float64(),
     "normalized_score": pl.Float64(),
     "cut": pl.Boolean(),
 }

@@ -22,6 +22,7 @@ from watched_pool import Run
 from actors.config import ActorsConfig
 from actors.pool import PoolConfig
 from actors.preprocess import ObservationBatch
+from benchmarks.soak import processes
 from gvz.cluster import dispatcher, supervised
 from gvz.cluster.config import ClusterConfig
 from gvz.cluster.pool import ClusterPool, cluster_pool
@@ -29,7 +30,6 @@ from gvz.core import janitor
 from gvz.core.errors import ConfigError, ResumeError, WorkerError
 from gvz.transport.messages import EpisodeStats, Fault, ParamsHeader, Ready
 from tests.cluster.conftest import FAKE_GAMES, RayCluster
-from tests.cluster.host_processes import host_of, host_processes, processes
 from tests.processes import arguments
 from tests.waiting import wait_until
 
@@ -118,6 +118,16 @@ def play(backend_of, tmp_path: Path, nodes: RayCluster):
     wait_until(lambda: not processes() and not janitor.dead_instances(), "the end of hosts, actors and what they made")
 
 
+def host_of(process: psutil.Process) -> int:
+    """The host's index: its actors' logs are named by their numbers."""
+    for child in process.children(recursive=True):
+        if "actors.worker" in arguments(child):
+            with contextlib.suppress(psutil.Error, OSError):
+                log = Path(f"/proc/{child.pid}/fd/1").readlink().stem
+                return int(log.removeprefix("actor_")) // 2
+    return -1
+
+
 def params_decide(tmp_path: Path) -> dict[str, Any]:
     """Options of a pool whose actions are the first two of four parameters."""
     games = ObservationBatch.of(config(tmp_path, {}), 2)
@@ -194,7 +204,7 @@ def test_a_host_that_dies_or_is_silent_is_replaced(play, fault: str, monkeypatch
     played.until_all_ready()
     played.play(500)
     before = played.node_of(0)
-    victim = next(p for p in host_processes() if host_of(p) == 0)
+    victim = next(p for p in processes("host") if host_of(p) == 0)
     victim.send_signal(signal.SIGKILL if fault == "kill" else signal.SIGSTOP)
     told = played.until_fault("host_died" if fault == "kill" else "host_silent")
     assert told.actor == -1
@@ -234,8 +244,7 @@ def test_a_host_that_parameters_do_not_reach_is_replaced(play, tmp_path: Path, m
 def test_an_actor_that_dies_is_its_hosts_matter(play):
     played = play({"length": 20})
     played.until_all_ready()
-    victims = [p for p in processes() if "actors.worker" in arguments(p)]
-    victims[0].kill()
+    processes("actor")[0].kill()
     told = played.until_fault("died")
     assert "was ended by SIGKILL; restart 1 of 20" in told.message
     played.until(lambda: len([m for m in played.messages if isinstance(m, Ready)]) == NUM_ACTORS + 1)
@@ -249,7 +258,7 @@ def test_a_node_that_dies_is_replaced_by_another(play, nodes: RayCluster):
     played.until_all_ready()
     before = {played.node_of(0), played.node_of(1)}
     assert len(before) == 2, "hosts of two cores on three nodes of two"
-    nodes.kill_node_of(host_processes()[0])
+    nodes.kill_node_of(processes("host")[0])
     told = played.until_fault("host_died")
     played.until_replaced()
     after = {played.node_of(0), played.node_of(1)}
@@ -299,7 +308,7 @@ def test_what_comes_too_late_is_dropped_and_counted(play, monkeypatch: pytest.Mo
 
     played = play({"length": 50, "step_s": 0.001}, silence_timeout_s=3.0)
     played.until_all_ready()
-    victim = next(p for p in host_processes() if host_of(p) == 0)
+    victim = next(p for p in processes("host") if host_of(p) == 0)
     with monkeypatch.context() as patch:
         patch.setattr(RayRemote, "kill", lambda _: None)  # the network is cut: the host does not hear of its end
         lost = played.pool._hosts[0].incarnation

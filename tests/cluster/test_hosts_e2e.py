@@ -10,11 +10,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 from rich.console import Console
 
 from benchmarks import hosts_soak
+from benchmarks.soak import processes
 from gvz.core import janitor, records
 from gvz.core.durable import saved_steps
 from tests.cluster.conftest import RayCluster
@@ -70,24 +70,8 @@ class Command:
 @pytest.fixture
 def command(cluster: RayCluster, tmp_path: Path) -> Iterator[Command]:
     yield Command(cluster, tmp_path / "run")
-    wait_until(lambda: not played_by_hosts(), "hosts, actors and engines to end", 60)
+    wait_until(lambda: not processes(), "hosts, actors and engines to end", 60)
     wait_until(lambda: not janitor.dead_instances(), f"{janitor.dead_instances()} to be removed", 10)
-
-
-def played_by_hosts() -> list[psutil.Process]:
-    """Processes of hosts, actors and engines below the nodes of this process's clusters; hosts come first."""
-    found: list[tuple[int, psutil.Process]] = []
-    for process in psutil.Process().children(recursive=True):
-        try:
-            words = " ".join(process.cmdline())
-            kinds = [
-                kind for kind, mark in enumerate(("RemoteHost", "actors.worker", "viz_instance_id")) if mark in words
-            ]
-            if kinds and process.status() != psutil.STATUS_ZOMBIE:
-                found.append((kinds[0], process))
-        except psutil.Error:  # it has just ended
-            continue
-    return [process for _, process in sorted(found, key=lambda pair: pair[0])]
 
 
 @pytest.mark.slow
@@ -95,8 +79,7 @@ def test_a_run_survives_a_killed_host_a_stop_and_a_killed_learner(command: Comma
     learner = command.start("--learner.total-updates", "10000")
     try:
         wait_until(lambda: command.num_updates() >= 40, "the first updates", TIMEOUT_S)
-        victim = played_by_hosts()[0]
-        victim.kill()
+        processes("host")[0].kill()
         wait_until(lambda: any(f["kind"] == "host_died" for f in command.rows("faults.jsonl")), "the fault", TIMEOUT_S)
         wait_until(lambda: command.rows("metrics.jsonl")[-1]["cluster/hosts"] == 2, "a host in its place", TIMEOUT_S)
         replaced_at = command.num_updates()
@@ -117,7 +100,7 @@ def test_a_run_survives_a_killed_host_a_stop_and_a_killed_learner(command: Comma
         wait_until(lambda: command.num_updates() >= stopped_at + 40, "the resumed run", TIMEOUT_S)
         learner.kill()
         learner.communicate(timeout=60)
-        wait_until(lambda: not played_by_hosts(), "the hosts to end by themselves", TIMEOUT_S)
+        wait_until(lambda: not processes(), "the hosts to end by themselves", TIMEOUT_S)
 
         learner = command.start("--learner.total-updates", "10000")
         wait_until(lambda: len(command.rows("starts.jsonl")) == 3, "the second resume", TIMEOUT_S)

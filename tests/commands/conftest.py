@@ -1,6 +1,5 @@
 """A run directory that was never trained, for commands that read one, and a place without a display."""
 
-import json
 import os
 import subprocess
 import sys
@@ -9,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from gvz.run.config_files import config_to_dict
 from tests.evaluation.policies import CONFIG, write_policy
 
 
@@ -19,7 +17,6 @@ def small_run(tmp_path: Path) -> Path:
     path = tmp_path / "run"
     for step in (10, 20):
         write_policy(path, CONFIG, step)
-    (path / "config.json").write_text(json.dumps(config_to_dict(CONFIG)))
     return path
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 import psutil
 
-from gvz.core import janitor, records
+from gvz.core import records
 from tests.processes import arguments
 
 ENV_STEPS_PER_UPDATE = 4
@@ -102,11 +102,6 @@ def _lives(stat: Path) -> bool:
     except (FileNotFoundError, ProcessLookupError):
         return False
     return state not in "ZX"
-
-
-def left_behind() -> list[str]:
-    """What there still is of runs that have ended, as far as their janitor knows of it."""
-    return janitor.dead_instances()
 
 
 def arrays_of(checkpoint: Path) -> dict[str, np.ndarray]:

@@ -10,7 +10,7 @@ from tests.waiting import wait_until
 
 sys.path.append(str(Path(__file__).parent))
 
-from command import STARTED, left_behind
+from command import STARTED
 
 
 @pytest.fixture
@@ -23,6 +23,6 @@ def nothing_left():
             process.kill()
             process.communicate()
             janitor.clean_dead_instances()
-    wait_until(lambda: not left_behind(), "engines and shared memory to be removed")
+    wait_until(lambda: not janitor.dead_instances(), "engines and shared memory to be removed")
     STARTED.clear()
     assert set(Path.cwd().glob("_vizdoom*")) <= files

@@ -2,15 +2,12 @@
 
 import pytest
 
-from gvz.run.rundir import RunDir
 from tests.evaluation.policies import CONFIG, write_policy
 
 
 @pytest.fixture
 def run(tmp_path):
     """A run directory with the policies of updates 10, 20 and 100."""
-    with RunDir(tmp_path / "run") as directory:
-        directory.write_config(CONFIG)
     for step in (10, 20, 100):
         write_policy(tmp_path / "run", CONFIG, step)
     return tmp_path / "run"

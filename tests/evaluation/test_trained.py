@@ -74,7 +74,6 @@ def test_a_policy_acts_greedily_on_what_it_was_trained_on(run, conditioned):
     """Frames, game variables and past actions, and the task if it is told."""
     agent_config = dataclasses.replace(CONFIG.agent, task_conditioned=conditioned, past_actions=2, game_variables=True)
     config = dataclasses.replace(CONFIG, agent=agent_config)
-    (run / "config.json").write_text(json.dumps(config_to_dict(config)))
     params, agent = write_policy(run, config, 30), run_agent(config)
     player = pickle.loads(pickle.dumps(trained_player(run, config, 30))).make_player()
     task = config.table.tasks[1]
@@ -129,7 +128,6 @@ def test_the_support_of_a_run_follows_from_how_its_games_are_played():
 def test_the_reward_weights_of_a_run_are_shown_in_its_own_scenario_alone(run):
     env = EnvConfig(action_set="unified_v1", reward_weights=(("kill", 2.0),))
     config = dataclasses.replace(CONFIG, env=env)
-    (run / "config.json").write_text(json.dumps(config_to_dict(config)))
     write_policy(run, config, 5)
     its_own, _ = EpisodeChoice(run_dir=run, checkpoint="5").resolve()
     other, _ = EpisodeChoice(run_dir=run, checkpoint="5", task="health_gathering/default").resolve()
@@ -173,7 +171,6 @@ def test_a_policy_refuses_a_game_that_it_cannot_play(run, task, changes, message
 
 def test_a_conditioned_policy_refuses_a_task_that_has_no_index(run):
     config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, task_conditioned=True))
-    (run / "config.json").write_text(json.dumps(config_to_dict(config)))
     write_policy(run, config, 20)
     player, frame = TrainedPlayer(run, 20), np.zeros(config.env.frame_shape, np.uint8)
     player.begin(SimpleNamespace(task=config.table.tasks[3], config=config.env), frame, {"variables": {}}, 1)
@@ -235,7 +232,6 @@ def test_a_policy_of_another_configuration_is_an_error(run):
 def test_an_agent_with_a_policy_has_probabilities_and_a_value_and_no_action_values(run):
     agent = PPOConfig(conv_channels=(4,), conv_kernels=(8,), conv_strides=(8,), hidden_units=8)
     config = dataclasses.replace(CONFIG, agent=agent, replay=None, learner=OnPolicyConfig())
-    (run / "config.json").write_text(json.dumps(config_to_dict(config)))
     params, made = write_policy(run, config, 20), run_agent(config)
     player = TrainedPlayer(run, 20)
     action = player.act()
@@ -248,7 +244,6 @@ def test_an_agent_with_a_policy_has_probabilities_and_a_value_and_no_action_valu
 
 def test_an_agent_without_distributions_has_values_alone(run):
     plain = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, distributional=False))
-    (run / "config.json").write_text(json.dumps(config_to_dict(plain)))
     write_policy(run, plain, 20)
     player = TrainedPlayer(run, 20)
     action = player.act()
@@ -260,7 +255,6 @@ def test_an_agent_without_distributions_has_values_alone(run):
 def test_the_value_is_that_of_an_action_which_the_task_allows(run):
     """`unified_v1` has 21 actions, of which Defend the Center allows 6. The others were never learned."""
     config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, action_set="unified_v1"))
-    (run / "config.json").write_text(json.dumps(config_to_dict(config)))
     write_policy(run, config, 20)
     player, mask = TrainedPlayer(run, 20), np.array(config.table.action_masks[0])
     frame = np.random.default_rng(0).integers(0, 256, config.env.frame_shape, dtype=np.uint8)

@@ -22,7 +22,6 @@ from gvz.evaluation.episode_log import RecordFile, read_rows
 from gvz.evaluation.trained import find_checkpoints, read_params, read_run_config, trained_player
 from gvz.evaluation.zoo import pack, run_directory, zoo_names
 from gvz.run.config_files import config_to_dict
-from gvz.run.rundir import RunDir
 from gvz.segmentation import segmenter_file
 from tests.evaluation.policies import CONFIG, write_policy
 from tests.processes import run_until_killed
@@ -59,8 +58,6 @@ def test_a_packed_policy_has_the_network_of_its_segmented_frames(tmp_path):
     network = write_network(tmp_path / "fresh.onnx")
     env = EnvConfig(frames="segmented", segmenter=str(network), frame_height=24, frame_width=42)
     config, run = dataclasses.replace(CONFIG, env=env), tmp_path / "run"
-    with RunDir(run) as directory:
-        directory.write_config(config)
     write_policy(run, config, 20)
     pack(run, "one")
     network.unlink()

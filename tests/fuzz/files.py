@@ -30,20 +30,8 @@ from tests.fuzz.target import Target
 
 RESULTS = Path(__file__).parents[2] / "results"
 QUICK = RESULTS / "rainbow_quick" / "seed_1111"
-JSON_WORDS = [
-    b"NaN",
-    b"Infinity",
-    b"-1e999",
-    b"1e300",
-    b"9" * 30,
-    b"null",
-    b"true",
-    b'"\\ud800"',
-    b'"\\u0000"',
-    b"{}",
-    b"[]",
-]
-JSON_WORDS += [b"[" * 2000, b'{"a":' * 2000, b'"schema": 2', b", ", b": ", b"\n", b"\xff"]
+JSON_WORDS = rb'NaN Infinity -1e999 1e300 null true "\ud800" "\u0000" {} []'.split()
+JSON_WORDS += [b"9" * 30, b"[" * 2000, b'{"a":' * 2000, b'"schema": 2', b", ", b": ", b"\n", b"\xff"]
 
 
 def _examples(name: str, num_lines: int = 3) -> bytes:

@@ -49,18 +49,7 @@ def wad(_directory: Path) -> Target:
                 assert "ENDMAP" not in level, name
         return True
 
-    names = (
-        b"PWAD",
-        b"IWAD",
-        b"MAP01",
-        b"TEXTMAP",
-        b"ENDMAP",
-        b"BEHAVIOR",
-        b"SCRIPTS",
-        b"F_START",
-        b"F_END",
-        b"TEXTURE1",
-    )
+    names = b"PWAD IWAD MAP01 TEXTMAP ENDMAP BEHAVIOR SCRIPTS F_START F_END TEXTURE1".split()
     level = [
         Lump(name, data) for name, data in (("MAP01", b""), ("TEXTMAP", b"t"), ("BEHAVIOR", b"b"), ("ENDMAP", b""))
     ]
@@ -149,21 +138,7 @@ def acs(_directory: Path) -> Target:
     sources = _lumps("SCRIPTS")
     words = {token.text.encode("latin-1") for s in sources for token in tokenize(s.decode("latin-1")) if token.text}
     words |= set(b"switch case default do until continue break return terminate #define static function".split())
-    words |= {
-        b"0x7fffffff",
-        b"2147483647",
-        b"0.5",
-        b'"',
-        b"/*",
-        b"*/",
-        b"//",
-        b"<<",
-        b"{ {",
-        b"((",
-        b"- -",
-        b"a[",
-        b"]",
-    }
+    words |= {*b'0x7fffffff 2147483647 0.5 " /* */ // << (( a[ ]'.split(), b"{ {", b"- -"}
     return Target(run=lambda data: compiles(data.decode("latin-1")), seeds=sources, words=sorted(words))
 
 

@@ -122,16 +122,9 @@ def message(_directory: Path) -> Target:
 
     names = sorted({name for one in MESSAGES for name in (one.__struct_config__.tag, *one.__struct_fields__)})
     words = [bytes([0xA0 + len(name)]) + name.encode() for name in names if len(name) < 32]
-    odd = [
-        b"\xc0",
-        b"\xc2",
-        b"\xc3",
-        b"\xcb\x7f\xf8" + bytes(6),
-        b"\xd3" + b"\xff" * 8,
-        b"\xdd\xff\xff\xff\xff",
-        b"\x91" * 600,
-    ]
-    return Target(run=run, seeds=[encode(one) for one in MESSAGES], words=words + odd)
+    words += [b"\xc0", b"\xc2", b"\xc3", b"\xcb\x7f\xf8" + bytes(6), b"\xd3" + b"\xff" * 8]
+    words += [b"\xdd\xff\xff\xff\xff", b"\x91" * 600]
+    return Target(run=run, seeds=[encode(one) for one in MESSAGES], words=words)
 
 
 def batch(_directory: Path) -> Target:

@@ -29,6 +29,7 @@ in the minibatch (ddof 0) plus 1e-8, means over the minibatch, a target of a ter
 """
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,7 @@ pytestmark = pytest.mark.isa
 THEIRS = json.loads(Path(__file__).with_name("on_policy_references.json").read_text())
 B, W, A, UPDATES = 2, 9, 3, 8
 SPEC = AgentSpec(obs_shape=(1, 4, 1), num_actions=A, num_tasks=1, v_min=-1.0, v_max=1.0)
+LEARNER = OnPolicyConfig(total_updates=UPDATES, rollout_steps=W - 1, num_epochs=UPDATES, num_minibatches=1)
 
 
 def arrays(numbers: Any) -> dict[str, jax.Array]:
@@ -98,11 +100,8 @@ def ppo() -> tuple[PPO, OnPolicyConfig]:
         entropy_weight=theirs["ent_coef"],
         normalize_advantages=theirs["norm_adv"],
     )
-    learner = OnPolicyConfig(
-        total_updates=UPDATES,
-        rollout_steps=W - 1,
-        num_epochs=UPDATES,
-        num_minibatches=1,
+    learner = replace(
+        LEARNER,
         learning_rate=theirs["learning_rate"],
         learning_rate_decay=theirs["anneal_lr"],
         optimizer="adam",
@@ -114,11 +113,8 @@ def ppo() -> tuple[PPO, OnPolicyConfig]:
 
 def pqn() -> tuple[PQN, OnPolicyConfig]:
     theirs = THEIRS["pqn"]["settings"]
-    learner = OnPolicyConfig(
-        total_updates=UPDATES,
-        rollout_steps=W - 1,
-        num_epochs=UPDATES,
-        num_minibatches=1,
+    learner = replace(
+        LEARNER,
         learning_rate=theirs["LR"],
         learning_rate_decay=theirs["LR_LINEAR_DECAY"],
         optimizer="radam",

@@ -19,6 +19,9 @@ from gvz.reports.run_section import run_sections
 from gvz.reports.runs import training_time_s
 from tests.reports.conftest import evaluation_row, write_rows
 
+TRAIN4 = "runs/rainbow_4task/defend_the_center/train4"
+"""where `small` has its only run on four tasks, seed_1111"""
+
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory, experiments_writer):
@@ -41,7 +44,7 @@ def test_agents_are_told_apart_by_what_they_were_trained_on(small):
 
 
 def test_an_agent_trained_in_one_way_needs_no_more_than_its_name(small, tmp_path):
-    one = small / "runs" / "rainbow_4task" / "defend_the_center" / "train4"
+    one = small / TRAIN4
     shutil.copytree(one, tmp_path / "elsewhere")
     results = read_results([tmp_path / "elsewhere" / "seed_1111"])
     assert list(results.agents.values()) == ["rainbow_4task"]
@@ -50,7 +53,7 @@ def test_an_agent_trained_in_one_way_needs_no_more_than_its_name(small, tmp_path
 
 
 def test_a_run_in_a_folder_called_discarded_is_read_and_what_a_run_discarded_is_not(small, tmp_path):
-    one = small / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111"
+    one = small / TRAIN4 / "seed_1111"
     run = tmp_path / "discarded" / "seed_1111"
     shutil.copytree(one, run)
     shutil.copytree(one, run / "discarded" / "further" / "seed_1111")
@@ -141,7 +144,7 @@ def copied(small, tmp_path):
     """Copies a run to `tmp_path / name`, with other settings."""
 
     def copy(name: str, **settings: Any) -> None:
-        source = small / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111"
+        source = small / TRAIN4 / "seed_1111"
         shutil.copytree(source, tmp_path / name)
         saved = json.loads((tmp_path / name / "config.json").read_text())
         for field, values in settings.items():
@@ -210,20 +213,17 @@ def test_runs_of_an_experiment_with_other_settings_are_put_together_and_named(tm
     assert " which have another agent.discount 0." in problem
 
 
-def test_seeds_that_learned_with_other_networks_are_named(small, tmp_path):
+def test_seeds_that_learned_with_other_networks_are_named(small, copied, tmp_path):
     shutil.copytree(small, tmp_path / "r")
-    one = sorted((tmp_path / "r" / "runs" / "rainbow_4task" / "defend_the_center" / "train4").iterdir())[0]
+    runs = tmp_path / "r" / TRAIN4
     for seed, digest in ((2222, "a"), (3333, "b")):
-        other = one.with_name(f"seed_{seed}")
-        shutil.copytree(one, other, dirs_exist_ok=True)
-        saved = json.loads((other / "config.json").read_text())
-        saved["config"]["seed"] = seed
-        (other / "config.json").write_text(json.dumps(saved))
-        write_rows(other / "starts.jsonl", [{"num_updates": 0, "segmenters": {"defend_the_center": digest}}])
+        copied(f"r/{TRAIN4}/seed_{seed}", seed=seed)
+        starts = [{"num_updates": 0, "segmenters": {"defend_the_center": digest}}]
+        write_rows(runs / f"seed_{seed}" / "starts.jsonl", starts)
     (problem,) = read_results([tmp_path / "r"]).problems
     assert problem == (
-        f"{one.with_name('seed_3333')}: put together with {one.with_name('seed_2222')}, which learned with another "
-        "segmentation network of defend_the_center"
+        f"{runs / 'seed_3333'}: put together with {runs / 'seed_2222'}, which learned with another segmentation "
+        "network of defend_the_center"
     )
 
 
@@ -257,7 +257,7 @@ def test_a_report_can_be_made_inside_a_run_directory(copied, tmp_path, monkeypat
 
 def test_runs_on_another_disk_are_read_through_links(small, tmp_path):
     results = shutil.copytree(small, tmp_path / "results")
-    seed = results / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111"
+    seed = results / TRAIN4 / "seed_1111"
     (seed / "episode.mp4").touch()
     before, plain = read_results([results]), run_sections(read_results([results]), tmp_path)[-1]
     seed.rename(tmp_path / "elsewhere")
@@ -278,7 +278,7 @@ def test_runs_on_another_disk_are_read_through_links(small, tmp_path):
 
 @pytest.mark.parametrize("name", ["", "evaluation.jsonl"])
 def test_a_run_that_is_given_beside_its_results_by_another_name_stays_in_its_experiment(small, tmp_path, name):
-    run = small / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111"
+    run = small / TRAIN4 / "seed_1111"
     (tmp_path / "latest").symlink_to(run)
     alone, both = read_results([small]), read_results([tmp_path / "latest" / name, small])
     assert not both.problems
@@ -341,7 +341,7 @@ def test_pauses_between_processes_are_no_training_time():
 
 
 def test_records_may_be_compressed(small, tmp_path):
-    source = small / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111"
+    source = small / TRAIN4 / "seed_1111"
     shutil.copy(source / "config.json", tmp_path)
     for name in ("metrics", "episodes", "evaluation"):
         (tmp_path / f"{name}.jsonl.gz").write_bytes(gzip.compress((source / f"{name}.jsonl").read_bytes()))
@@ -356,7 +356,7 @@ def test_records_may_be_compressed(small, tmp_path):
 @pytest.fixture
 def a_run(small, tmp_path):
     """A run directory of its own."""
-    source = small / "runs" / "rainbow_4task" / "defend_the_center" / "train4" / "seed_1111"
+    source = small / TRAIN4 / "seed_1111"
     return shutil.copytree(source, tmp_path / "run")
 
 

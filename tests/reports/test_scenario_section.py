@@ -1,7 +1,5 @@
 """The section of a scenario: own kills beside a score that is kills, levels, who solved a task, gaps, curves."""
 
-import json
-
 import pytest
 
 from gvz.evaluation.statistics import SOLVED_EPISODES
@@ -32,7 +30,7 @@ def test_own_kills_stand_below_the_scores_by_task_and_by_level(tmp_path):
         for task, kills in by_task.items()
         for n in range(2)
     ]
-    (tmp_path / "rows.jsonl").write_text("".join(json.dumps({"schema": 1, **row}) + "\n" for row in rows))
+    write_rows(tmp_path / "rows.jsonl", rows)
     (section,) = scenario_sections(read_results([tmp_path]), tmp_path)
     levels, tasks, own_kills, _ = section.blocks[0].tables
     assert (levels.id, tasks.id) == ("seek_and_kill_levels", "seek_and_kill_tasks")
