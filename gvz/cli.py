@@ -12,13 +12,14 @@ import tyro
 
 import gvz
 from gvz.core.errors import EXIT_INTERRUPTED, GvzError
+from gvz.core.files import NO_ROOM
 from gvz.core.registry import discover
 from gvz.core.stop import StopRequest, say
 
 EXIT_BROKEN_PIPE = 141
 """exit code that a shell shows for a program that SIGPIPE ended"""
-_OF_THE_DISK = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EISDIR}
-"""what a user can do something about: no permission, no room, a directory in a file's place"""
+_OF_THE_DISK = {*NO_ROOM, errno.EACCES, errno.EPERM, errno.EROFS, errno.EISDIR, errno.ENAMETOOLONG}
+"""what a user can do something about: no permission, no room, a directory in a file's place, too long a name"""
 DESCRIPTION = (
     "GViZDoom: a benchmark of visual generalization in Doom. Help: `gvz COMMAND --help`. Version: `gvz --version`."
 )

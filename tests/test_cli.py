@@ -164,6 +164,7 @@ def test_an_interrupted_import_is_an_interruption(capsys, monkeypatch):
     ("error", "said"),
     [
         (PermissionError(errno.EACCES, "Permission denied", "out/a.svg"), "error: out/a.svg: Permission denied; make "),
+        (OSError(errno.ENAMETOOLONG, "File name too long", "a.gif"), "error: a.gif: File name too long; make room or "),
         (OSError(errno.ENOSPC, "No space left on device"), "error: No space left on device; make room or give "),
     ],
 )

@@ -1,14 +1,24 @@
 """`gvz completion`: completion of commands and flags in a shell."""
 
+import contextlib
+import io
+import re
 from dataclasses import dataclass
 from typing import Literal
 
 import tyro
 
+_CHANGES = {
+    "for completion in completions:": "for completion in completions or ['__TYRO_COMPLETE_FILES__']:",
+    'COMPREPLY=($(compgen -f -- "$cur"))': "COMPREPLY=()",  # bash itself does more: / behind a directory, quotes
+    "complete -F": "complete -o default -F",
+}
+"""of tyro's scripts, which complete paths as the values of flags alone; with these, where nothing else fits"""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Completion:
-    """Print a script that completes commands and flags in your shell.
+    """Print a script that completes commands, flags and paths in your shell.
 
     bash: gvz completion bash > ~/.local/share/bash-completion/completions/gvz
 
@@ -25,7 +35,13 @@ class Completion:
         from gvz.cli import parse
         from gvz.launch import Launch
 
-        parse(["--tyro-write-completion", self.shell, "-"], train=Launch)
+        with contextlib.redirect_stdout(io.StringIO()) as printed, contextlib.suppress(SystemExit):
+            parse(["--tyro-write-completion", self.shell, "-"], train=Launch)
+        script = printed.getvalue()
+        for old, new in _CHANGES.items():
+            script = script.replace(old, new)
+        # a line break in the help of a flag would begin another completion
+        print(re.sub(r"(?m)^COMPLETION_SPEC = .*$", lambda line: re.sub(r"\\+n", " ", line[0]), script), end="")
         return 0
 
 

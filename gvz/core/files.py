@@ -3,6 +3,7 @@ written whole.
 """
 
 import contextlib
+import errno
 import fnmatch
 import heapq
 import os
@@ -13,12 +14,15 @@ from typing import IO
 from gvz.core import records
 from gvz.core.errors import ConfigError
 
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""errors of a full disk; those of a write do not name the file"""
+
 
 @contextlib.contextmanager
 def written_whole(path: Path) -> Generator[Path]:
     """A file to write to, which takes the place of `path` at the end of the block: nobody sees half of it, and one
-    process at a time writes it. An error leaves what was there before. What a killed process has left goes with
-    the next one. Directories are made.
+    process at a time writes it. An error leaves what was there before, and that of a full disk names a file. What a
+    killed process has left goes with the next one. Directories are made.
 
     Raises:
         ConfigError: it cannot be made, or another process writes it.
@@ -33,7 +37,10 @@ def written_whole(path: Path) -> Generator[Path]:
             file.truncate(0)  # of what a killed process left
             yield writing
             writing.replace(path)
-    except BaseException:  # perhaps a Ctrl-C that came while the file was made
+    except BaseException as error:  # perhaps a Ctrl-C that came while the file was made
+        if isinstance(error, OSError) and error.errno in NO_ROOM and error.filename is None:
+            with contextlib.suppress(AttributeError):  # PyAV's cannot be set
+                error.filename = str(path)
         with contextlib.suppress(OSError), writing.open("rb+") as file:
             if _is_ours(file, writing):
                 writing.unlink()

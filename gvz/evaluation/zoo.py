@@ -12,6 +12,7 @@ import json
 import math
 import shutil
 import zipfile
+import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,9 +46,11 @@ def run_directory(path: Path) -> Path:
     Raises:
         ConfigError: there is no such policy. ResourceError: its file is damaged, or the cache cannot be written.
     """
-    if not str(path).startswith(PREFIX):
-        return path
     name, known = str(path).removeprefix(PREFIX), zoo_names()
+    if not str(path).startswith(PREFIX):
+        if name in known and not path.exists():
+            raise ConfigError(f"{path}: no such file or directory; did you mean {PREFIX}{name}?")
+        return path
     if name not in known:
         raise ConfigError(f"{path}: no such policy{nearest(name, known)}; want one of {', '.join(known) or 'none'}")
     file = ZOO_DIRECTORY / f"{name}.zip"
@@ -67,7 +70,9 @@ def run_directory(path: Path) -> Path:
 
 
 def _unpack(file: Path, directory: Path) -> None:
-    """Unpacks what is not there: all of it, or files that were deleted since, as old ones in a cache are."""
+    """Unpacks what is not there: all of it, or files that were deleted since, as old ones in a cache are, or that a
+    power cut has damaged.
+    """
     with zipfile.ZipFile(file) as archive:
         lost = [entry for entry in archive.infolist() if not _is_whole(directory / entry.filename, entry)]
         if not lost:
@@ -93,7 +98,7 @@ def _is_whole(path: Path, entry: zipfile.ZipInfo) -> bool:
     if entry.is_dir():
         return path.is_dir()
     own = path.name == EVALUATION_RECORDS  # episodes that the user played since are there, too
-    return path.is_file() and (own or path.stat().st_size == entry.file_size)
+    return path.is_file() and (own or zlib.crc32(path.read_bytes()) == entry.CRC)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -1,5 +1,6 @@
 """gvz completion: the shells themselves complete by what it prints."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -42,6 +43,7 @@ def bash(tmp_path_factory) -> Path:
         ("gvz evaluate --epi", {"--episodes"}),
         ("gvz train --learner.total", {"--learner.total-updates"}),
         ("gvz evaluate --player scr", {"scripted"}),
+        ("gvz evaluate --pl", {"--player"}),  # whose help has two lines
     ],
 )
 def test_bash_completes(bash, words, wanted):
@@ -49,6 +51,28 @@ def test_bash_completes(bash, words, wanted):
     done = subprocess.run(["bash", "-c", ask], capture_output=True, text=True, timeout=60, check=False)
     assert done.stderr == ""
     assert set(done.stdout.split()) == wanted
+
+
+@pytest.mark.parametrize("words", ["evaluate run", "evaluate --player idle --out run", "report r zoo:p run"])
+def test_bash_itself_completes_paths(bash, words):
+    """It does with `-o default`, and only if the function has found nothing: not even an empty completion."""
+    asked = ASK.format(script=bash, words=f"gvz {words}")
+    ask = f'{asked}\ncomplete -p gvz\necho "${{#COMPREPLY[@]}} found"'
+    done = subprocess.run(["bash", "-c", ask], capture_output=True, text=True, timeout=60, check=False)
+    assert done.stdout.split("\n")[-3:] == ["complete -o default -F _tyro_gvz gvz", "0 found", ""]
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_other_shells_complete_paths_where_nothing_else_fits(shell):
+    """Their scripts ask Python for the completions, and complete paths if it says so."""
+    begin, end = {"zsh": ("<< 'PYTHON_EOF'\n", "\nPYTHON_EOF"), "fish": ('set -l pycode "', '"\n    set')}[shell]
+    program = script(shell).partition(begin)[2].partition(end)[0]
+    if shell == "fish":
+        program = re.sub(r'\\([\\"$])', r"\1", program)
+    ask = [sys.executable, "-", "gvz", "evaluate"]
+    for word, wanted in (("run", ["__TYRO_COMPLETE_FILES__"]), ("--pl", ["--player"])):
+        done = subprocess.run([*ask, word, "2"], input=program, capture_output=True, text=True, timeout=60, check=True)
+        assert [line.partition("\t")[0] for line in done.stdout.splitlines()] == wanted
 
 
 @pytest.mark.parametrize("shell", ["zsh", "fish"])

@@ -75,7 +75,7 @@ def test_a_full_disk_is_one_line_and_leaves_the_table_of_before(kind, run_dirs, 
     with full_disk(50):
         assert cli.main(["export", str(run_dirs[0]), "--format", kind, "--out", str(table.parent)]) == 1
     printed = capsys.readouterr()
-    assert printed.err == "error: File too large; make room or give a place that you can write to\n"
+    assert printed.err == f"error: {table}: File too large; make room or give a place that you can write to\n"
     assert [(file, file.read_text()) for file in table.parent.iterdir()] == [(table, "of before")]
 
 

@@ -1,7 +1,9 @@
 """Files below a directory, by links, too; and files that are written whole."""
 
+import errno
 from pathlib import Path
 
+import av.error
 import pytest
 
 from gvz.core import records
@@ -85,8 +87,11 @@ def test_a_file_appears_when_it_is_whole(tmp_path):
 def test_a_full_disk_leaves_what_was_there_before(tmp_path):
     file = tmp_path / "report.md"
     file.write_text("before")
-    with pytest.raises(OSError, match="File too large"), full_disk(3), written_whole(file) as writing:
+    with pytest.raises(OSError, match="File too large") as caught, full_disk(3), written_whole(file) as writing:
         writing.write_text("after")
+    assert caught.value.filename == str(file)
+    with pytest.raises(OSError, match="no room"), written_whole(file):
+        raise av.error.OSError(errno.ENOSPC, "no room")  # whose file name cannot be set
     assert [(path, path.read_text()) for path in tmp_path.iterdir()] == [(file, "before")]
 
 

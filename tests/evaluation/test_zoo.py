@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -95,7 +96,7 @@ def test_files_that_the_cache_lost_are_unpacked_again(run):
     assert all(path.read_bytes() == content for path, content in before.items() if path != played)
     shutil.rmtree(directory / "policies")
     played.unlink()
-    (directory / "config.json").write_text("")
+    (directory / "config.json").write_bytes(bytes(len(before[directory / "config.json"])))  # after a power cut
     run_directory("zoo:one")
     assert {path: path.read_bytes() for path in before} == before
     assert (directory / "episode.gif").exists()
@@ -182,6 +183,8 @@ def test_an_unknown_policy_is_named(run):
         ConfigError, match=r"zoo:dodge_projectile: no such policy \(did you mean 'dodge_projectiles'\?\); want one of"
     ):
         run_directory("zoo:dodge_projectile")
+    with pytest.raises(ConfigError, match=r"no such file or directory; did you mean zoo:dodge_projectiles\?"):
+        run_directory(Path("dodge_projectiles"))
     with pytest.raises(ConfigError, match="zoo: got name 'a/b', want letters, digits, _ and -"):
         pack(run, "a/b")
 
