@@ -13,6 +13,7 @@ import tyro
 import gvz
 from gvz.core.errors import EXIT_INTERRUPTED, GvzError
 from gvz.core.files import NO_ROOM
+from gvz.core.helptext import paragraphs
 from gvz.core.registry import discover
 from gvz.core.stop import StopRequest, say
 
@@ -109,13 +110,14 @@ def parse(arguments: Sequence[str], **other_commands: type) -> Any:
     for name, command in found.items():
         sentence = (command.__doc__ or "").partition("\n")[0] if overview else None
         choices.append(Annotated[command, tyro.conf.subcommand(name, description=sentence)])
-    return tyro.cli(
-        functools.reduce(operator.or_, choices),
-        args=arguments,
-        prog="gvz",
-        description=DESCRIPTION,
-        config=(tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff),
-    )
+    with paragraphs():
+        return tyro.cli(
+            functools.reduce(operator.or_, choices),
+            args=arguments,
+            prog="gvz",
+            description=DESCRIPTION,
+            config=(tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff),
+        )
 
 
 if __name__ == "__main__":

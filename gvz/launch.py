@@ -14,6 +14,7 @@ import tyro
 
 from gvz.core.control_groups import keep_xla_to_quota
 from gvz.core.errors import ConfigError, GvzError
+from gvz.core.helptext import paragraphs
 from gvz.core.libraries import require_learner
 from gvz.core.stop import StopRequest, exit_at_once, say, told_of_delay
 from gvz.run.config import RunConfig, with_agent, without_effect
@@ -61,7 +62,9 @@ def parse(arguments: Sequence[str]) -> Launch:
     def parsed(config: RunConfig) -> Launch:
         if agent is not None and agent != config.agent.name:
             config = with_agent(config, agent)
-        return tyro.cli(Launch, args=arguments, default=Launch(config=name, run=config), prog="python -m gvz.launch")
+        default = Launch(config=name, run=config)
+        with paragraphs():
+            return tyro.cli(Launch, args=arguments, default=default, prog="python -m gvz.launch")
 
     config = load_config(name, argument(arguments, "--scenario"))
     launch = parsed(config)

@@ -10,7 +10,7 @@ from importlib.metadata import version
 
 import pytest
 
-from gvz import cli
+from gvz import cli, launch
 from gvz.core.registry import discover
 from gvz.tasks import scenarios
 
@@ -77,6 +77,21 @@ def test_help_of_a_command_says_all_that_the_overview_leaves_out(capsys):
     assert "Episode n of a task has the same seed" in evaluate
     assert "RUN_DIR" in evaluate
     assert "None" not in evaluate.replace("(default: None)", "")
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "text"),
+    [
+        (cli.main, ["evaluate", "--help"], "noise off; by default the test tasks of their scenarios"),
+        (launch.main, ["--help"], "pairs adds to 8 each two of their attributes"),
+    ],
+)
+def test_help_of_a_flag_breaks_lines_only_where_the_terminal_ends(command, arguments, text, capsys, monkeypatch):
+    """And not where the docstring does."""
+    monkeypatch.setenv("COLUMNS", "1000")
+    with pytest.raises(SystemExit):
+        command(arguments)
+    assert text in capsys.readouterr().out
 
 
 def test_it_says_its_version(capsys):

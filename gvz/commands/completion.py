@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import re
 from dataclasses import dataclass
 from typing import Literal
 
@@ -40,8 +39,7 @@ class Completion:
         script = printed.getvalue()
         for old, new in _CHANGES.items():
             script = script.replace(old, new)
-        # a line break in the help of a flag would begin another completion
-        print(re.sub(r"(?m)^COMPLETION_SPEC = .*$", lambda line: re.sub(r"\\+n", " ", line[0]), script), end="")
+        print(script, end="")
         return 0
 
 
