@@ -74,7 +74,7 @@ def test_own_kills_by_level_are_of_named_tasks_alone(tmp_path):
 
 
 @pytest.mark.usefixtures("no_files")
-def test_a_task_is_solved_where_the_newest_checkpoint_of_every_seed_survived(tmp_path):
+def test_scores_are_of_the_final_checkpoints_and_a_task_is_solved_where_the_newest_of_every_seed_survived(tmp_path):
     """Final are the last two of five. An older one changes nothing, whether it survived or not."""
     survivors = {"gore": {(1, 5), (2, 5)}, "default": {(1, 5)}, "stone_wall": {(1, 4), (2, 4)}}
     rows = [
@@ -102,6 +102,8 @@ def test_a_task_is_solved_where_the_newest_checkpoint_of_every_seed_survived(tmp
     (section,) = scenario_sections(read_results([tmp_path]), tmp_path)
     (tasks,) = [table for table in section.blocks[0].tables if table.id.endswith("_tasks")]
     assert {row[0].text for row in tasks.rows if row[2].note == "solved"} == {"gore"}
+    scores = {row[0].text: row[2].text.split()[0] for row in tasks.rows}
+    assert scores == {"default": "62.5", "gore": "75.0", "stone_wall": "75.0", "mossy_bricks": "75.0"}
 
 
 @pytest.mark.usefixtures("no_files")
