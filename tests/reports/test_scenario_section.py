@@ -74,7 +74,9 @@ def test_own_kills_by_level_are_of_named_tasks_alone(tmp_path):
 
 
 @pytest.mark.usefixtures("no_files")
-def test_scores_are_of_the_final_checkpoints_and_a_task_is_solved_where_the_newest_of_every_seed_survived(tmp_path):
+def test_scores_are_of_the_final_checkpoints_and_a_task_is_solved_where_the_newest_of_every_seed_survived(
+    tmp_path, monkeypatch
+):
     """Final are the last two of five. An older one changes nothing, whether it survived or not."""
     survivors = {"gore": {(1, 5), (2, 5)}, "default": {(1, 5)}, "stone_wall": {(1, 4), (2, 4)}}
     rows = [
@@ -99,11 +101,14 @@ def test_scores_are_of_the_final_checkpoints_and_a_task_is_solved_where_the_newe
         for row in rows[: 10 * SOLVED_EPISODES]
     ]
     write_rows(tmp_path / "rows.jsonl", rows)
+    drawn = []
+    monkeypatch.setattr("gvz.reports.scenario_section.draw_rewards", lambda *args: drawn.append(args[2]))
     (section,) = scenario_sections(read_results([tmp_path]), tmp_path)
     (tasks,) = [table for table in section.blocks[0].tables if table.id.endswith("_tasks")]
     assert {row[0].text for row in tasks.rows if row[2].note == "solved"} == {"gore"}
     scores = {row[0].text: row[2].text.split()[0] for row in tasks.rows}
     assert scores == {"default": "62.5", "gore": "75.0", "stone_wall": "75.0", "mossy_bricks": "75.0"}
+    assert drawn == [{"a": {"kill": pytest.approx(7.25), "death": -1.0}}]
 
 
 @pytest.mark.usefixtures("no_files")
