@@ -118,7 +118,7 @@ def test_kills_beyond_the_upper_bound_do_not_score():
         assert info["score"] == min(info["kills"], 1)
         assert info["normalized_score"] == 100 * info["score"]
         assert type(info["score"]) is type(info["upper_bound"]) is float, "arrays of a vector environment have its type"
-    assert steps[-1][4]["kills"] > 1
+    assert steps[-1][4]["kills"] > 1 > steps[-1][4]["player_kills"], "the agent has not shot"
     assert steps[-1][2:4] == (False, True)
     assert steps[-1][4]["solved_episode"] is False, "to survive is not its objective"
     env.close()

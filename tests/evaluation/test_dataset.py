@@ -106,7 +106,7 @@ def test_episodes_of_a_file_elsewhere_of_which_there_are_several_runs_are_told_o
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.json").write_text(json.dumps({"resolved": {"tasks": [GORE]}}))
         (tmp_path / name / "evaluation.jsonl").write_text(line(**policy, params=name))
-    (tmp_path / "mine.jsonl").write_text(line(**policy, params="a") + line(**policy, params="a", episode=1))
+    (tmp_path / "Z.jsonl").write_text(line(**policy, params="a") + line(**policy, params="a", episode=1))  # found first
     frame, (problem,) = collect_evaluations([tmp_path])
     assert frame.select("episode", "run_dir").rows() == [
         (0, str(tmp_path / "a")),

@@ -45,6 +45,8 @@ def test_rows_do_not_depend_on_how_episodes_are_shared_out():
     shared = list(play(jobs, num_workers=2))
     assert sorted(map(str, here)) == sorted(map(str, shared))
     assert {(e, Episode(row["task"], row["episode"], row["base_seed"])) for e, row in here} == set(jobs)
+    one, other = (row for _, row in here if (row["task"], row["episode"]) == (TASK, 1))
+    assert one != other, "a worker that goes on with another player's episodes plays as that player"
     for _, row in here:
         assert row["seed"] == episode_seed(row["task"], row["episode"], row["base_seed"])
         assert row["terminated"] != row["truncated"]

@@ -68,6 +68,17 @@ def test_rows_say_which_parameters_played(run):
     assert new["params"] == hashlib.blake2b(flat.tobytes(), digest_size=8).hexdigest()
 
 
+def test_rows_by_other_networks_of_segmented_frames_are_another_players(run, tmp_path):
+    env = dataclasses.replace(CONFIG.env, grayscale=False, frames="segmented", segmenter=str(tmp_path))
+    config = dataclasses.replace(CONFIG, env=env)
+    write_policy(run, config, 20)
+    network, params = tmp_path / "defend_the_center.onnx", []
+    for contents in (b"one", b"another", b"one"):
+        network.write_bytes(contents)
+        params.append(trained_player(run, config, 20).identity["params"])
+    assert params[0] == params[2] != params[1]
+
+
 @pytest.mark.engine
 @pytest.mark.parametrize("conditioned", [False, True])
 def test_a_policy_acts_greedily_on_what_it_was_trained_on(run, conditioned):
@@ -264,3 +275,6 @@ def test_the_value_is_that_of_an_action_which_the_task_allows(run):
     q_values = player.values.q_values
     assert q_values.argmax() in np.flatnonzero(~mask), "the largest is of a forbidden action"
     assert player.values.value == q_values[action] == q_values[mask].max()
+    env.action_masks = lambda: ~mask  # as in a scenario that it was not trained on
+    player.begin(env, frame, {"variables": {}}, 1)
+    assert player.act() == q_values.argmax()

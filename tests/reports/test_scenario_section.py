@@ -8,7 +8,7 @@ from gvz.reports import draw
 from gvz.reports.document import Figure
 from gvz.reports.results import read_results
 from gvz.reports.scenario_section import scenario_sections
-from gvz.tasks import named_tasks
+from gvz.tasks import named_tasks, parse_task
 from tests.reports.conftest import evaluation_row, write_rows
 
 DEFAULT, BLUE, RED = named_tasks("seek_and_kill")[:3]
@@ -72,7 +72,9 @@ def test_own_kills_by_level_are_of_named_tasks_alone(tmp_path):
 
 
 @pytest.mark.usefixtures("no_files")
-def test_a_task_is_solved_where_the_newest_checkpoint_of_every_seed_survived(tmp_path):
+def test_scores_are_of_the_final_checkpoints_and_a_task_is_solved_where_the_newest_of_every_seed_survived(
+    tmp_path, monkeypatch
+):
     """Final are the last two of five. An older one changes nothing, whether it survived or not."""
     survivors = {"gore": {(1, 5), (2, 5)}, "default": {(1, 5)}, "stone_wall": {(1, 4), (2, 4)}}
     rows = [
@@ -97,9 +99,14 @@ def test_a_task_is_solved_where_the_newest_checkpoint_of_every_seed_survived(tmp
         for row in rows[: 10 * SOLVED_EPISODES]
     ]
     write_rows(tmp_path / "rows.jsonl", rows)
+    drawn = []
+    monkeypatch.setattr("gvz.reports.scenario_section.draw_rewards", lambda *args: drawn.append(args[2]))
     (section,) = scenario_sections(read_results([tmp_path]), tmp_path)
     (tasks,) = [table for table in section.blocks[0].tables if table.id.endswith("_tasks")]
     assert {row[0].text for row in tasks.rows if row[2].note == "solved"} == {"gore"}
+    scores = {row[0].text: row[2].text.split()[0] for row in tasks.rows}
+    assert scores == {"default": "62.5", "gore": "75.0", "stone_wall": "75.0", "mossy_bricks": "75.0"}
+    assert drawn == [{"a": {"kill": pytest.approx(7.25), "death": -1.0}}]
 
 
 @pytest.mark.usefixtures("no_files")
@@ -107,11 +114,12 @@ def test_the_gap_of_an_agent_is_shown_in_each_of_its_scenarios(tmp_path, experim
     """It has a run in each scenario, all of one name."""
     scenarios = ("defend_the_center", "seek_and_kill")
     plan = Plan.of("general_on_policy", scale=0.01, scenarios=scenarios)
-    experiments_writer(tmp_path, plan, lambda played: 70.0 if played.task in played.run.tasks else 50.0)
+    of_level = (70.0, 70.0, 40.0, 50.0, 50.0)  # of 6 tasks of level 2, 3 are test tasks, and so are the 4 above
+    experiments_writer(tmp_path, plan, lambda played: of_level[parse_task(played.task).level])
     for section in scenario_sections(read_results([tmp_path]), tmp_path):
         [gap] = [table for table in section.blocks[0].tables if table.id.endswith("_gap")]
         [cells] = gap.rows  # the tasks of levels 0 and 1 are those of training
-        assert [cell.text.split()[0] for cell in cells] == ["ppo_segmented", "20.0", "20.0"]
+        assert [cell.text.split()[0] for cell in cells] == ["ppo_segmented", "24.3", "26.0"]
 
 
 @pytest.mark.usefixtures("no_files")

@@ -18,7 +18,7 @@ from gvz.evaluation.players import CLASSES
 from gvz.evaluation.simple import player_env
 from gvz.scenarios.base import Scenario, Task
 from gvz.scenarios.compiler import compile_task
-from gvz.scenarios.rewards import Pace, Reward, Rewarder, living, return_range
+from gvz.scenarios.rewards import Fell, Gained, Pace, Reward, Rewarder, Rose, living, return_range
 from gvz.tasks import all_scenarios, parse_task, scenario_named, scenarios
 
 ALIVE = {"KILLCOUNT": 0, "PLAYER_KILLS": 0, "AMMO2": 26, "HEALTH": 100, "POSITION_X": 0, "POSITION_Y": 0}
@@ -70,6 +70,14 @@ def test_distance_is_counted_over_five_decisions():
     assert moved == pytest.approx([0.05, 0.1, 0.15, 0.2, 0.25, 0.25, 0.25, 0.25])
     rewarder.reset({**ALIVE, "POSITION_X": 1000})  # the last episode's places are forgotten
     assert rewarder.step({**ALIVE, "POSITION_X": 1010}, False)["moved"] == pytest.approx(0.05)
+
+
+def test_a_change_counts_in_its_own_decision_alone():
+    events = {"rose": Rose("X"), "fell": Fell("X"), "gained": Gained("X")}
+    rewarder = Rewarder(events, dict.fromkeys(events, 1.0))
+    rewarder.reset({"X": 0.0})
+    steps = [tuple(rewarder.step({"X": x}, False).values()) for x in (2.0, 2.0, 5.0, 1.0, 1.0)]
+    assert steps == [(1, 0, 2), (0, 0, 0), (1, 0, 3), (0, 1, 0), (0, 0, 0)]
 
 
 def test_dodge_projectiles_is_equation_3_6():
@@ -145,10 +153,12 @@ def test_an_event_that_gives_no_amount_is_named(amount: Any):
         rewarder.step(ALIVE, False)
 
 
-def range_of(frame_skip: int, discount: float, weight: float = 1.0, **options) -> tuple[float, float]:
+def range_of(
+    frame_skip: int, discount: float, weight: float = 1.0, profile: Profile = "thesis", **options
+) -> tuple[float, float]:
     """The range of a reward of one component with these options."""
     rewards = {"x": Reward(event=living, weight=weight, levdoom=weight, **options)}
-    return return_range(rewards, {"x": weight}, EnvConfig(frame_skip=frame_skip), discount)
+    return return_range(rewards, {"x": weight}, EnvConfig(frame_skip=frame_skip, profile=profile), discount)
 
 
 def test_a_range_is_the_discounted_sum_of_events_that_come_at_their_paces():
@@ -160,6 +170,9 @@ def test_a_range_is_the_discounted_sum_of_events_that_come_at_their_paces():
     assert range_of(4, 0.0, paces=three)[1] == 1
     assert range_of(4, 0.5, weight=-3.0, paces=three)[0] == pytest.approx(-3 * (1 + 0.5**2 + 0.5**4))
     assert range_of(4, 0.5)[1] == range_of(7, 0.5)[1] == 2  # once a decision, without end
+    of_profile = {"paces": three, "levdoom_paces": (Pace(tics=4),)}
+    assert range_of(4, 0.5, **of_profile)[1] == range_of(4, 0.5, paces=three)[1]
+    assert range_of(4, 0.5, profile="levdoom", **of_profile)[1] == 2
 
 
 def test_amounts_of_one_decision_add_up():
