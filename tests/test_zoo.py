@@ -77,13 +77,9 @@ def test_a_policy_is_added_by_one_name_alone(refusal):
     assert "zoo: got mine beside --add" in refusal("zoo", "mine", "--add", "runs/mine", "--name", "mine")
 
 
-def test_the_findings_say_what_the_agent_with_shifted_frames_has(tmp_path, monkeypatch):
+def test_the_policy_of_dodge_projectiles_learned_from_shifted_frames(tmp_path, monkeypatch):
     monkeypatch.setenv("GVZ_CACHE_DIR", str(tmp_path))
-    directory = run_directory(Path("zoo:dodge_projectiles"))
-    assert read_run_config(directory).agent.augmentations == ("shift",)
-    means = scores_of(read_rows(directory / "evaluation.jsonl"), "dodge_projectiles")
-    said = f"That of the zoo has {np.mean(means):.1f} on the test tasks, and {means[-1]:.0f} on `complete`."
-    assert said in WORDS
+    assert read_run_config(run_directory(Path("zoo:dodge_projectiles"))).agent.augmentations == ("shift",)
 
 
 @pytest.mark.parametrize("suffix", ["", "_compositions", "_screen", "_train4"])
