@@ -95,7 +95,7 @@ def test_the_findings_say_what_ppo_loses_on_the_training_tasks():
 @pytest.mark.parametrize("agent", RUNS)
 def test_the_findings_say_what_each_run_gains(agent: str):
     said, by_run = zip(*(gain_of_average(agent, scenario) for scenario in SCENARIOS), strict=True)
-    assert f"{agent} gains {in_words(list(said))} points on the gate tasks" in WORDS
+    assert f"{agent} gains {in_words(list(said))} points on the gate tasks**" in WORDS
     assert f"by run {'; '.join(in_words(runs) for runs in by_run)}." in WORDS
 
 

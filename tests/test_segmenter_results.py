@@ -6,16 +6,11 @@ from gvz.tasks import named_tasks, scenarios
 from tests.score_tables import PAGE, ROOT, WORDS, segmenter
 
 
-def test_the_findings_say_how_well_segmentation_networks_find_things():
+def test_segmentation_networks_learned_from_training_tasks_alone():
     for name in scenarios():
         record = segmenter(name)
         assert record["tasks"] == [task.id for task in named_tasks(name, split="train8")], "no gate or test task"
         assert list(record["average_precision"]) == [task.id for task in named_tasks(name, split="gate")]
-        for task, found in record["average_precision"].items():
-            cells = (
-                f"{found[kind]:.2f}" if kind in found else "-" for kind in ("enemy", "projectile", "kit", "poison")
-            )
-            assert f"| `{task}` | {' | '.join(cells)} |" in PAGE
 
 
 def test_the_findings_say_what_putting_frames_together_gave():
@@ -64,7 +59,7 @@ def test_the_findings_say_what_putting_frames_together_gave():
     assert f"have {count['real']:.1f}. Near walls hide far things. With things of three frames they hold" in PAGE
     assert f"they hold {count['three_frames']:.1f}." in PAGE
     numbers = record["put_together"]["seek_and_kill/red+shadows"]
-    assert f"average precision of {numbers['put_together']:.2f}, and with {numbers['real']:.2f}" in PAGE
+    assert f"average precision of {numbers['put_together']:.2f}, and with {numbers['real']:.2f}" in WORDS
     trials = record["put_together"]["of_trials"]
     last, second = (trials[form].values() for form in ("direct", "few_own_things"))
     last, second = (" and ".join(f"{x:.2f}" for x in one) for one in (last, second))
