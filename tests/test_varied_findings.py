@@ -16,6 +16,7 @@ from tests.score_tables import (
     in_words,
     last_updates,
     learned,
+    means,
     rows_of,
     score_cells,
     score_row,
@@ -27,8 +28,6 @@ from tests.score_tables import (
 
 AGENTS = {"varied maps": "general_varied", "8 tasks": "general_short"}
 SCENARIOS = ("defend_the_center", "seek_and_kill")
-WITH_NETWORKS = ("defend_the_center", "health_gathering", "seek_and_kill")
-"""scenarios of the runs on networks of varied maps"""
 
 
 def test_the_findings_say_what_agents_of_varied_maps_have():
@@ -156,8 +155,9 @@ def test_the_findings_say_what_the_networks_of_varied_maps_find():
 def test_the_findings_say_what_90_minutes_on_varied_maps_gave_with_a_network_of_them():
     network, plain = "rainbow_segmented+varied_network", "rainbow_segmented"
     runs = {"varied maps": f"general_varied_network/runs/{network}", "eight tasks": f"general_varied_long/runs/{plain}"}
-    steps, of_eight, lower = [], [], []
-    for name in WITH_NETWORKS:
+    folders = {"varied maps": ("general_varied_network", network), "8 tasks": ("general", plain)}
+    steps, of_eight = [], []
+    for name in scenarios():
         title = scenario_named(name).title
         for called, run in runs.items():
             episodes = rows_of(ROOT / f"results/{run}/{name}/varied/seed_1111/episodes.jsonl.gz")
@@ -174,29 +174,35 @@ def test_the_findings_say_what_90_minutes_on_varied_maps_gave_with_a_network_of_
             if folder == "general_varied" and name not in SCENARIOS:
                 continue
             assert f"| {title} | {row} | {score_cells(scores_of(folder, agent, name), name)} |" in PAGE
-        compositions = scores_of("general_compositions_long", plain, name)
-        varied = scores_of("general_varied_network", network, name)
-        tests = [score_cells(scores, name).split(" | ")[2].split()[0] for scores in (compositions, varied)]
-        said = "have {} on the test tasks of {} after 2,700 seconds, varied maps {} after"
-        assert said.format(tests[0], title, tests[1]) in WORDS
-        lower.append(gain(varied, scores_of("general", plain, name), task_sets(name)[1]).split()[0])
-    kits = scores_of("general_varied_network", network, "health_gathering")
+    varied, eight = ({name: scores_of(*of, name) for name in scenarios()} for of in folders.values())
+    of_varied, of_eight_tasks = means(varied), means(eight)
+    assert f"| mean | varied maps | varied maps | 5,400 s | {' | '.join(of_varied)} |" in PAGE
+    assert f"| mean | 8 tasks | eight tasks | 5,400 s | {' | '.join(of_eight_tasks)} |" in PAGE
+    assert f"agents have {of_varied[2]} on the test tasks; those of eight tasks have {of_eight_tasks[2]}." in WORDS
+    compositions = {name: scores_of("general_compositions_long", plain, name) for name in scenarios()}
+    assert f"have {means(compositions)[2]} in the mean on the test tasks, after 2,700 seconds." in WORDS
+    gains = [[gain(varied[name], eight[name], task_sets(name)[column]) for name in scenarios()] for column in (2, 1)]
+    for said, of_column in zip(("differences are {} points, in", "On the gate tasks they are {}."), gains, strict=True):
+        assert said.format(in_words(of_column)) in WORDS
+    lower = (of_gate.split()[0] for of_gate in gains[1])
+    assert "not eight tasks and their networks | {} | {} | {} | {} | no |".format(*lower) in WORDS
+    kits = varied["health_gathering"]
     changes_rules = {"poison", "supreme", "short_agent"}
     tasks = [task for task in named_tasks("health_gathering") if not changes_rules & set(task.attributes)]
     assert len(tasks) > 10
     assert {f"{task_mean(kits, task.id):.0f}" for task in tasks} == {"100"}
+    for task in ("city", "flames", "flaming_skulls", "barons", "cacodemons"):
+        assert f"{task_mean(varied['dodge_projectiles'], f'dodge_projectiles/{task}'):.0f}" == "100"
     short = scores_of("general_varied", plain, SCENARIOS[0])
     of_gate_and_test = [
         score_cells(scores, SCENARIOS[0]).split(" | ")[column].split()[0]
-        for scores in (scores_of("general_varied_network", network, SCENARIOS[0]), short)
+        for scores in (varied[SCENARIOS[0]], short)
         for column in (1, 2)
     ]
     assert "have {} and {}, not {} and {} as after 900 seconds".format(*of_gate_and_test) in WORDS
     wall = task_mean(short, "defend_the_center/fuzzy_enemies+gore+stone_wall")
     assert f"on the network of eight tasks, the latter had {wall:.0f}." in WORDS
-    assert "not eight tasks and their networks | {} | | {} | {} | no |".format(*lower) in WORDS
-    said = "{:,} gradient steps in Defend the Center, {:,} in Health Gathering and {:,} in Seek and Kill, 8 games"
-    assert said.format(*steps) in WORDS
+    assert f"{min(steps):,} to {max(steps):,} gradient steps, 8 games at once" in WORDS
     assert f"16 games at once and {min(of_eight):,} to {max(of_eight):,} gradient steps." in WORDS
 
 
@@ -214,6 +220,9 @@ def test_the_findings_say_what_90_minutes_on_varied_maps_gave_with_a_network_of_
         ("defend_the_center", "gore+resized_enemies", "`gore+resized_enemies` has {0}, not {1}, and"),
         ("defend_the_center", "fuzzy_enemies+gore+stone_wall", "where looks alone change, {0}, not {1}."),
         ("defend_the_center", "gore+mossy_bricks", "`gore+mossy_bricks` has {0}, with eight tasks {1}."),
+        ("dodge_projectiles", "mancubus", "training, has {0}, not {1}, and"),
+        ("dodge_projectiles", "arachnotron+city", "`arachnotron+city` {0}, not {1}."),
+        ("dodge_projectiles", "arachnotron", "`arachnotron` has {0}, not {1}."),
         ("health_gathering", "short_agent", "whose eyes are lower, has {0}, not {1}, and"),
         ("health_gathering", "short_agent+water", "`short_agent+water` {0}, not {1}."),
         ("health_gathering", "water", "`water` has {0}, not {1}."),
