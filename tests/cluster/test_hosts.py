@@ -163,8 +163,9 @@ def test_hosts_on_different_nodes_play_all_lanes_by_the_newest_parameters(play, 
 def test_a_learner_that_takes_nothing_holds_the_hosts_back_and_a_lane_gets_its_task(play):
     played = play({"length": 20}, credits=2)
     played.until_all_ready()
-    time.sleep(2.0)  # takes nothing
-    hosts = played.pool._hosts
+    hosts = played.pool._hosts  # from here on the learner takes nothing
+    wait_until(lambda: [host.waiting_batches for host in hosts] == [2, 2], "two batches of each host")
+    time.sleep(0.8)
     assert [host.waiting_batches for host in hosts] == [2, 2], "two credits a host, and no batch more"
     played.checker.assigned = {1: 0, 6: 1}
     for lane, task in played.checker.assigned.items():
