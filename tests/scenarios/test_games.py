@@ -6,14 +6,18 @@ The tables here are written from the thesis and from LevDoom's maps, not from th
 import cmath
 import random
 from collections import Counter
+from contextlib import closing
 
 import pytest
 
 from gvz.engine.engine import Engine, EngineConfig
+from gvz.env import DoomEnv
 from gvz.scenarios.base import BOOKKEEPING
 from gvz.scenarios.compiler import compile_task
 from gvz.tasks import named_tasks, parse_task, scenarios
+from tests.episodes import idle_to_the_end
 from tests.scenarios.conftest import bad_lines
+from tests.score_tables import WORDS, words_of
 
 pytestmark = pytest.mark.engine
 
@@ -341,3 +345,14 @@ def test_what_enemies_do_to_each_other_is_not():
     both = [kills("seek_and_kill/invulnerable", [0] * 5, 1200, seed) for seed in range(3)]
     assert sum(all_kills for all_kills, _ in both) >= 3
     assert [own for _, own in both] == [0, 0, 0]
+
+
+def test_the_pages_say_how_many_shots_an_episode_of_seek_and_kill_has_time_for():
+    with closing(DoomEnv("seek_and_kill/default")) as env:
+        _, info = env.reset(seed=1)
+        assert env.task.scenario.buttons[0] == "ATTACK"
+        *_, truncated, last = idle_to_the_end(env, action=0)[-1]
+    assert truncated
+    shots = info["variables"]["AMMO2"] - last["variables"]["AMMO2"]
+    assert f"an episode has time for {shots:.0f} shots" in WORDS
+    assert f"A held ATTACK fires {shots:.0f} times in an episode" in words_of("docs/benchmark/differences.md")
