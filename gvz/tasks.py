@@ -15,8 +15,8 @@ LEVELS = range(MAX_LEVEL + 1)
 """levels of tasks, the easiest first"""
 TrainingSet = Literal["train1", "train4", "train8", "pairs", "compositions", "train8_varied"]
 """tasks to train on; pairs: the eight of train8, and each two of their attributes that go together and are no named
-task; compositions: likewise any number of their attributes; train8_varied: the eight, and those of them that change no
-texture on varied maps"""
+task; compositions: likewise any number of their attributes; train8_varied: the eight, and on varied maps those of them
+that change no texture"""
 TaskSet = Literal[TrainingSet, "test", "gate"]
 """a training set, the test set, or the gate set: the named tasks of GATE_LEVEL that are in neither"""
 GATE_LEVEL = 2

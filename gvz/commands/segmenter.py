@@ -41,7 +41,8 @@ class TrainSegmenter:
     out: Path
     """the ONNX file to write; beside it comes a .json file with what it was trained on, and its scores"""
     training_set: Literal["train4", "train8", "train8_varied"] = "train8"
-    """the tasks that it learns from; train8_varied: the eight, and those that change no texture on varied maps, too"""
+    """the tasks that it learns from; train8_varied: the eight, and on varied maps those of them that change no
+    texture"""
     frames: int = 1500
     """labelled frames of each training task"""
     gate_frames: int = 300

@@ -22,7 +22,7 @@ class TaskSelection:
     split: TaskSet | None = None
     """the tasks of this set; gate: the named tasks of level 2 in no other set; pairs: the eight training tasks, and
     each two of their attributes that go together and are no named task; compositions: any number of them;
-    train8_varied: the eight, and those that change no texture on varied maps, too"""
+    train8_varied: the eight, and on varied maps those of them that change no texture"""
     suite: Suite = "core"
     """whose named tasks, if no scenario is given; core: the thesis's four scenarios; extended: later ones"""
     level: int | None = None

@@ -11,5 +11,5 @@ EXPERIMENT = Gate(
     trainings=("train8", "train8_varied"),
     columns="training",
     max_processor_s=900.0,
-    notes=("The segmentation networks have seen both kinds of maps in both, so only play can gain.",),
+    notes=("The segmentation networks have seen varied maps in both, so only play can gain.",),
 )

@@ -85,8 +85,8 @@ class RunConfig:
     """scenario whose training set is played (unless tasks are named)"""
     training_set: Literal[1, 4, 8, "pairs", "compositions", "train8_varied"] = 4
     """tasks in the training set: 1 is the default task, 4 and 8 add tasks of level 1, pairs adds to 8 each two of
-    their attributes that go together and are no named task, compositions any number of them, train8_varied those of 8
-    that change no texture, on varied maps"""
+    their attributes that go together and are no named task, compositions any number of them, train8_varied adds to
+    8 those of them that change no texture, on varied maps"""
     tasks: tuple[str, ...] | None = None
     """ids of the tasks to train on, instead of a training set; of several scenarios with env.action_set unified_v1"""
     seed: int = 1111
