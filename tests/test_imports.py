@@ -76,6 +76,13 @@ def test_imports_point_down(module: str, file: Path):
             assert module == "gvz.engine.engine", f"{module} imports vizdoom; only gvz.engine.engine may"
 
 
+def test_the_page_says_which_libraries_the_vocabulary_imports():
+    names = {name.partition(".")[0] for module, file in modules() if tier(module) == 0 for name in imports_of(file)}
+    page = (ROOT / "docs" / "ARCHITECTURE.md").read_text()
+    (said,) = re.findall(r"^\| 0 vocabulary .* \| (.*), standard library \|$", page, flags=re.MULTILINE)
+    assert set(said.split(", ")) == names - sys.stdlib_module_names - {"gvz"}
+
+
 @pytest.mark.parametrize(
     ("statement", "forbidden"),
     [
