@@ -13,7 +13,6 @@ from gvz.commands import segmenter
 from gvz.core import control_groups
 from gvz.core.errors import ConfigError, EngineError
 from gvz.env import DoomEnv
-from gvz.evaluation import segmentation
 from gvz.evaluation.segmentation import Labelled
 from gvz.run import machine
 from gvz.segmentation import SEGMENTERS
@@ -53,7 +52,7 @@ def test_under_a_quota_xla_has_no_thread_for_each_core_of_the_machine(refusal, t
     def stopped(*_: object) -> None:
         raise ConfigError(f"NPROC {os.environ.get('NPROC')}")
 
-    monkeypatch.setattr(segmentation, "training_tasks", stopped)
+    monkeypatch.setattr(machine, "describe", stopped)
     assert "NPROC 1" in refusal("segmenter", "--scenario", "seek_and_kill", "--out", str(tmp_path / "n.onnx"))
 
 

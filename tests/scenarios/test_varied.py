@@ -22,7 +22,7 @@ from gvz.evaluation.players import ScriptedPlayer
 from gvz.evaluation.simple import player_env
 from gvz.run.config import RunConfig
 from gvz.scenarios import looks
-from gvz.scenarios.base import BOOKKEEPING, Content, Scenario, Task
+from gvz.scenarios.base import BOOKKEEPING, Chance, Content, Scenario, Task
 from gvz.scenarios.compiler import CompiledTask, compile_task, map_source, task_content
 from gvz.scenarios.looks import FLATS, LOOSE, SOLID, STYLES, WALLS
 from gvz.scenarios.map_set import MapSet
@@ -88,7 +88,8 @@ def test_no_decoration_of_a_named_task_is_drawn():
 
 
 def test_no_render_style_of_a_named_task_is_drawn():
-    used = {content.entity.get("RenderStyle") for content in contents()}
+    styles = [content.entity.get("RenderStyle") for content in contents()]
+    used = {style.value if isinstance(style, Chance) else style for style in styles}
     assert used == {None, "STYLE_Add", "STYLE_Fuzzy", "STYLE_Shaded", "STYLE_Shadow"}
     assert not used & set(STYLES)
 
