@@ -206,6 +206,31 @@ def test_the_findings_say_what_90_minutes_on_varied_maps_gave_with_a_network_of_
     assert f"16 games at once and {min(of_eight):,} to {max(of_eight):,} gradient steps." in WORDS
 
 
+def test_the_findings_say_what_varied_maps_gave_beside_the_eight_tasks():
+    trainings = ("8 tasks", "8 tasks, also on varied maps")
+    agent, gains, on_eight = "rainbow_segmented+varied_network", [], []
+    for name in ("defend_the_center", "health_gathering"):
+        eight, varied = (scores_of("gates", f"{agent} ({called})", name) for called in trainings)
+        on_eight.append(gain(varied, eight, task_sets(name)[0]))
+        gains.append(gain(varied, eight, task_sets(name)[1]))
+    assert "have {} points more in Defend the Center and {} in Health Gathering.**".format(*gains) in WORDS
+    assert "no difference is shown, either**: {} and {} points.".format(*on_eight) in WORDS
+    lower = [of_scenario.split()[0] for of_scenario in gains]
+    assert "both on networks of varied maps | {} | | {} | | no: `--training-set train8_varied` |".format(*lower) in PAGE
+    means_of = [
+        f"{task_mean(scores, f'health_gathering/{task}'):.0f}"
+        for task in ("short_agent+water", "poison")
+        for scores in (varied, eight)
+    ]
+    said = "`short_agent+water` has {}, not {}, and `poison`, a training task, {}, not {}."
+    assert said.format(*means_of) in WORDS
+    steps = last_updates(f"gates/runs/{agent}/*/*/*")
+    assert f"{steps[0]:,} to {steps[-1]:,} gradient steps; 16 games" in WORDS
+    for training, games in (("train8", 16), ("train8_varied", 28)):
+        for run in (ROOT / "results/gates/runs" / agent).glob(f"*/{training}/*"):
+            assert len({row["lane"] for row in rows_of(run / "episodes.jsonl.gz")}) == games
+
+
 @pytest.mark.parametrize(
     ("name", "tasks", "said"),
     [
