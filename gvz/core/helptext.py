@@ -1,13 +1,13 @@
 """Help texts of command lines."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Generator
 
 import docstring_parser
 
 
 @contextlib.contextmanager
-def paragraphs() -> Iterator[None]:
+def paragraphs() -> Generator[None]:
     """Within the block, tyro shows the docstring of a field as paragraphs.
 
     Without it, a line of the help ends where one of the source does if the next one is indented, as in all fields here.
