@@ -111,7 +111,7 @@ def segmenter(name: str) -> dict[str, Any]:
 
 
 def learned(rows: list[dict[str, Any]], first: int, end: int) -> float:
-    """The mean score of those training episodes that ended after so many gradient steps, and before so many."""
+    """The mean score of the training episodes that ended at `first` gradient steps or later, and before `end`."""
     return float(np.mean([row["normalized_score"] for row in rows if first <= row["num_updates"] < end]))
 
 

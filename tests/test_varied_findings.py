@@ -74,15 +74,15 @@ def test_the_findings_say_what_six_times_the_time_on_varied_maps_gave():
     readme = (ROOT / "results" / "general_varied_long" / "README.md").read_text()
     runs = {"8 tasks": "general/runs/rainbow_segmented/{}/train8"}
     runs["varied maps"] = "general_varied_long/runs/rainbow_segmented/{}/varied"
-    steps, means, waits, minutes = [], {}, [], []
+    steps, trained, waits, minutes = [], {}, [], []
     for name in scenarios():
         title = scenario_named(name).title
         for called, run in runs.items():
             of_first, *_ = sorted((ROOT / "results" / run.format(name)).glob("seed_*"))
             episodes = rows_of(of_first / "episodes.jsonl.gz")
             for first in (10_000, 40_000, 80_000):
-                means[name, called, first] = learned(episodes, first, first + 10_000)
-            cells = " | ".join(f"{means[name, called, first]:.1f}" for first in (10_000, 40_000, 80_000))
+                trained[name, called, first] = learned(episodes, first, first + 10_000)
+            cells = " | ".join(f"{trained[name, called, first]:.1f}" for first in (10_000, 40_000, 80_000))
             assert f"| {title} | {called} | {cells} |" in WORDS
         run = ROOT / "results" / runs["varied maps"].format(name) / "seed_1111"
         first, *_, last = rows = rows_of(run / "metrics.jsonl.gz")
@@ -100,11 +100,11 @@ def test_the_findings_say_what_six_times_the_time_on_varied_maps_gave():
     assert f"waited for decisions for {100 * np.mean(waits):.0f} percent" in readme
 
     def lower(name: str) -> float:
-        return means[name, "8 tasks", 80_000] - means[name, "varied maps", 80_000]
+        return trained[name, "8 tasks", 80_000] - trained[name, "varied maps", 80_000]
 
     center, seek = SCENARIOS
     assert all(lower(name) <= 0 for name in ("dodge_projectiles", "health_gathering"))
-    gained = means[seek, "varied maps", 80_000] - means[seek, "varied maps", 40_000]
+    gained = trained[seek, "varied maps", 80_000] - trained[seek, "varied maps", 40_000]
     said = f"stand {lower(center):.0f} and {lower(seek):.0f} points lower, and Seek and Kill gains only {gained:.0f}"
     assert f"{said} points" in WORDS
 
@@ -266,8 +266,8 @@ def test_the_findings_say_what_varied_maps_gave_beside_the_eight_tasks():
 )
 def test_the_findings_say_how_an_agent_of_varied_maps_plays_single_tasks(name: str, tasks: str, said: str):
     both = (("general_varied_network", "rainbow_segmented+varied_network"), ("general", "rainbow_segmented"))
-    means = []
+    found = []
     for folder, agent in both:
         scores = scores_of(folder, agent, name)
-        means.append(in_words([f"{task_mean(scores, f'{name}/{task}'):.0f}" for task in tasks.split()]))
-    assert said.format(*means) in WORDS
+        found.append(in_words([f"{task_mean(scores, f'{name}/{task}'):.0f}" for task in tasks.split()]))
+    assert said.format(*found) in WORDS

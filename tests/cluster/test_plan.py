@@ -161,8 +161,7 @@ def test_actors_of_a_plan_act_by_themselves_as_those_of_hosts_have_to(capsys, mo
 @pytest.mark.e2e
 @pytest.mark.engine
 def test_this_machine_can_be_measured_instead(capsys, monkeypatch):
-    monkeypatch.setattr(measure, "FIRST_S", 0.5)
-    monkeypatch.setattr(measure, "PLAY_S", 1.5)
+    monkeypatch.setattr(measure, "PLAY_S", 3.0)
     flags = ["cluster", "plan", "--hosts", "2", "--cores", "2", "--config", "dqn_quick", "--measure", "--json"]
     assert cli.main(flags) == 0
     costs = json.loads(capsys.readouterr().out)["costs"]

@@ -143,8 +143,7 @@ def test_agents_of_different_maps_that_played_the_same_are_not_one(tmp_path, exp
 def copied(small, tmp_path):
     """Copies a run to `tmp_path / name`, with other settings."""
 
-    def copy(name: str, **settings: Any) -> None:
-        source = small / TRAIN4 / "seed_1111"
+    def copy(name: str | Path, source: Path = small / TRAIN4 / "seed_1111", **settings: Any) -> None:
         shutil.copytree(source, tmp_path / name)
         saved = json.loads((tmp_path / name / "config.json").read_text())
         for field, values in settings.items():
@@ -197,16 +196,12 @@ def test_reward_weights_tell_agents_apart_unless_they_are_of_other_scenarios(cop
 
 
 @pytest.mark.parametrize("experiment", ["training_set_size", "general_pairs", "general_compositions", "general"])
-def test_runs_of_an_experiment_with_other_settings_are_put_together_and_named(tmp_path, experiments_writer, experiment):
+def test_runs_of_an_experiment_with_other_settings_are_put_together(copied, tmp_path, experiments_writer, experiment):
     plan = Plan.of(experiment, scale=0.0001, scenarios=("defend_the_center",))
     experiments_writer(tmp_path, plan, lambda _: 50.0)
     run = run_directory(tmp_path, plan.runs()[-1])
     names = {*read_results([tmp_path]).agents.values()}
-    other = run.with_name("seed_2222")
-    shutil.copytree(run, other)
-    saved = json.loads((other / "config.json").read_text())
-    saved["config"]["agent"]["discount"], saved["config"]["seed"] = 0.5, 2222
-    (other / "config.json").write_text(json.dumps(saved))
+    copied(other := run.with_name("seed_2222"), run, agent={"discount": 0.5}, seed=2222)
     results = read_results([tmp_path])
     assert {*results.agents.values()} == names
     (problem,) = (text for text in results.problems if text.startswith(f"{other}: put together"))

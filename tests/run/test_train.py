@@ -230,7 +230,7 @@ def test_an_epsilon_that_is_no_probability_ends_a_run_which_is_saved_first(tmp_p
 def test_a_run_goes_on_bit_for_bit_within_a_stretch_of_noise(tmp_path):
     """With a loss of sight. The cut at 80 of each game's 110 decisions lies in the third stretch, after the warm-up."""
     agent = RainbowConfig(**NETWORK, noisy_sigma=0.5, noisy_period_steps=30, num_atoms=5, sight_weight=1.0)
-    config = replace(DQN, name="rainbow", tasks=("defend_the_center/default", "defend_the_center/gore"), agent=agent)
+    config = replace(DQN, name="rainbow", agent=agent)
     go_on(tmp_path / "whole", config, 80)
     go_on(tmp_path / "cut", config, 50)
     saved = msgpack.unpackb((tmp_path / "cut" / "checkpoints" / "50" / "host.msgpack").read_bytes())
@@ -253,7 +253,7 @@ ON_POLICY = OnPolicyConfig(rollout_steps=12, num_epochs=2, num_minibatches=3, av
 @pytest.mark.parametrize("agent", [PPOConfig(**NETWORK), PQNConfig(**NETWORK)], ids=["ppo", "pqn"])
 def test_an_on_policy_run_goes_on_bit_for_bit_between_two_rollouts(tmp_path, agent):
     """The cut lies in both games' episodes; the windows after it begin with records from before it."""
-    config = replace(PLAIN, name="on_policy", agent=agent, replay=None, learner=ON_POLICY)
+    config = replace(DQN, name="on_policy", agent=agent, replay=None, learner=ON_POLICY)
     go_on(tmp_path / "whole", config, 36)
     rarely = replace(config, log=replace(config.log, period_updates=1_000))
     go_on(tmp_path / "cut", rarely, 18)
@@ -277,7 +277,7 @@ def test_an_on_policy_run_goes_on_bit_for_bit_between_two_rollouts(tmp_path, age
         re.findall(rf"^\| `([^`]+/[^`]+)` \| {agents}", page, re.MULTILINE) for agents in ("", f"(?:both|{agent.name})")
     )
     for row in rows:
-        written = {re.sub("|".join(config.tasks or ()), "<task>", name) for name in row if "/" in name}
+        written = {re.sub("|".join(DQN.tasks or ()), "<task>", name) for name in row if "/" in name}
         assert written <= set(everyones)
         assert set(own) <= written
         assert row["rollout/age_max_versions"] == 1
