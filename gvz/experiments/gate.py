@@ -7,6 +7,7 @@ from gvz.experiments.base import Experiment
 Gate = partial(
     Experiment,
     source="docs/EXPERIMENTS.md, Gates",
+    trainings=("train8",),
     seeds=(1111, 2222),
     total_updates=60_000,
     max_processor_s=400.0,

@@ -12,7 +12,6 @@ EXPERIMENT = Gate(
         "shots_free": {"env.reward_weights": [["seek_and_kill.ammo_spent", 0.0], ["seek_and_kill.moved", 0.0005]]},
     },
     scenarios=("seek_and_kill",),
-    trainings=("train8",),
     notes=(
         "By the thesis a shot costs 0.1 and a kill gives 1; LevDoom's shots are free. Scores are the protocol's, "
         "whatever an agent was rewarded for.",

@@ -9,7 +9,6 @@ EXPERIMENT = Gate(
     configs=("ppo_segmented",),
     variants={"average": {"learner.average_ema": 0.999}},
     scenarios=("defend_the_center", "seek_and_kill"),
-    trainings=("train8",),
     max_processor_s=900.0,
     notes=(
         "An average does not change training. So the agent to compare with is the same run with its last parameters, "

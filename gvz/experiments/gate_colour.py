@@ -12,6 +12,5 @@ EXPERIMENT = Gate(
     configs=("rainbow_quick",),
     variants={"shots_free": GREY, "colour": {**GREY, "env.grayscale": False}},  # gate_ammo has the grey runs, too
     scenarios=("seek_and_kill",),
-    trainings=("train8",),
     notes=("A frame with colour has three channels, so the first convolution computes three times as much.",),
 )

@@ -12,7 +12,6 @@ EXPERIMENT = Gate(
         "shots_free": {"env.reward_weights": [["defend_the_center.ammo_spent", 0.0]]},
     },
     scenarios=("defend_the_center",),
-    trainings=("train8",),
     notes=(
         "By the thesis a shot costs 0.1 and a kill gives 1; by LevDoom 0.01. An episode has 26 rounds, and agents of "
         "general_short die with some of them left. Scores are the protocol's, whatever an agent was rewarded for.",

@@ -9,6 +9,5 @@ EXPERIMENT = Gate(
     configs=("rainbow_segmented",),
     variants={"near": {"agent.discount": 0.95}, "far": {"agent.discount": 0.98}},
     scenarios=("health_gathering",),
-    trainings=("train8",),
     max_processor_s=900.0,
 )

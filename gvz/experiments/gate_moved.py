@@ -19,7 +19,6 @@ EXPERIMENT = Gate(
         "shift_moved": {"env.reward_weights": [["dodge_projectiles.moved", 0.005]]},
     },
     scenarios=("dodge_projectiles",),
-    trainings=("train8",),
     max_processor_s=900.0,
     notes=("`shift_moved` shifts frames, as `rainbow_segmented` does. `shift` of `gate_shift` has 0.002.",),
 )

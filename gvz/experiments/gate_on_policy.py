@@ -9,6 +9,5 @@ EXPERIMENT = Gate(
     configs=("rainbow_quick", "pqn_quick", "ppo_quick"),
     variants={"plain": {}},  # named, so that gate_sight and this gate share their runs of Rainbow
     scenarios=("dodge_projectiles", "health_gathering"),
-    trainings=("train8",),
     notes=("Rainbow has 16 games at once, PQN and PPO have 8: each config as it is.",),
 )

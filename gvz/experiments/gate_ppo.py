@@ -15,7 +15,6 @@ EXPERIMENT = Gate(
         "both": {"agent.discount": 0.99, "agent.entropy_weight": 0.03},
     },
     scenarios=("defend_the_center",),
-    trainings=("train8",),
     max_processor_s=900.0,
     notes=("`plain` has a discount of 0.95 and a weight of the entropy of 0.01.",),
 )

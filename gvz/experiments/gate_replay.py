@@ -15,6 +15,5 @@ EXPERIMENT = Gate(
         "replay_400k": {"replay.capacity": 400_000, **_BEFORE},
     },
     scenarios=("defend_the_center",),
-    trainings=("train8",),
     max_processor_s=900.0,
 )

@@ -12,7 +12,6 @@ EXPERIMENT = Gate(
         "tenth": {"env.reward_weights": [["seek_and_kill.moved", 0.0005]]},
     },
     scenarios=("seek_and_kill",),
-    trainings=("train8",),
     notes=(
         "An agent that walks straight on gets some 0.2 a decision for it, as much as for a kill in five decisions. "
         "Scores are the protocol's, whatever an agent was rewarded for.",

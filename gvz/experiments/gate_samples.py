@@ -13,7 +13,6 @@ EXPERIMENT = Gate(
         "batch_64": {"learner.batch_size": 64},
     },
     scenarios=("defend_the_center",),
-    trainings=("train8",),
     seeds=(1111,),
     max_processor_s=900.0,
     notes=(

@@ -15,7 +15,6 @@ EXPERIMENT = Gate(
         "vertical": {"agent.augmentations": ["vertical_shift"], "agent.augmentation_strength": 0.5},
     },
     scenarios=("dodge_projectiles", "defend_the_center", "health_gathering"),
-    trainings=("train8",),
     max_processor_s=900.0,
     notes=("`moved_most` is `rainbow_segmented` without shifted frames.",),
 )

@@ -20,7 +20,6 @@ EXPERIMENT = Gate(
         "layer_norm": {"agent.encoder": "layer_norm"},
     },
     scenarios=("dodge_projectiles", "health_gathering", "defend_the_center"),
-    trainings=("train8",),
     notes=(
         "Dodge Projectiles and Health Gathering are learned in this time: what is lost on the gate tasks is sight. In "
         "Defend the Center it is play, too.",

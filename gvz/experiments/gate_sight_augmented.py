@@ -18,7 +18,6 @@ EXPERIMENT = Gate(
         "labels_sight_augmented": SIGHT | HALF | {"agent.sight_augmentations": LOOKS},
     },
     scenarios=("defend_the_center", "health_gathering"),
-    trainings=("train8",),
     max_processor_s=900.0,
     notes=("Labels are needed in training alone: agents act on the same grey frames.",),
 )

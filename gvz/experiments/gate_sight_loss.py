@@ -9,6 +9,5 @@ EXPERIMENT = Gate(
     configs=("rainbow_general",),
     variants={"plain": {}, "sight_0.1": {"agent.sight_weight": 0.1}, "sight_1": {"agent.sight_weight": 1.0}},
     scenarios=("defend_the_center", "seek_and_kill"),
-    trainings=("train8",),
     notes=("Labels are needed in training alone: agents act on the same grey frames.",),
 )

@@ -17,7 +17,6 @@ EXPERIMENT = Gate(
         "sticky_50": {"env.repeat_action_probability": 0.5, **_BEFORE},
     },
     scenarios=("dodge_projectiles",),
-    trainings=("train8",),
     max_processor_s=900.0,
     notes=("Evaluations have no sticky actions.",),
 )

@@ -12,6 +12,5 @@ EXPERIMENT = Gate(
         "temperature_2": {"env.segmenter_temperature": 2.0},
     },
     scenarios=("seek_and_kill", "health_gathering"),
-    trainings=("train8",),
     max_processor_s=900.0,
 )
