@@ -109,13 +109,7 @@ class Evaluate:
     def _player_specs(self) -> "dict[PlayerSpec, tuple[tuple[Task, ...], Path]]":
         """Who plays -> what, and the record file."""
         from gvz.evaluation.episode_log import simple_player
-        from gvz.evaluation.trained import (
-            check_profile,
-            check_tasks,
-            find_checkpoints,
-            read_run_config,
-            trained_player,
-        )
+        from gvz.evaluation.trained import check_profile, check_tasks, find_checkpoints, read_run_config, trained_player
         from gvz.evaluation.zoo import run_directory
 
         if self.player is not None:

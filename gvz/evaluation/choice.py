@@ -48,13 +48,7 @@ class EpisodeChoice:
             ConfigError, TaskError, CheckpointError: there is no such player, task or checkpoint.
         """
         from gvz.evaluation.episode_log import simple_player
-        from gvz.evaluation.trained import (
-            check_profile,
-            check_tasks,
-            find_checkpoint,
-            read_run_config,
-            trained_player,
-        )
+        from gvz.evaluation.trained import check_profile, check_tasks, find_checkpoint, read_run_config, trained_player
         from gvz.evaluation.zoo import run_directory
 
         if self.player is not None and self.run_dir is not None:

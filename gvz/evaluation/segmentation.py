@@ -20,15 +20,7 @@ from gvz.scenarios.base import Task, Textures
 from gvz.scenarios.compiler import task_content
 from gvz.segmentation import INPUT_HEIGHT, INPUT_WIDTH
 from learner.segmentation import CELL
-from learner.segmentation_views import (
-    OUTLINES,
-    Shot,
-    changed_view,
-    mirrored,
-    moved,
-    num_pixels_gained,
-    shrunk,
-)
+from learner.segmentation_views import OUTLINES, Shot, changed_view, mirrored, moved, num_pixels_gained, shrunk
 
 
 class Labelled(NamedTuple):

@@ -18,16 +18,7 @@ from gvz.evaluation.simple import SIMPLE_PLAYERS
 from gvz.run.config import RunConfig
 from gvz.run.config_files import load_config, with_settings
 from gvz.scenarios.map_set import PROCEDURAL, VARIED, names_map_set
-from gvz.tasks import (
-    LEVELS,
-    Task,
-    TrainingSet,
-    attribute_tasks,
-    named_tasks,
-    parse_task,
-    scenario_named,
-    scenarios,
-)
+from gvz.tasks import LEVELS, Task, TrainingSet, attribute_tasks, named_tasks, parse_task, scenario_named, scenarios
 
 EACH_TASK = "each"
 """as a training: every named task of the scenario, alone"""

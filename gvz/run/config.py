@@ -18,15 +18,7 @@ from gvz.run.group_config import GroupConfig
 from gvz.task_table import TaskTable, task_table
 from gvz.tasks import TrainingSet, named_tasks
 from learner.agents.configs.rainbow import RainbowConfig
-from learner.config import (
-    AgentConfig,
-    LearnerConfig,
-    OnPolicyConfig,
-    ReplayConfig,
-    ValueConfig,
-    change_agent,
-    unused,
-)
+from learner.config import AgentConfig, LearnerConfig, OnPolicyConfig, ReplayConfig, ValueConfig, change_agent, unused
 
 MIN_CLUSTER_SLOTS = 128
 """step records that a game has room for in the replay of a run with actor hosts"""

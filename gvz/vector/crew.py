@@ -14,17 +14,7 @@ from gvz.core import errors, janitor
 from gvz.core.errors import GvzError, TransportError, WorkerError
 from gvz.core.watchdog import AwakeClock
 from gvz.transport.child import ChildProcess, end_all
-from gvz.transport.messages import (
-    Decision,
-    Decisions,
-    Fault,
-    Message,
-    Outcome,
-    Outcomes,
-    Render,
-    Screen,
-    VectorSpec,
-)
+from gvz.transport.messages import Decision, Decisions, Fault, Message, Outcome, Outcomes, Render, Screen, VectorSpec
 from gvz.vector.frames import Frames
 
 SILENCE_TIMEOUT_S = 240.0

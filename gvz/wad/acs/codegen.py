@@ -8,14 +8,7 @@ from gvz.wad.acs.constant_expressions import constant, constant_number
 from gvz.wad.acs.expressions import flow
 from gvz.wad.acs.lexer import error
 from gvz.wad.acs.parser import parse
-from gvz.wad.acs.statements import (
-    RETURN_VALUE,
-    RETURN_VOID,
-    TERMINATE,
-    array_size,
-    emit_statement,
-    initial_values,
-)
+from gvz.wad.acs.statements import RETURN_VALUE, RETURN_VOID, TERMINATE, array_size, emit_statement, initial_values
 from gvz.wad.acs.symbols import FunctionSymbol, Unit, VariableSymbol
 from gvz.wad.stock import stock_actors
 
