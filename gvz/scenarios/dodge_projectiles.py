@@ -14,11 +14,12 @@ Differs: the enemies have their normal health, as in the author's maps; the agen
 """
 
 import random
+from dataclasses import replace
 from functools import partial
 
-from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Value, Variety, words
+from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Value, Variety, words
 from gvz.scenarios.layout import Layout, ring, vary
-from gvz.scenarios.parts import retextured, things_at
+from gvz.scenarios.parts import SHORT_AGENT, retextured, things_at
 from gvz.scenarios.rewards import HISTORY_STEPS, Fell, Pace, Reward, living, moved
 from gvz.wad.udmf import UdmfMap
 
@@ -180,11 +181,7 @@ SCENARIO = Scenario(
                 agent={"DamageFactor": 0.3},
             ),
         ),
-        Attribute(
-            name="resized_agent",
-            groups=("agent_height",),
-            content=Content(agent={"ViewHeight": Uniform(0.0, 100.0)}),
-        ),
+        replace(SHORT_AGENT, name="resized_agent"),
     ),
     complete=("city", "flaming_skulls", "revenants_and_arachnotron", "resized_agent"),
     levdoom_tasks={

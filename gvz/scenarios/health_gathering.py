@@ -13,10 +13,11 @@ Attributes: thesis B.2, below. `complete` takes water for its textures. Tasks: t
 """
 
 import random
+from dataclasses import replace
 
 from gvz.scenarios.base import Attribute, Content, Period, Scenario, Textures, Uniform, Variety, words
 from gvz.scenarios.layout import Layout, draw_rooms, furnished, vary
-from gvz.scenarios.parts import RESIZED, rendered, retextured, starts_at, things_at
+from gvz.scenarios.parts import RESIZED, SHORT_AGENT, rendered, retextured, starts_at, things_at
 from gvz.scenarios.rewards import Pace, Reward, Rose, death, living
 
 WAD = "health_gathering.wad"
@@ -259,12 +260,7 @@ SCENARIO = Scenario(
         ),
         Attribute(name="resized_kits", groups=("entity_size",), aliases=("resized",), content=RESIZED),
         rendered("shaded_kits", "STYLE_Shaded", "shaded"),
-        Attribute(
-            name="short_agent",
-            groups=("agent_height",),
-            content=Content(agent={"ViewHeight": Uniform(0.0, 100.0)}),
-            levdoom=Content(agent={"ViewHeight": 0.0}),
-        ),
+        replace(SHORT_AGENT, levdoom=Content(agent={"ViewHeight": 0.0})),
         Attribute(
             name="poison",
             groups=("poison",),
