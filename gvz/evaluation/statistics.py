@@ -9,6 +9,7 @@ Source: thesis 3.1 (performance indicators, eq. 3.1 and 3.2) and 3.1.4 (solved);
 edge of the statistical precipice" (interquartile mean, probability of improvement, stratified bootstrap).
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, assert_never
@@ -148,12 +149,7 @@ def solved(timed_out: np.ndarray) -> bool:
 
     Source: thesis 3.1.4.
     """
-    streak = 0
-    for one in timed_out:
-        streak = streak + 1 if one else 0
-        if streak == SOLVED_EPISODES:
-            return True
-    return False
+    return any(one and len(list(streak)) >= SOLVED_EPISODES for one, streak in itertools.groupby(timed_out))
 
 
 # ------------------------------------------------------------------------------------------------- intervals
