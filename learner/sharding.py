@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -64,84 +64,53 @@ class Learning:
         )
 
 
-class Placement(Protocol):
-    """A learner's arrays on its device or devices."""
-
-    def init(self, key: PRNGKeyArray) -> tuple[LearnerState, ReplayState]:
-        """The state before the first update, and an empty replay."""
-        ...
-
-    def place(self, state: LearnerState, replay_state: ReplayState) -> tuple[LearnerState, ReplayState]:
-        """The same from numpy arrays in canonical form; copies, for a borrowed buffer cannot be donated."""
-        ...
-
-    def canonical(self, state: LearnerState, replay_state: ReplayState) -> tuple[LearnerState, ReplayState]:
-        """In the form that does not depend on the devices."""
-        ...
-
-    def settled(self, state: LearnerState) -> LearnerState:
-        """What `local` gave on all devices again, where parts of it were made elsewhere, such as empty sums."""
-        ...
-
-    def local(self, state: LearnerState) -> LearnerState:
-        """What this process has of it."""
-        ...
-
-    def one_copy(self, tree: Any) -> Any:
-        """Replicated arrays on the default device alone."""
-        ...
-
-    def add(self, replay_state: ReplayState, arrays: StepArrays) -> ReplayState:
-        """`replay.add`, jitted; the replay is donated."""
-        ...
-
-    def blocks(self, ingest: Ingest, blocks: Sequence[StepBlock], params_version: int) -> Iterator[StepArrays]:
-        """Checked records in the blocks that `add` takes."""
-        ...
-
-    def make_train_step(self, num_updates: int) -> TrainStep:
-        """As `train_step.make_train_step`."""
-        ...
-
-
-class OneDevice:
-    """The default device (`Placement`)."""
+class Placement:
+    """A learner's arrays on the default device. `SeveralDevices` has them on several."""
 
     def __init__(self, learning: Learning):
         self._learning = learning
         self._add = jax.jit(partial(replay.add, learning.replay_spec), donate_argnums=0)
 
     def init(self, key: PRNGKeyArray) -> tuple[LearnerState, ReplayState]:
+        """The state before the first update, and an empty replay."""
         return jax.jit(self._learning.init)(key), replay.init(self._learning.replay_spec)
 
     def place(self, state: LearnerState, replay_state: ReplayState) -> tuple[LearnerState, ReplayState]:
+        """The same from numpy arrays in canonical form; copies, for a borrowed buffer cannot be donated."""
         return jax.tree.map(jnp.array, (state, replay_state))
 
     def canonical(self, state: LearnerState, replay_state: ReplayState) -> tuple[LearnerState, ReplayState]:
+        """In the form that does not depend on the devices."""
         return state, replay_state
 
-    def local(self, state: LearnerState) -> LearnerState:
+    def settled(self, state: LearnerState) -> LearnerState:
+        """What `local` gave on all devices again, where parts of it were made elsewhere, such as empty sums."""
         return state
 
-    def settled(self, state: LearnerState) -> LearnerState:
+    def local(self, state: LearnerState) -> LearnerState:
+        """What this process has of it."""
         return state
 
     def one_copy(self, tree: Any) -> Any:
+        """Replicated arrays on the default device alone."""
         return tree
 
     def add(self, replay_state: ReplayState, arrays: StepArrays) -> ReplayState:
+        """`replay.add`, jitted; the replay is donated."""
         return self._add(replay_state, arrays)
 
     def blocks(self, ingest: Ingest, blocks: Sequence[StepBlock], params_version: int) -> Iterator[StepArrays]:
+        """Checked records in the blocks that `add` takes."""
         return ingest.arrays(blocks, params_version)
 
     def make_train_step(self, num_updates: int) -> TrainStep:
+        """As `train_step.make_train_step`."""
         one = self._learning
         return train_step.make_train_step(one.agent, one.replay_spec, one.config, one.replay_config, num_updates)
 
 
-class SeveralDevices:
-    """The first devices of every process, a shard of the process's lanes on each (`Placement`).
+class SeveralDevices(Placement):
+    """The first devices of every process, a shard of the process's lanes on each.
 
     The learner's state is of all processes. A replay is of one: its arrays are made parts of larger ones for a train
     step, without a copy.
@@ -297,7 +266,7 @@ def placement(learning: Learning) -> Placement:
         ConfigError: there are not as many devices as it wants.
     """
     alone = learning.config.devices == jax.process_count() == 1
-    return OneDevice(learning) if alone else SeveralDevices(learning)
+    return Placement(learning) if alone else SeveralDevices(learning)
 
 
 def devices(num_devices: int) -> list[Any]:
