@@ -1,10 +1,12 @@
 """Discrete actions: the buttons that each action of a scenario holds."""
 
+from collections.abc import Iterable
 from itertools import chain, combinations, product
 from types import MappingProxyType
 
 from gvz.core.env_config import ActionSet
-from gvz.scenarios.base import Scenario
+from gvz.core.errors import ConfigError
+from gvz.scenarios.base import Scenario, Task
 
 Buttons = tuple[str, ...]
 """buttons that are held together"""
@@ -37,6 +39,16 @@ _FIXED: MappingProxyType[ActionSet, tuple[Buttons, ...]] = MappingProxyType(
     }
 )
 """lists that are the same in every scenario"""
+
+
+def check_one_action_set(where: str, tasks: Iterable[Task], action_set: ActionSet) -> None:
+    """Raises ConfigError for tasks of several scenarios, if their actions differ. `where` begins its message."""
+    names = sorted({task.scenario.id for task in tasks})
+    if len(names) > 1 and action_set not in _FIXED:
+        raise ConfigError(
+            f"{where}: got tasks of {', '.join(names)}, whose actions differ; want one scenario, or "
+            'action_set="unified_v1"'
+        )
 
 
 def action_buttons(scenario: Scenario, action_set: ActionSet) -> tuple[Buttons, ...]:

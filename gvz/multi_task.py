@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
-from gvz.actions import Buttons
+from gvz.actions import Buttons, check_one_action_set
 from gvz.core.env_config import EPISODE_SEEDS, EnvConfig, given_episode_seed, typed
 from gvz.core.errors import ConfigError, TaskError
 from gvz.env import Action, DoomEnv
@@ -60,12 +60,7 @@ class MultiTaskEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         self._games = {game.task.id: game for game in games}
         if not games or len(self._games) < len(games):
             raise ConfigError(f"tasks: got {[game.task.id for game in games]}, want at least one, each once")
-        names = sorted({game.task.scenario.id for game in games})
-        if len(names) > 1 and games[0].config.action_set not in ("unified_v1", "multi_discrete_v1"):
-            raise ConfigError(
-                f"tasks: got tasks of {', '.join(names)}, whose actions differ; want one scenario, or "
-                'action_set="unified_v1"'
-            )
+        check_one_action_set("tasks", [game.task for game in games], games[0].config.action_set)
         self._sampler = sampler
         self._max_engines = max_engines
         self._running: list[DoomEnv] = []

@@ -14,6 +14,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from gvz.actions import check_one_action_set
 from gvz.core.control_groups import num_cores
 from gvz.core.env_config import EPISODE_SEEDS, EnvConfig
 from gvz.core.errors import ConfigError
@@ -100,12 +101,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         options = {"render_mode": render_mode, "recycle_episodes": recycle_episodes}
         envs = {task: DoomEnv(task, config, **options, **fields) for task in dict.fromkeys(ids)}
         first = envs[ids[0]]
-        scenarios = sorted({env.task.scenario.id for env in envs.values()})
-        if len(scenarios) > 1 and first.config.action_set not in ("unified_v1", "multi_discrete_v1"):
-            raise ConfigError(
-                f"make_vec: got tasks of {', '.join(scenarios)}, whose actions differ; want one scenario, or "
-                'action_set="unified_v1"'
-            )
+        check_one_action_set("make_vec", [env.task for env in envs.values()], first.config.action_set)
         self.tasks = tuple(envs[ids[game % len(ids)]].task.id for game in range(self.num_envs))
         self.render_mode = render_mode
         self.metadata = {**first.metadata, "autoreset_mode": self._mode}
