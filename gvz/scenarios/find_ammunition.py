@@ -21,7 +21,7 @@ Source: thesis 6.2.1, its second idea for a scenario. Differs: wrong ammunition 
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Variety, words
 from gvz.scenarios.find_the_key import MAZE, ROOM_SPOTS, draw_rooms_of_spots
 from gvz.scenarios.health_gathering import OBSTACLES
-from gvz.scenarios.parts import ACS_APART, ACS_NEAR, GLOWING_ENEMIES, RESIZED_ENEMIES, retextured, starts_at
+from gvz.scenarios.parts import ACS_APART, ACS_NEAR, GLOWING_ENEMIES, RESIZED_ENEMIES, definition, retextured, starts_at
 from gvz.scenarios.rewards import Pace, Reward, Rose, death, living
 from gvz.scenarios.seek_and_kill import drain_acid
 
@@ -198,21 +198,8 @@ ACTOR ImpFireball : DoomImpBall replaces DoomImpBall
 
 def _clip(name: str, sprite: str, scale: float) -> dict[str, str]:
     """A DECORATE class that gives two bullets."""
-    definition = f"""\
-ACTOR {name} : Clip
-{{
-  Scale {scale}
-  Radius 32
-  Inventory.Amount 2
-  States
-  {{
-  Spawn:
-    {sprite} A -1
-    Stop
-  }}
-}}
-"""
-    return {name: definition}
+    properties = f"Scale {scale}", "Radius 32", "Inventory.Amount 2"
+    return {name: definition(f"{name} : Clip", *properties, spawn=f"{sprite} A -1\n    Stop")}
 
 
 def _decoy(name: str, base: str) -> dict[str, str]:

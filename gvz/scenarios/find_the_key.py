@@ -27,7 +27,7 @@ import random
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
 from gvz.scenarios.health_gathering import OBSTACLES, draw_hall
 from gvz.scenarios.layout import Layout
-from gvz.scenarios.parts import ACS_APART, ACS_NEAR, SHORT_AGENT, rendered, retextured, starts_at
+from gvz.scenarios.parts import ACS_APART, ACS_NEAR, SHORT_AGENT, definition, rendered, retextured, starts_at
 from gvz.scenarios.rewards import Pace, Reward, Rose, death, living
 from gvz.scenarios.seek_and_kill import SPOTS as MAZE_SPOTS
 from gvz.scenarios.seek_and_kill import drain_acid
@@ -158,21 +158,7 @@ script 4 (void)
 """
 )
 
-PORTAL = {
-    "Portal": """\
-ACTOR Portal
-{
-  Radius 20
-  Height 56
-  States
-  {
-  Spawn:
-    IFOG ABCDEDCB 6 Bright
-    Loop
-  }
-}
-"""
-}
+PORTAL = {"Portal": definition("Portal", "Radius 20", "Height 56", spawn="IFOG ABCDEDCB 6 Bright\n    Loop")}
 
 RESIZED_THINGS = Content(entity={"ScaleX": Uniform(1.0, 5.0), "ScaleY": Uniform(1.0, 5.0)})
 """0.4 to 2 times as wide and as high as in the default task; smaller keys could not be told apart"""

@@ -25,7 +25,7 @@ Source: thesis 6.2.1, its last idea for a scenario, with its small rewards for k
 from gvz.scenarios.base import Attribute, Content, Scenario, Textures, Uniform, Variety, words
 from gvz.scenarios.find_the_key import ROOM_SPOTS, draw_rooms_of_spots
 from gvz.scenarios.health_gathering import COLUMNS
-from gvz.scenarios.parts import ACS_NEAR, SHORT_AGENT, rendered, retextured, starts_at, things_at
+from gvz.scenarios.parts import ACS_NEAR, SHORT_AGENT, definition, rendered, retextured, starts_at, things_at
 from gvz.scenarios.rewards import Fell, Pace, Reward, Rose, death
 from gvz.scenarios.seek_and_kill import drain_acid
 
@@ -171,24 +171,9 @@ script 3 (int tid)
 
 def _portal(name: str, sprites: str) -> dict[str, str]:
     """A DECORATE class: light above a place, which the agent walks into."""
-    definition = f"""\
-ACTOR {name}
-{{
-  Radius 20
-  Height 56
-  Scale 3.0
-  RenderStyle Translucent
-  Alpha 0.7
-  +BLOCKEDBYSOLIDACTORS
-  States
-  {{
-  Spawn:
-    {sprites} 6 Bright
-    Loop
-  }}
-}}
-"""
-    return {name: definition}
+    look = "Scale 3.0", "RenderStyle Translucent", "Alpha 0.7"
+    spawn = f"{sprites} 6 Bright\n    Loop"
+    return {name: definition(name, "Radius 20", "Height 56", *look, "+BLOCKEDBYSOLIDACTORS", spawn=spawn)}
 
 
 def _guards(kind: str, distance: float, damage_factor: float) -> Content:

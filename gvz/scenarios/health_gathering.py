@@ -17,7 +17,7 @@ from dataclasses import replace
 
 from gvz.scenarios.base import Attribute, Content, Period, Scenario, Textures, Uniform, Variety, words
 from gvz.scenarios.layout import Layout, draw_rooms, furnished, vary
-from gvz.scenarios.parts import RESIZED, SHORT_AGENT, rendered, retextured, starts_at, things_at
+from gvz.scenarios.parts import RESIZED, SHORT_AGENT, definition, rendered, retextured, starts_at, things_at
 from gvz.scenarios.rewards import Pace, Reward, Rose, death, living
 
 WAD = "health_gathering.wad"
@@ -137,20 +137,8 @@ script 5 OPEN
 
 def _health(name: str, sprite: str, amount: int) -> dict[str, str]:
     """A DECORATE class that heals `amount`; an agent in full health takes it, too."""
-    definition = f"""\
-ACTOR {name} : Health
-{{
-  +INVENTORY.ALWAYSPICKUP
-  Inventory.Amount {amount}
-  Inventory.MaxAmount 100
-  States
-  {{
-  Spawn:
-    {sprite}
-  }}
-}}
-"""
-    return {name: definition}
+    properties = "+INVENTORY.ALWAYSPICKUP", f"Inventory.Amount {amount}", "Inventory.MaxAmount 100"
+    return {name: definition(f"{name} : Health", *properties, spawn=sprite)}
 
 
 def _poison(amount: int) -> dict[str, str]:
