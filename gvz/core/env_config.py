@@ -114,7 +114,7 @@ class EnvConfig:
 
     @property
     def channels(self) -> int:
-        return 3 if self.frames == "segmented" else 1 if self.grayscale or self.frames == "classes" else 3
+        return 1 if self.grayscale or self.frames == "classes" else 3
 
     @property
     def frame_shape(self) -> tuple[int, int, int]:

@@ -2,6 +2,8 @@
 
 import dataclasses
 import importlib.util
+import json
+import os
 import stat
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -128,19 +130,11 @@ def _words(value: Any) -> tuple[str, ...]:
 
 def config_to_dict(config: RunConfig) -> dict[str, Any]:
     """The configuration with its derived values, as plain JSON types."""
-
-    def plain(value: Any) -> Any:
-        if dataclasses.is_dataclass(value):
-            return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-        if isinstance(value, tuple):
-            return [plain(v) for v in value]
-        return str(value) if isinstance(value, Path) else value
-
     if config.group.num_processes > 1:  # who reads it may be elsewhere, without Slurm's variables
         config = dataclasses.replace(config, group=dataclasses.replace(config.group, process_id=config.group.own_id))
     return {
         "schema": CONFIG_SCHEMA,
-        "config": plain(config),
+        "config": json.loads(json.dumps(dataclasses.asdict(config), default=os.fspath)),  # a tuple becomes a list
         "resolved": {
             "tasks": list(config.table.ids),
             "num_actors": config.num_actors // max(1, config.cluster.hosts),
