@@ -18,7 +18,7 @@ from gvz.core.errors import ConfigError
 if TYPE_CHECKING:
     from gvz.experiments.costs import Cost
     from gvz.experiments.jobs import Job
-    from gvz.experiments.places import Slot
+    from gvz.experiments.places import Places, Slot
     from gvz.experiments.plan import Plan
 
 DEFAULT_RESULTS = Path("runs/experiments")
@@ -153,31 +153,23 @@ class RunCommand:
     def run(self) -> int:
         """0 all done, 1 some failed, 130, 143 or 129 stopped."""
         from gvz.experiments.places import Machine
-        from gvz.experiments.plan import parse_shard, write_plan
-        from gvz.experiments.schedule import run_jobs
+        from gvz.experiments.plan import parse_shard
 
         plan = self.ask.plan()
-        index, count = parse_shard(self.ask.shard)
+        shard = parse_shard(self.ask.shard)
         _check_flags(plan)
         if self.cluster is None:
             if self.job_cores is not None or self.job_gpus is not None:
                 raise ConfigError(
                     "--job-cores and --job-gpus are for a cluster (--cluster); here --jobs divides the cores"
                 )
-            slots = self.ask.slots()
-            write_plan(self.ask.results, plan)
-            jobs = _jobs(plan, self.ask.results, index, count)
-            _warn_of_other_settings(jobs)
-            return run_jobs(jobs, Machine(slots))
+            return _run(plan, self.ask.results, shard, Machine(self.ask.slots()))
         from gvz.cluster.ray_jobs import open_places
 
         results = self.ask.results.resolve()  # every node has working directories of its own
         share = (2 if self.job_cores is None else self.job_cores, self.job_gpus, self.ask.jobs)
         with open_places(self.cluster, results, *share, public=self.cluster_public) as places:
-            write_plan(results, plan)
-            jobs = _jobs(plan, results, index, count)
-            _warn_of_other_settings(jobs)
-            return run_jobs(jobs, places)
+            return _run(plan, results, shard, places)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,6 +227,17 @@ class Experiment:
 
 
 COMMAND = Experiment
+
+
+def _run(plan: "Plan", results: Path, shard: tuple[int, int], places: "Places") -> int:
+    """Notes the plan and runs the jobs of a shard; returns the exit code."""
+    from gvz.experiments.plan import write_plan
+    from gvz.experiments.schedule import run_jobs
+
+    write_plan(results, plan)
+    jobs = _jobs(plan, results, *shard)
+    _warn_of_other_settings(jobs)
+    return run_jobs(jobs, places)
 
 
 def _warn_of_other_settings(jobs: "Sequence[Job]") -> None:
