@@ -129,7 +129,6 @@ class ExportedPolicy:
         self.num_calls = 0
 
     def set_params(self, params: np.ndarray, header: ParamsHeader) -> None:
-        """Acts by `params` float32[P] from now on, which nobody may change any more."""
         self.params_version = header.version
         leaves = np.split(params, self._ends[:-1])
         leaves = [leaf.reshape(shape) for leaf, shape in zip(leaves, self._shapes, strict=True)]
@@ -137,7 +136,6 @@ class ExportedPolicy:
         self._epsilon = self._jax.device_put(np.float32(header.epsilon), self._cpu)
 
     def act(self, obs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """The arrays of an `ObservationBatch` -> (action int32[B], extras float32[B, E])."""
         num_calls = np.uint32(self.num_calls % 2**32)
         action, extras = self._act(self._acting_params(), dict(obs), self._seed_key, num_calls, self._epsilon)
         self.num_calls += 1

@@ -142,7 +142,6 @@ class RemoteProcess:
             self._actor.stop.remote()
 
     def kill(self) -> None:
-        """Ends the command and all it started at once."""
         import ray
 
         if self._code is None:
@@ -204,7 +203,6 @@ class ClusterPlaces:
         return process
 
     def end(self, process: Process) -> None:
-        """Its share is free again."""
         self._used = [used for used in self._used if used != process]
 
     def _capacity(self, step: str | None) -> int:

@@ -58,11 +58,9 @@ class Machine:
         self._used: dict[Process, Slot] = {}
 
     def room(self, step: str | None = None) -> bool:
-        """Whether a slot is free."""
         return bool(self._free)
 
     def start(self, log: Path, command: Command) -> Process | None:
-        """Starts a command in a free slot; None if another process runs the job of this log."""
         slot = self._free[0]
         process = LocalProcess.start(log, command.arguments, slot.cores, {**os.environ, **slot.environment})
         if process is not None:
@@ -70,7 +68,6 @@ class Machine:
         return process
 
     def end(self, process: Process) -> None:
-        """Its slot is free again."""
         self._free.append(self._used.pop(process))
 
 

@@ -102,7 +102,6 @@ class LocalProcess:
         return cls(log, process)
 
     def poll(self) -> int | None:
-        """Exit code of the command, as a shell says it; None while it runs."""
         code = self._process.poll()
         if code is not None and self._code is None:
             self._code = 128 - code if code < 0 else code
@@ -111,12 +110,10 @@ class LocalProcess:
         return self._code
 
     def stop(self) -> None:
-        """Asks the command to save what it has and to end."""
         if self.poll() is None:
             self._process.send_signal(signal.SIGINT)
 
     def kill(self) -> None:
-        """Ends the command and all it started at once."""
         if self.poll() is None:
             os.killpg(self._process.pid, signal.SIGKILL)
             janitor.reap_killed(self._process, self._log.name)
