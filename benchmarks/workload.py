@@ -74,9 +74,9 @@ def run_config(budget: Budget) -> "RunConfig":
     return dataclasses.replace(four_task_config(budget), training_set=1)
 
 
-def random_players(config: "PoolConfig", **changes: Any) -> "PoolConfig":
+def random_players(config: "PoolConfig") -> "PoolConfig":
     """The same pool without a network: uniformly random actions."""
-    return msgspec.structs.replace(config, policy=b"", num_params=0, layout_hash=0, **changes)
+    return msgspec.structs.replace(config, policy=b"", num_params=0, layout_hash=0)
 
 
 @contextlib.contextmanager
@@ -273,11 +273,7 @@ class Learner:
         from learner import replay
         from learner.agents.base import OffPolicyAgent
 
-        agent, spec, batch_size = (
-            direct(self.sizes.agent),
-            self.sizes.replay_spec,
-            self.sizes.batch_size,
-        )
+        agent, spec, batch_size = direct(self.sizes.agent), self.sizes.replay_spec, self.sizes.batch_size
         batch, _ = jax.eval_shape(
             lambda s, key: replay.sample(spec, s, key, batch_size, 0.5), self.replay, jax.random.key(0)
         )

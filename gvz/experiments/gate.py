@@ -17,4 +17,5 @@ Gate = partial(
     table_checkpoints=1,
     columns="config",
 )
-"""An experiment of short runs with equal processor time, scored on the gate tasks and those of training."""
+"""An experiment of short runs with equal processor time, scored on the gate tasks and those of training: by default the
+eight."""

@@ -210,13 +210,7 @@ def _neighbours(cell: tuple[int, int]) -> list[tuple[int, int]]:
     return [(x + 1, y), (x, y + 1), (x - 1, y), (x, y - 1)]
 
 
-def _corridor(
-    rng: random.Random,
-    one: Box,
-    other: Box,
-    vertical: bool,
-    widths: tuple[int, int],
-) -> list[Box]:
+def _corridor(rng: random.Random, one: Box, other: Box, vertical: bool, widths: tuple[int, int]) -> list[Box]:
     """A straight or bent way between neighbours in a row, or with `vertical` in a column."""
     if vertical:
         turned = _corridor(rng, _turned(one), _turned(other), False, widths)

@@ -108,14 +108,7 @@ def read_maps(lumps: Sequence[Lump]) -> dict[str, dict[str, bytes]]:
     return maps
 
 
-def write_map_wad(
-    *,
-    textmap: str,
-    behavior: bytes,
-    scripts: str,
-    decorate: str = "",
-    textures: str = "",
-) -> bytes:
+def write_map_wad(*, textmap: str, behavior: bytes, scripts: str, decorate: str = "", textures: str = "") -> bytes:
     """Writes a WAD with one map, MAP_NAME; the same arguments give the same bytes.
 
     There are no nodes (ZNODES): the engine builds them in a few milliseconds, and outdated nodes would be wrong.
