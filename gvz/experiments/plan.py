@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -95,21 +95,20 @@ class Plan:
 
     def evaluations(self) -> dict[str, Evaluation]:
         """Run id -> the evaluation episodes of all its experiments."""
-        found: dict[str, Evaluation] = {}
-        for experiment in self.experiments():
-            for run in experiment.runs():
-                before = found.get(run.id, Evaluation())
-                found[run.id] = before.joined(experiment.evaluation_tasks(run), experiment.episodes)
-        return found
+        return self._evaluations(lambda _, run: (run.id,))
 
     def players(self) -> dict[SimplePlayerName, Evaluation]:
         """Simple player -> the episodes that it plays: those of all runs of its experiments."""
-        found: dict[SimplePlayerName, Evaluation] = {}
+        return self._evaluations(lambda experiment, _: experiment.players)
+
+    def _evaluations(self, who: Callable[[Experiment, TrainingRun], tuple[str, ...]]) -> dict[str, Evaluation]:
+        """Who plays the episodes of a run in an experiment -> all its episodes."""
+        found: dict[str, Evaluation] = {}
         for experiment in self.experiments():
             for run in experiment.runs():
-                for player in experiment.players:
-                    before = found.get(player, Evaluation())
-                    found[player] = before.joined(experiment.evaluation_tasks(run), experiment.episodes)
+                for name in who(experiment, run):
+                    before = found.get(name, Evaluation())
+                    found[name] = before.joined(experiment.evaluation_tasks(run), experiment.episodes)
         return found
 
     def joined(self, other: "Plan") -> "Plan":
