@@ -31,7 +31,6 @@ class OffPolicyParts(Learning):
     """gradient steps in one jitted call"""
 
     def array_shapes(self) -> dict[str, Any]:
-        """Shapes and dtypes of `OffPolicyLearner.arrays()`."""
         return {
             "learner": jax.eval_shape(self.init, jax.random.key(0)),
             "replay": jax.eval_shape(lambda: replay.init(self.replay_spec)),

@@ -35,7 +35,6 @@ class OnPolicyParts:
     spec: RolloutSpec
 
     def array_shapes(self) -> dict[str, Any]:
-        """Shapes and dtypes of `OnPolicyLearner.arrays()`."""
         return {
             "learner": jax.eval_shape(self.init, jax.random.key(0)),
             "rollouts": rollouts.array_shapes(self.spec),
