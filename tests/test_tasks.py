@@ -5,6 +5,7 @@ import doctest
 import functools
 import pickle
 from pathlib import Path
+from typing import Any
 
 import cloudpickle
 import gymnasium
@@ -16,7 +17,7 @@ from hypothesis import strategies as st
 import gvz
 import gvz.scenarios
 from gvz.commands.tasks import task_row
-from gvz.core.errors import TaskError
+from gvz.core.errors import ConfigError, TaskError
 from gvz.scenarios.base import Attribute, Content, Task, Textures
 from gvz.scenarios.compiler import task_content
 from gvz.scenarios.map_set import PARTS, MapSet
@@ -227,6 +228,8 @@ def test_all_of_complete_spelled_out_is_complete():
         ("defend_the_center/gore+varied-10", "'varied-10' is a task and no attribute"),
         ("seek_and_kill/varied-0", "got 'varied-0', want 'varied-<number of maps>', as 'varied-10'"),
         ("seek_and_kill/varied-1001", "varied-1001: want 1 to 1000 maps"),
+        ("seek_and_kill/varied=10", "got 'varied=10', want 'varied-<number of maps>', as 'varied-10'"),
+        ("seek_and_kill/procedural=0.5", "got 'procedural=0.5', want 'procedural-<split>-<number of maps>'"),
         ("seek_and_kill/varied-ten", "got 'varied-ten', want 'varied-<number of maps>'"),
         ("seek_and_kill/procedural-", "got 'procedural-', want 'procedural-<split>-<number of maps>'"),
         (
@@ -239,7 +242,10 @@ def test_all_of_complete_spelled_out_is_complete():
         ("seek_and_kill/procedural+layout=1.5", r"got layout=1.5, want a strength from 0 .* to 1"),
         ("seek_and_kill/procedural+layout=0.1234", "got layout=0.1234, want .* with at most three decimals"),
         ("seek_and_kill/procedural+layout=nan", "got 'layout=nan' in .*strengths from 0 to 1"),
-        ("seek_and_kill/procedural+gore", "got 'gore' in 'procedural[+]gore', want each at most once: '<part>="),
+        (
+            "seek_and_kill/procedural+gore",
+            "got 'gore' in 'procedural[+]gore', want each at most once: '<part>=.*attributes go with 'varied' alone",
+        ),
         ("seek_and_kill/procedural+layout=1+layout=0", "got 'layout=0' in .* at most once"),
         ("seek_and_kill/procedural+light=1", r"unknown part 'light' \(did you mean 'lights'\?\); want one of layout, "),
     ],
@@ -247,6 +253,20 @@ def test_all_of_complete_spelled_out_is_complete():
 def test_what_is_no_task_is_refused_with_what_is_possible(text: str, message: str):
     with pytest.raises(TaskError, match=message):
         parse_task(text)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"num_maps": 2.5}, "procedural-train.num_maps: got 2.5, want int"),
+        ({"num_maps": "10"}, "num_maps: got '10', want int"),
+        ({"strengths": (("layout", "0.5"),)}, "strengths, .*: got '0.5', want float"),
+        ({"strengths": {"layout": 0.5}}, "strengths: got {'layout': 0.5}, want a list"),
+    ],
+)
+def test_a_map_set_whose_fields_have_other_types_is_refused(fields: dict[str, Any], message: str):
+    with pytest.raises(ConfigError, match=message):
+        MapSet("train", **fields)
 
 
 def test_unknown_selections_of_named_tasks_are_refused():

@@ -9,6 +9,7 @@ from gvz.core.env_config import Profile, check_types
 from gvz.core.errors import TaskError, nearest
 from gvz.scenarios.map_set import PROCEDURAL, VARIED
 from gvz.scenarios.rewards import Fell, Gained, Rose
+from gvz.wad.textures import NO_TEXTURE
 
 if TYPE_CHECKING:
     from gvz.scenarios.base import Content, Scenario, Task, Value
@@ -30,14 +31,15 @@ def check_scenario(scenario: "Scenario") -> None:
         TaskError: a name of an attribute that ids cannot have or that another attribute has; no group, or one that no
             attribute in `complete` has and whose name is nearly that of another group; an attribute in `complete` or an
             exception in `levdoom_tasks` under another name than its own; a set without tasks, or with one that has no
-            name; no base map or textures; a reward of a variable that is not read; a pace that needs an unknown reward
-            or lasts no tic; no button; no time-out or bound of a profile; a combined button that the scenario lacks.
+            name; no base map or textures, or "-" for one of them; a reward of a variable that is not read; a pace that
+            needs an unknown reward or lasts no tic; no button; no time-out or bound of a profile; a combined button
+            that the scenario lacks.
     """
     from gvz.scenarios.base import Split  # which imports this module
 
     check_types(scenario, f"scenario {scenario.id}", convert=False)
     for content in (scenario.content, scenario.levdoom, *scenario.levdoom_tasks.values()):
-        check_types(content, f"scenario {scenario.id}, content", convert=False)
+        _check_content(content, f"scenario {scenario.id}, content")
     if not _NAME.fullmatch(scenario.id):
         raise TaskError(f"scenario: got the id {scenario.id!r}, want lower-case letters, digits and '_'")
     if scenario.content.base_wad is None or scenario.content.textures is None:
@@ -63,13 +65,24 @@ def check_scenario(scenario: "Scenario") -> None:
     _check_score(scenario)
 
 
+def _check_content(content: "Content", where: str) -> None:
+    check_types(content, where, convert=False)
+    if content.textures is not None:
+        check_types(content.textures, f"{where}.textures", convert=False)
+        if NO_TEXTURE in dataclasses.astuple(content.textures):
+            raise TaskError(
+                f"{where}: got {content.textures}, want three textures; where there is none, the engine shows what it "
+                "drew before, so the frames of an episode would depend on earlier ones"
+            )
+
+
 def _check_attributes(scenario: "Scenario") -> None:
     owners: dict[str, str] = {}
     for attribute in scenario.attributes:
         where = f"scenario {scenario.id}, attribute {attribute.name!r}"
         check_types(attribute, where, convert=False)
         for content in (attribute.content, attribute.levdoom):
-            check_types(content, f"{where}, content", convert=False)
+            _check_content(content, f"{where}, content")
         if not attribute.groups:
             raise TaskError(f"{where}: got no group, want one or more")
         for name in (attribute.name, *attribute.aliases):

@@ -7,6 +7,7 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
+from gvz.core.env_config import check_types
 from gvz.core.errors import TaskError, nearest
 
 VARIED, PROCEDURAL = "varied", "procedural"
@@ -33,7 +34,7 @@ class MapSet:
         strengths: (part, strength from 0 to 1) pairs; a part that is left out has strength 1. `varied` has its own.
 
     Raises:
-        TaskError: a number, part or strength out of range.
+        TaskError: a number, part or strength out of range. ConfigError: a field of another type.
     """
 
     split: MapSplit
@@ -43,6 +44,7 @@ class MapSet:
     def __post_init__(self) -> None:
         if self.split not in NUMBERS:
             raise _unknown_split(self.split)
+        check_types(self, self._stem)
         most = len(NUMBERS[self.split])
         if not 0 <= self.num_maps <= most:
             raise TaskError(f"{self._stem}-{self.num_maps}: want 1 to {most} maps")
@@ -92,7 +94,7 @@ def _unknown_split(name: str) -> TaskError:
 
 def names_map_set(name: str) -> bool:
     """Whether a task's name, or a word of it between plus signs, is that of a set of drawn maps."""
-    return name.partition("+")[0].partition("-")[0] in (VARIED, PROCEDURAL)
+    return re.split("[-+=]", name, maxsplit=1)[0] in (VARIED, PROCEDURAL)
 
 
 def parse_map_set(name: str) -> MapSet:
@@ -107,13 +109,13 @@ def parse_map_set(name: str) -> MapSet:
         TaskError: another form, or something out of range; the message says what is possible.
     """
     stem, *settings = name.split("+")
-    kind, *words = stem.split("-")
+    kind, *words = re.split("[-=]", stem)
     split = VARIED if kind == VARIED else "train"
     if kind == PROCEDURAL and words and words[0]:
         split = words.pop(0)
     if (split == VARIED) != (kind == VARIED):
         raise _unknown_split(split)
-    if len(words) > 1 or not all(re.fullmatch("[1-9][0-9]{0,9}", word) for word in words):
+    if "=" in stem or len(words) > 1 or not all(re.fullmatch("[1-9][0-9]{0,9}", word) for word in words):
         example = "'varied-10'" if kind == VARIED else "'procedural-train-100'"
         raise TaskError(
             f"got {name!r}, want '{kind}{'-<split>' * (kind == PROCEDURAL)}-<number of maps>', as {example}"
@@ -124,7 +126,7 @@ def parse_map_set(name: str) -> MapSet:
         if not re.fullmatch(r"[0-9]+(\.[0-9]+)?", value) or part in strengths:
             raise TaskError(
                 f"got {setting!r} in {name!r}, want each at most once: '<part>=<strength>', parts {', '.join(PARTS)}, "
-                "strengths from 0 to 1, as 'layout=0.5'"
+                f"strengths from 0 to 1, as 'layout=0.5'; attributes go with {VARIED!r} alone"
             )
         strengths[part] = float(value)
     return MapSet(split, int(words[0]) if words else 0, tuple(strengths.items()))  # pyright: ignore[reportArgumentType]

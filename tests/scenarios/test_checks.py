@@ -37,6 +37,10 @@ ICE = Attribute(name="ice", groups=("textures",), content=Content(textures=Textu
             r"content\.things\['defend_the_center\.wad'\]: got \[Thing\(.*\)\], want a tuple$",
         ),
         ({"content": Content(parameters={"places": [1.0, 2.0]})}, r"parameters\['places'\]: got \[1\.0, 2\.0\], want"),
+        (
+            {"content": Content(textures=Textures("FLAT14", "-", "FLAT14"))},
+            r"got Textures\(.*'-'.*, want three textures",
+        ),
         ({"groups": ()}, r"got no group"),
         (
             {"groups": ("texture",)},
