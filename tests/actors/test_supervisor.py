@@ -10,6 +10,8 @@ from actors import supervisor
 from actors.config import ActorsConfig
 from actors.pool import lanes_to_begin_with
 from actors.supervisor import SupervisedActor
+from gvz.core.errors import WaitTimeoutError
+from gvz.transport import child
 from gvz.transport.messages import EpisodeStats, Fault, Message, Ready
 from gvz.transport.ring import WriterState, WriterStatus
 
@@ -127,6 +129,26 @@ def test_an_episode_of_no_task_of_the_run_is_a_fault(actor: SupervisedActor):
     actor.process.said.append(stats)
     (fault,) = actor.watch(0.0, 0.0)
     assert "got an episode of lane 0, task 2, want one of lanes [0, 1] and a task below 2" in fault.message
+
+
+def test_a_process_that_hangs_in_the_kernel_leaves_no_other_running():
+    class Stopped(Process):
+        closed, ended = True, False
+
+        def wait(self, timeout_s: float) -> bool:
+            return timeout_s > 0
+
+        def end(self, *, grace_s: float) -> None:
+            self.ended = True
+            if self.exit is not None:
+                raise WaitTimeoutError(self.exit)
+
+    first, hanging, last = (Stopped() for _ in range(3))
+    hanging.exit = "it hangs in the kernel"
+    with pytest.raises(WaitTimeoutError, match="it hangs in the kernel"):
+        child.end_all([first, hanging, last], 0.0)
+    assert first.ended
+    assert last.ended
 
 
 def test_an_actor_that_ends_a_long_reset_while_it_is_looked_at_is_not_stuck(

@@ -83,6 +83,21 @@ def test_sending_to_a_closed_peer_is_noticed_not_raised(pair: tuple[Channel, Cha
     assert a.closed
 
 
+@pytest.mark.parametrize("read", [True, False])
+def test_what_a_peer_said_before_its_end_is_there_after_a_message_to_it(pair: tuple[Channel, Channel], read: bool):
+    a, b = pair
+    a.send(Stop())
+    if read:
+        b.receive()
+    said = [Ready(actor=0, pid=5), fault("x" * 100_000)]
+    for message in said:
+        b.send(message)
+    b.close()
+    a.send(Stop())
+    assert a.closed
+    assert a.receive() == said
+
+
 def test_an_absurd_length_is_refused():
     left, right = socket.socketpair()
     channel = Channel(right, peer="A")
