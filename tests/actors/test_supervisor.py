@@ -62,6 +62,22 @@ def end(actor: SupervisedActor, now: float) -> Fault:
     return fault
 
 
+def test_what_an_actor_says_just_before_its_end_is_heard(actor: SupervisedActor):
+    get_ready(actor, 0.0)
+    process, hear = actor.process, actor.process.receive
+
+    def hear_and_end() -> list[Message]:
+        heard = hear()
+        if process.exit is None:
+            process.said.append(Fault(actor=0, lane=None, kind="exception", message="its last words"))
+            process.exit = "exited with code 1"
+        return heard
+
+    process.receive = hear_and_end
+    messages = [message for now in (1.0, 2.0) for message in actor.watch(now, 0.0)]
+    assert [message.kind for message in messages if isinstance(message, Fault)] == ["exception", "died"]
+
+
 def test_an_end_counts_only_within_the_window(actor: SupervisedActor):
     for now in (0.0, 150.0, 300.0):
         get_ready(actor, now)
