@@ -109,9 +109,12 @@ class ActorLoop:
         self._ring.beat(WriterState.ACTING)
         actions, extras = self._policy.act(self._obs.arrays)
         self._write(actions, extras)
+        for game in self.games:  # first: whatever ends this process while it plays on, their records are published
+            if game.terminated or game.truncated:
+                self._report(game)
         for game, action in zip(self.games, actions.tolist(), strict=True):
             if game.terminated or game.truncated:
-                self._finish(game)
+                self._begin_next(game)
             else:
                 self._ring.beat(WriterState.ACTING)
                 game.params_version = self._policy.params_version
@@ -180,8 +183,8 @@ class ActorLoop:
             game.reward_components[name] = game.reward_components.get(name, 0.0) + float(value)
         self._obs.push(game.index, action, frame, game.info.get("variables", {}))
 
-    def _finish(self, game: Game) -> None:
-        """Reports the episode, whose last record is written, and starts the next."""
+    def _report(self, game: Game) -> None:
+        """Says what became of the episode, whose last record is written."""
         crashed = bool(game.info.get("engine_crash", False))
         if crashed:
             self._report_crash(game, f"at decision {len(game.actions)}")
@@ -202,6 +205,9 @@ class ActorLoop:
                 cut=crashed,
             )
         )
+
+    def _begin_next(self, game: Game) -> None:
+        """Starts the episode after the one that has ended."""
         game.episode += 1
         if game.next_task != game.task:
             self._ring.beat(WriterState.RESETTING)  # a map may be compiled, which takes its time

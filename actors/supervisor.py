@@ -68,7 +68,6 @@ class SupervisedActor:
         """Starts a process; does not wait for it."""
         self.process = start_actor(self._spec, self.ring, self._shared)
         self._ready_at, self._kill_at, self._silent_s = None, None, 0.0
-        self._heartbeat_ns = self.ring.writer_status().heartbeat_ns
 
     def free(self) -> None:
         """Releases the shared memory; the process has ended. Can be repeated."""

@@ -5,7 +5,8 @@
 
 Writing: snapshot to host memory now, write into a hidden sibling in a thread, hash every file into the manifest, fsync
 every file and directory, rename, fsync the parent. So a name without a dot stands for a whole checkpoint also after a
-power cut. Hashing and fsync release the interpreter's lock: training goes on meanwhile.
+power cut, and the run's records, of which it has the lengths, are on the disk before it. Hashing and fsync release the
+interpreter's lock: training goes on meanwhile.
 
 A directory without a manifest that agrees with its files is damaged and named, never used; nothing in a checkpoint is
 unpickled, so one from a stranger can be read.
@@ -272,7 +273,8 @@ class Checkpointer:
             run_path: the run directory.
             keep: whole checkpoints to keep, at least 1.
         """
-        self._checkpoints, self._policies, self._keep = run_path / "checkpoints", run_path / "policies", keep
+        self._run_path, self._keep = run_path, keep
+        self._checkpoints, self._policies = run_path / "checkpoints", run_path / "policies"
         self._thread: threading.Thread | None = None
         self._outcome: str | None = None
         self._ends, self._abandoned = threading.Lock(), False
@@ -309,6 +311,8 @@ class Checkpointer:
         def work() -> None:
             try:
                 write(self._policies / str(num_updates), copies.pop(0), {"num_updates": num_updates}, self._finishing)
+                for records in self._run_path.glob("*.jsonl"):  # on the disk before the lengths in `host`
+                    fsync(records)
                 write(self._checkpoints / str(num_updates), copies.pop(0), host, self._finishing)
                 # what is newer was damaged when the run went on from an older one: it takes no place among the kept
                 steps = [step for step in saved_steps(self._checkpoints) if step <= num_updates]
@@ -317,7 +321,7 @@ class Checkpointer:
                         break
                     shutil.rmtree(self._checkpoints / str(step), ignore_errors=True)
                 self._outcome = ""
-            except CheckpointError as error:
+            except (CheckpointError, OSError) as error:
                 self._outcome = None if self._abandoned else str(error)
             copies.clear()
             release_freed_memory()

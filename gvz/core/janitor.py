@@ -99,7 +99,11 @@ def make_directory(place: Path | None = None) -> Path:
     """
     directory = (place or Path(_temporary_place())) / (PREFIX + secrets.token_hex(8))
     record(directory)
-    directory.mkdir(mode=0o700)
+    try:
+        directory.mkdir(mode=0o700)
+    except BaseException:
+        forget(directory)
+        raise
     return directory
 
 

@@ -18,6 +18,7 @@ from typing import IO, Any
 
 from gvz.core.durable import fsync
 from gvz.core.errors import GvzError, ResourceError
+from gvz.core.stop import uninterrupted
 
 SCHEMA = 1
 """Stands in every row as `schema`; raised by one when a row's meaning changes."""
@@ -92,7 +93,8 @@ class Writer:
 
     def _write(self) -> None:
         while self._waiting:  # the disk may take a part of a row
-            del self._waiting[: self._opened().write(self._waiting)]
+            with uninterrupted():  # else a Ctrl-C in between would have `close` write it again
+                del self._waiting[: self._opened().write(self._waiting)]
 
     def _unwritten(self, error: OSError) -> GvzError:
         return GvzError(

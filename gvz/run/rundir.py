@@ -204,7 +204,6 @@ class RunDir:
             except GvzError as error:
                 lost.append(error)
         self._writers.clear()
-        shutil.rmtree(self.work / "engines", ignore_errors=True)
         if not self._lock.closed:
             os.umask(self._umask)
         self._lock.close()

@@ -24,6 +24,7 @@ from tensorboardX.record_writer import masked_crc32c
 from tensorboardX.summary import scalar
 
 from gvz.core.errors import ConfigError
+from gvz.core.files import written_whole
 from gvz.run.config import LogConfig
 from gvz.run.progress import TaskStatus
 from gvz.run.rundir import RunDir, disk_checked
@@ -194,7 +195,8 @@ def start_wandb(run: RunDir) -> Any:  # wandb.Run, a type only where the extra i
     saved = json.loads((run.path / "config.json").read_text())
     id_file = run.path / "wandb_id"  # a resumed run is the same run there, one begun with --fresh another
     if not id_file.exists():
-        id_file.write_text(uuid.uuid4().hex[:12])
+        with written_whole(id_file) as writing:
+            writing.write_text(uuid.uuid4().hex[:12])
     # versions that cannot bound the last upload wait for it
     can_bound = "finish_timeout" in wandb.Settings.model_fields
     bounded: dict[str, Any] = {"finish_timeout": UPLOAD_TIMEOUT_S} if can_bound else {}

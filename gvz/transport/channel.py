@@ -30,7 +30,7 @@ class Channel:
         return self._socket.fileno()
 
     def send(self, message: Message) -> None:
-        """Sends a complete message. If the peer has closed its end, sets `closed` instead.
+        """Sends a complete message. If the peer has closed its end, sets `closed` instead; what it said before is kept.
 
         Raises:
             WaitTimeoutError: the peer does not read.
@@ -43,6 +43,8 @@ class Channel:
                 f"channel: waited {self._timeout_s:.0f} s for {self._peer} to read a message of {len(data)} bytes"
             ) from error
         except (BrokenPipeError, ConnectionResetError):
+            while not self.closed and self._poll.poll(0):
+                self._fill()
             self.closed = True
 
     def receive(self) -> list[Message]:

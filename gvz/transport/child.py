@@ -9,6 +9,7 @@ four engines each made 820 decisions/s in sessions of their own and 2,240 in one
 rounds beside other work of a load of 10; 2026-11-22, 2 cores).
 """
 
+import contextlib
 import faulthandler
 import os
 import signal
@@ -44,7 +45,11 @@ def one_core() -> dict[str, str]:
 
 
 def end_all(processes: "Sequence[ChildProcess]", grace_s: float) -> None:
-    """Asks them to stop, and ends those that have not within `grace_s`, also when a second Ctrl-C ends the wait."""
+    """Asks them to stop, and ends those that have not within `grace_s`, also when a second Ctrl-C ends the wait.
+
+    Raises:
+        WaitTimeoutError: one is still there, or did not read; the others have ended.
+    """
     try:
         for process in processes:
             if not process.channel.closed:
@@ -54,8 +59,9 @@ def end_all(processes: "Sequence[ChildProcess]", grace_s: float) -> None:
             process.wait(max(0.0, deadline - time.monotonic()))
     finally:
         deadline = time.monotonic() + grace_s
-        for process in processes:
-            process.end(grace_s=max(0.0, deadline - time.monotonic()))
+        with contextlib.ExitStack() as all_of_them:
+            for process in processes:
+                all_of_them.callback(lambda p=process: p.end(grace_s=max(0.0, deadline - time.monotonic())))
 
 
 class ChildProcess:

@@ -302,6 +302,18 @@ def test_a_crashed_engine_cuts_its_episode_and_the_lane_goes_on(tmp_path: Path):
     assert not any(cut for lane in (0, 2) for _, _, cut, _ in stats[lane])
 
 
+def test_an_episode_is_told_of_before_another_game_plays_on_which_may_end_the_process(tmp_path: Path):
+    def reset(**_: Any) -> None:
+        raise RuntimeError("no engine today")
+
+    with InlinePool(inline_config(tmp_path)) as pool:
+        pool._loop.games[0].env.reset = reset
+        with pytest.raises(RuntimeError, match="no engine today"):
+            pool.drain(3 * (LENGTH + 2))
+        ended = [int(lane) for lane in pool._ring.read(100).steps[-3:]["lane"]]
+        assert [m.lane for m in pool.poll() if isinstance(m, EpisodeStats)] == ended == [0, 1, 2]
+
+
 def test_what_is_published_is_copied_and_recorded(tmp_path: Path):
     pool_config = inline_config(tmp_path, policy=hashing_policy(3), num_params=3)
     with InlinePool(pool_config) as pool, InlinePool(pool_config) as other:

@@ -10,6 +10,8 @@ from actors import supervisor
 from actors.config import ActorsConfig
 from actors.pool import lanes_to_begin_with
 from actors.supervisor import SupervisedActor
+from gvz.core.errors import WaitTimeoutError
+from gvz.transport import child
 from gvz.transport.messages import EpisodeStats, Fault, Message, Ready
 from gvz.transport.ring import WriterState, WriterStatus
 
@@ -58,6 +60,22 @@ def end(actor: SupervisedActor, now: float) -> Fault:
     actor.process.exit = "exited with code 1"
     (fault,) = actor.watch(now, 0.0)
     return fault
+
+
+def test_what_an_actor_says_just_before_its_end_is_heard(actor: SupervisedActor):
+    get_ready(actor, 0.0)
+    process, hear = actor.process, actor.process.receive
+
+    def hear_and_end() -> list[Message]:
+        heard = hear()
+        if process.exit is None:
+            process.said.append(Fault(actor=0, lane=None, kind="exception", message="its last words"))
+            process.exit = "exited with code 1"
+        return heard
+
+    process.receive = hear_and_end
+    messages = [message for now in (1.0, 2.0) for message in actor.watch(now, 0.0)]
+    assert [message.kind for message in messages if isinstance(message, Fault)] == ["exception", "died"]
 
 
 def test_an_end_counts_only_within_the_window(actor: SupervisedActor):
@@ -127,6 +145,26 @@ def test_an_episode_of_no_task_of_the_run_is_a_fault(actor: SupervisedActor):
     actor.process.said.append(stats)
     (fault,) = actor.watch(0.0, 0.0)
     assert "got an episode of lane 0, task 2, want one of lanes [0, 1] and a task below 2" in fault.message
+
+
+def test_a_process_that_hangs_in_the_kernel_leaves_no_other_running():
+    class Stopped(Process):
+        closed, ended = True, False
+
+        def wait(self, timeout_s: float) -> bool:
+            return timeout_s > 0
+
+        def end(self, *, grace_s: float) -> None:
+            self.ended = True
+            if self.exit is not None:
+                raise WaitTimeoutError(self.exit)
+
+    first, hanging, last = (Stopped() for _ in range(3))
+    hanging.exit = "it hangs in the kernel"
+    with pytest.raises(WaitTimeoutError, match="it hangs in the kernel"):
+        child.end_all([first, hanging, last], 0.0)
+    assert first.ended
+    assert last.ended
 
 
 def test_an_actor_that_ends_a_long_reset_while_it_is_looked_at_is_not_stuck(

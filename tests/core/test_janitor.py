@@ -90,6 +90,12 @@ def test_a_temporary_directory_goes_with_its_block_or_with_the_next_start(regist
     assert list(registry.iterdir()) == []
 
 
+def test_a_directory_that_cannot_be_made_leaves_no_record(registry: Path, tmp_path: Path):
+    with pytest.raises(FileNotFoundError):
+        janitor.make_directory(tmp_path / "absent")
+    assert not [*registry.iterdir(), *(held for held in janitor._held if tmp_path in held.parents)]
+
+
 def test_a_record_whose_owner_was_killed_before_it_wrote_is_removed(registry: Path):
     (registry / "gvz-engine-x.json").touch()
     assert janitor.dead_instances() == []

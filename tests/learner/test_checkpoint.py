@@ -214,6 +214,7 @@ def test_every_file_is_on_the_disk_before_the_rename_and_the_rename_before_the_e
 
     monkeypatch.setattr(os, "fsync", recorded_fsync)
     monkeypatch.setattr(os, "rename", recorded_rename)
+    (tmp_path / "episodes.jsonl").touch()
     save(tmp_path, 7)
     for kind in ("policies", "checkpoints"):
         final = tmp_path / kind / "7"
@@ -228,6 +229,7 @@ def test_every_file_is_on_the_disk_before_the_rename_and_the_rename_before_the_e
         for path in everything[1:]:
             assert synced.index(path) < synced.index(path.parent), "what a directory names is there before the name is"
         assert done[renamed + 1] == ("fsync", str(tmp_path / kind))
+    assert ("fsync", str(tmp_path / "episodes.jsonl")) in done[:renamed], "the checkpoint vouches for its length"
     before = done.index(("fsync", str(tmp_path / "checkpoints")))
     assert ("fsync", str(tmp_path)) in done[:before], "the folders themselves have their names"
 

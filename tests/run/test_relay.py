@@ -18,6 +18,7 @@ def test_a_process_that_goes_in_the_middle_of_a_message_is_the_one_that_is_named
     the_relay = Relay(address, 2)
     with socket.create_connection(address) as other:
         other.sendall(relay.encode({"kind": "hello", "from": 1, "number": 0, "value": {}}))
+        assert other.recv(1000), "it has joined: a later process is told of it"
         first = link.Link(address, 0, 2, {})
         other.sendall(b'{"kind": "propose", "fr')
         other.shutdown(socket.SHUT_WR)

@@ -1,6 +1,7 @@
 """A run directory and the processes that use it one after another, or at once."""
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -8,6 +9,7 @@ from gvz.core import records
 from gvz.core.errors import ConfigError, ResumeError
 from gvz.launch import main
 from gvz.run import rundir
+from gvz.run.config_files import load_config
 from gvz.run.rundir import RunDir, refuse_other_contents
 
 
@@ -25,6 +27,19 @@ def test_a_directory_that_is_moved_before_it_is_locked_is_not_held(tmp_path, mon
     with pytest.raises(ResumeError, match="another running process uses it"):
         RunDir(path)
     RunDir(path).close()
+
+
+def test_after_a_power_cut_the_configuration_is_the_old_one_or_the_new_one(tmp_path, monkeypatch):
+    file, writing = tmp_path / "config.json", tmp_path / "config.json.tmp"
+    with RunDir(tmp_path) as run:
+        run.write_config(load_config("rainbow_quick"))
+        done: list[tuple[Path, bool, bool]] = []
+        monkeypatch.setattr(
+            rundir, "fsync", lambda path: done.append((path, writing.exists(), file.stat().st_ino != before))
+        )
+        before = file.stat().st_ino
+        run.write_config(load_config("rainbow_quick"))
+    assert done == [(writing, True, False), (tmp_path, False, True)], "its contents, then its name"
 
 
 def test_a_row_follows_no_half_row_of_a_process_that_was_killed_on_a_full_disk(tmp_path):

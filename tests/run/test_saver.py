@@ -39,6 +39,7 @@ def test_a_slow_run_is_saved_after_a_time_and_still_at_the_multiples(tmp_path, m
     monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
     saver, counts = started(tmp_path, 0)
     several: Any = SimpleNamespace(num_common_saved=0, may_save=lambda: True)
+    another_writes: Any = SimpleNamespace(num_common_saved=0, may_save=lambda: False)
     saved = []
     for at_s, num_updates, group in (
         (901, 0, ALONE),  # its warm-up
@@ -46,6 +47,7 @@ def test_a_slow_run_is_saved_after_a_time_and_still_at_the_multiples(tmp_path, m
         (903, 3, ALONE),
         (1000, 60, ALONE),
         (1804, 700, ALONE),
+        (1805, 1000, another_writes),
         (1805, 1001, ALONE),  # a multiple of the period in gradient steps
         (2704, 1500, ALONE),
         (2706, 1500, ALONE),

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -16,7 +17,7 @@ from gvz.run import machine
 from gvz.run.config import LogConfig
 from gvz.run.config_files import load_config
 from gvz.run.rundir import RunDir
-from gvz.run.telemetry import Telemetry
+from gvz.run.telemetry import Telemetry, start_wandb
 from gvz.task_table import task_table
 from gvz.transport.messages import EpisodeStats
 from tests.full_disk import full_disk
@@ -151,3 +152,22 @@ def test_wandb_that_is_not_installed_is_an_error_with_its_remedy(tmp_path, monke
     monkeypatch.setitem(sys.modules, "wandb", None)  # what `import` takes for "not to be found"
     with RunDir(tmp_path) as run, pytest.raises(ConfigError, match=r"log\.wandb: .*pip install 'gvizdoom\[wandb\]'"):
         telemetry(run)
+
+
+def test_a_run_whose_first_start_met_a_full_disk_has_one_id_with_wandb_ever_after(tmp_path, monkeypatch):
+    ids: list[str] = []
+    started = SimpleNamespace(define_metric=lambda *_, **__: None, finish=lambda: None)
+    fake = SimpleNamespace(
+        Settings=type("Settings", (SimpleNamespace,), {"model_fields": {}}),
+        init=lambda **given: ids.append(given["id"]) or started,
+        Error=RuntimeError,
+    )
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    with RunDir(tmp_path) as run:
+        run.write_config(load_config("rainbow_quick"))
+        with full_disk(0), pytest.raises(OSError, match="File too large"):
+            start_wandb(run)
+        for _ in range(2):
+            start_wandb(run)
+    assert len(ids[0]) == 12
+    assert ids == 2 * ids[:1]

@@ -100,6 +100,24 @@ def test_a_version_counts_when_it_is_whole(writer: BroadcastWriter):
     assert found == [(1, 2)], "the slot's ticket is even again"
 
 
+def test_a_publication_that_was_interrupted_does_not_hide_the_next_ones(
+    writer: BroadcastWriter, reader: BroadcastReader, monkeypatch: pytest.MonkeyPatch
+):
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(writer, "_fence", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        publish(writer, 1)
+    assert reader.read() is None
+    for version in range(1, 8):
+        ticket, seen = writer._words[(version - 1) % 3], []
+        monkeypatch.setattr(writer, "_fence", lambda ticket=ticket, seen=seen: seen.append(ticket[0] % 2))
+        publish(writer, version)
+        assert seen == [1, 1], "the ticket is odd while the slot is written"
+        assert read(reader)[0] == header(version)
+
+
 def test_what_was_read_is_the_readers_own(writer: BroadcastWriter, reader: BroadcastReader):
     publish(writer, 1)
     newest = reader.read()

@@ -90,6 +90,16 @@ def test_an_answer_to_a_dead_actor_is_none_to_its_successor(learner: RequestRead
     assert successor.answer().action.tolist() == [2, 2]
 
 
+def test_numbers_of_requests_go_round(learner: RequestReader):
+    actor = attach(learner)
+    actor._words[0] = actor._words[8] = 2**64 - 1
+    actor.ask()
+    assert learner.pending() == 0
+    assert not wait(actor, cancelled=True)
+    learner.answer(0, answer(3))
+    assert wait(actor)
+
+
 def test_waiting_has_an_end_and_a_heartbeat(learner: RequestReader):
     actor, beats = attach(learner), []
     actor.ask()

@@ -244,6 +244,17 @@ def test_records_count_when_they_are_whole_and_a_state_when_its_heartbeat_has_co
     assert found == [(0, [0, 1]), (1, [0, 1]), (2, [0, 1])], "published, heartbeat, state"
 
 
+def test_a_heartbeat_is_as_new_as_the_state_that_is_seen(
+    reader: RingReader, writer: RingWriter, monkeypatch: pytest.MonkeyPatch
+):
+    writer.beat(WriterState.RESETTING)
+    before_ns = reader.writer_status().heartbeat_ns
+    monkeypatch.setattr(reader, "_fence", lambda: writer.beat(WriterState.ACTING))
+    status = reader.writer_status()
+    assert status.state == WriterState.RESETTING
+    assert status.heartbeat_ns > before_ns
+
+
 # ---- damage: what a broken writer, or anything else with access, may have done to the memory
 
 

@@ -13,6 +13,7 @@ import pytest
 
 from gvz.core.errors import ResourceError, TransportError
 from gvz.transport.segment import Segment, hash_layout
+from tests.full_disk import full_disk
 
 PAYLOAD, LAYOUT = 1000, hash_layout("test", 1)
 
@@ -108,6 +109,13 @@ def test_memory_that_cannot_be_had_is_an_error_with_advice_and_leaves_no_descrip
     before = descriptors()
     with pytest.raises(ResourceError, match=r"got \d+ bytes of available memory, want \d+; lower actors"):
         Segment.create("gvz-test", 2**50, layout_hash=LAYOUT)
+    assert descriptors() == before
+
+
+def test_memory_that_the_kernel_refuses_is_an_error_and_leaves_no_descriptor():
+    before = descriptors()
+    with full_disk(0), pytest.raises(ResourceError, match="gvz-test: the kernel refused 1064 bytes: File too large"):
+        Segment.create("gvz-test", PAYLOAD, layout_hash=LAYOUT)
     assert descriptors() == before
 
 
