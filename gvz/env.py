@@ -79,7 +79,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
     def __init__(
         self,
         task: Task | str,
-        config: EnvConfig | None = None,
+        config: EnvConfig | Mapping[str, Any] | None = None,
         *,
         render_mode: Literal["rgb_array", "human"] | None = None,
         recycle_episodes: int | None = None,
@@ -89,7 +89,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
 
         Args:
             task: a task or its id, "defend_the_center/gore+mossy_bricks".
-            config: sizes, action set, profile.
+            config: sizes, action set, profile; or fields of EnvConfig, which Gymnasium's JSON makes of one.
             render_mode: rgb_array: `render()` gives the screen, uint8 [render_height, render_width, 3];
                 human: a window shows the game at its normal speed.
             recycle_episodes: restart the engine after at most this many episodes; default: only if the task needs it.
@@ -111,7 +111,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         if recycle_episodes is not None and recycle_episodes < 0:
             raise ConfigError(f"recycle_episodes: got {recycle_episodes}, want 0 or more")
         self.task = task if isinstance(task, Task) else parse_task(task)
-        self.config = config = _with_fields(EnvConfig() if config is None else config, fields)
+        self.config = config = _with_fields(config, fields)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": TICS_PER_SECOND / config.frame_skip}
         scenario = self.task.scenario
@@ -156,8 +156,7 @@ class DoomEnv(gymnasium.Env[Observation, np.int64 | np.ndarray]):
         self._state: GameState | None = None
         self._observation: Observation | None = None
         self._playing = False
-        self._held: list[bool] | None = None
-        """the buttons of the last decision"""
+        self._held: list[bool] | None = None  # the buttons of the last decision
 
     @one_thread
     def reset(
@@ -392,7 +391,9 @@ def make_env(task_id: str, env_config: Mapping[str, Any], **options: Any) -> Doo
     return DoomEnv(task_id, **env_config, **options)
 
 
-def _with_fields(config: EnvConfig, fields: Mapping[str, Any]) -> EnvConfig:
+def _with_fields(config: EnvConfig | Mapping[str, Any] | None, fields: Mapping[str, Any]) -> EnvConfig:
+    if config is None or isinstance(config, Mapping):
+        config, fields = EnvConfig(), {**(config or {}), **fields}
     known = [field.name for field in dataclasses.fields(EnvConfig)]
     if unknown := sorted(fields.keys() - set(known)):
         raise ConfigError(f"env: unknown options {unknown}, want some of {', '.join(known)}")

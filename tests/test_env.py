@@ -330,7 +330,7 @@ def test_a_seed_gives_a_sequence_of_episodes(shared: DoomEnv):
             ConfigError,
             r"env.reward_weights, \('kill', nan\): got nan, want a",
         ),
-        ({"config": {"frame_skip": 4}}, ConfigError, "config: got {'frame_skip': 4}, want EnvConfig"),
+        ({"config": ["frame_skip", 4]}, ConfigError, r"config: got \['frame_skip', 4\], want EnvConfig"),
         ({"task": None}, TaskError, "task: got None, want '<scenario>/<task>'"),
         ({"render_width": 300}, ConfigError, "got 300x144, want one of"),
         ({"render_mode": "ansi"}, ValueError, "render_mode: got 'ansi'"),

@@ -6,9 +6,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import data_equivalence
 
 from gvz import LABEL_CLASSES
-from gvz.core.env_config import SIGHT_CLASSES, SIGHT_COLUMNS, EnvConfig
+from gvz.core.env_config import SIGHT_CLASSES, SIGHT_COLUMNS, Buffer, EnvConfig
 from gvz.core.errors import ConfigError
 from gvz.env import DoomEnv
 from gvz.observation import CLASS_GREYS, label_class
@@ -124,6 +125,24 @@ def test_the_automap_is_whole_and_stands_still_and_buffers_change_no_screen():
     assert np.ptp(rows) >= 0.8 * 144
     assert np.ptp(columns) == pytest.approx(np.ptp(rows) * 640 / 448, abs=3)
     assert 0 < (automaps[-1] != automaps[0]).any(-1).mean() < 0.02, "only the agent moves"
+
+
+@pytest.mark.parametrize(
+    ("task", "buffers"), [("seek_and_kill/default", ()), ("health_gathering/default", ("automap",))]
+)
+def test_no_picture_depends_on_the_episode_before(task: str, buffers: tuple[Buffer, ...]):
+    """The weapon swung on after a walk, and the automap had the colours of the screen before."""
+    env = DoomEnv(task, buffers=buffers, action_set="combinations")
+    walk = env.action_meanings.index(("MOVE_FORWARD",))
+
+    def episode() -> list[object]:
+        return [env.reset(options={"episode_seed": 9}), *(env.step(walk) for _ in range(12))]
+
+    first = episode()
+    assert data_equivalence(episode(), first, exact=True), "in an engine that has played"
+    env.reset()
+    assert data_equivalence(episode(), first, exact=True), "after an episode without a step"
+    env.close()
 
 
 def test_frames_of_classes_are_the_labels_as_grey_levels():

@@ -11,9 +11,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 import gvz
+from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError
 from gvz.env import DoomEnv
 from gvz.registration import gymnasium_id, register_envs
@@ -105,6 +107,17 @@ def test_every_named_task_is_registered():
     assert env.step(TURN)[4]["episode_frames"] == 2
     assert env.render().shape == (144, 256, 3)
     env.close()
+
+
+def test_an_environment_is_made_again_from_the_json_of_its_spec():
+    """A configuration became a dict there, which was refused."""
+    name = "GViZDoom/SeekAndKill-Default-v0"
+    env = gymnasium.make(name, config=EnvConfig(frame_skip=8), buffers=("depth",), reward_weights={"kill": 2.0})
+    assert env.spec is not None
+    again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.config == env.unwrapped.config
+    with pytest.raises(ConfigError, match=r"unknown options \['frame_skp'\]"):
+        gymnasium.make(name, config={"frame_skp": 8})
 
 
 @pytest.mark.parametrize(

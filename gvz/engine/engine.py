@@ -25,6 +25,7 @@ import numpy as np
 
 from gvz.core import janitor
 from gvz.core.errors import ConfigError, EngineError
+from gvz.core.stop import uninterrupted
 from gvz.engine import process as engine_process
 from gvz.engine import queue_locks
 from gvz.wad.lumps import MAP_NAME
@@ -40,6 +41,8 @@ _MAP_VARIABLE = "gvz_map"
 """the engine's console variable that names the map of the next episode"""
 _MAP_FILE = "map.wad"
 """of a map that is not in the configured file; in the engine's private directory"""
+_WEAPON_PICTURES = 15
+"""in which a weapon still swings after a walk, beside an episode's first one: MAXBOB of ViZDoom's p_user.cpp is 16"""
 _OVERRIDE = Path("_vizdoom.cfg")
 """ViZDoom loads a file of this name in the working directory over everything that was configured"""
 
@@ -102,18 +105,18 @@ class Engine:
         _clean_once()
         self.config = config
         self.deadline: float | None = None
-        self._overdue = False
-        game, directory, self.log = _start(config)
-        self._game, self._directory = game, directory
+        self._game, self._directory, self.log = _start(config)
         self.owner_pid = os.getpid()
-        self._end = weakref.finalize(self, engine_process.end_if_ours, game, directory, self.owner_pid)
-        instance = janitor.read_instance(directory)
+        self._end = weakref.finalize(self, engine_process.end_if_ours, self._game, self._directory, self.owner_pid)
+        instance = janitor.read_instance(self._directory)
         assert instance is not None, "an engine that answered has written its instance file"
         self.pid, self._process_start, self.instance_id = instance
         self._queues = queue_locks.mapped(self.instance_id)
-        self._loads_maps = False
-        self._variables = game.get_available_game_variables()
-        self.screen = _map_screen(game, self.instance_id)
+        self._overdue = self._loads_maps = False
+        swings = config.render_weapon and any(button.startswith("MOVE_") for button in config.buttons)
+        self._paused_pictures = _WEAPON_PICTURES if swings else int(config.automap)
+        self._variables = self._game.get_available_game_variables()
+        self.screen = _map_screen(self._game, self.instance_id)
         engine_process.watch(self)
 
     def new_episode(self, seed: int, map_wad: bytes | None = None) -> "GameState":
@@ -128,10 +131,14 @@ class Engine:
         with self._answering("new_episode"):
             if self.log.stat().st_size > _LOG_BYTES:
                 os.truncate(self.log, 0)
+            if self._paused_pictures:
+                self._game.advance_action()  # else the end of the pause, if no tic has come since, would begin one
             if map_wad is not None:
                 self._load_map(map_wad)
             self._game.set_seed(seed)  # last: it holds for one load of a map
             self._game.new_episode()
+            if self._paused_pictures:
+                self._forget_pictures()
             state = _state(self._game)
         if state is None:
             raise EngineError(f"engine {self._name}: the episode of seed {seed} ended before it began")
@@ -150,6 +157,14 @@ class Engine:
             self._game.send_game_command(f"set {_MAP_VARIABLE} {MAP_NAME}")
             self._game.set_doom_map(f"${_MAP_VARIABLE}")  # the map that it is on
             self._game.send_game_command(f"set {_MAP_VARIABLE} file:{_MAP_FILE}")  # in its working directory
+
+    @uninterrupted()  # in pause no other episode can begin
+    def _forget_pictures(self) -> None:
+        """Draws in pause what depends on the episode before: how a weapon swings, and the automap's palette."""
+        self._game.send_game_command("pause")
+        for _ in range(self._paused_pictures):
+            self._game.advance_action()
+        self._game.send_game_command("pause")  # ends with the next tic
 
     def step(self, buttons: Sequence[float], tics: int) -> "GameState | None":
         """`advance`, then `state`."""

@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import os
 import weakref
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -57,7 +57,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         self,
         tasks: Task | str | Sequence[Task | str],
         num_envs: int | None = None,
-        config: EnvConfig | None = None,
+        config: EnvConfig | Mapping[str, Any] | None = None,
         *,
         batch_size: int | None = None,
         num_workers: int | None = None,

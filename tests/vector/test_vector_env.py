@@ -262,11 +262,7 @@ def test_gymnasium_makes_it_by_the_tasks_id():
         (("defend_the_center/gore", 2, None, {"copy": False, "batch_size": 1}), ConfigError, "batch_size=1, want 2"),
         (("defend_the_center/gore", 2, None, {"render_mode": "human"}), ConfigError, "want None or 'rgb_array'"),
         (("defend_the_center/gore", 2, None, {"frame_skp": 4}), ConfigError, "unknown options"),
-        (
-            ("defend_the_center/gore", 2, {"frame_skip": 4}),
-            ConfigError,
-            "config: got {'frame_skip': 4}, want EnvConfig",
-        ),
+        (("defend_the_center/gore", 2, "thesis"), ConfigError, "config: got 'thesis', want EnvConfig"),
         (
             (("defend_the_center/default", "seek_and_kill/default"),),
             ConfigError,
