@@ -4,7 +4,9 @@ import ast
 import re
 import subprocess
 import sys
+import tomllib
 from functools import cache
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -81,6 +83,19 @@ def test_the_page_says_which_libraries_the_vocabulary_imports():
     page = (ROOT / "docs" / "ARCHITECTURE.md").read_text()
     (said,) = re.findall(r"^\| 0 vocabulary .* \| (.*), standard library \|$", page, flags=re.MULTILINE)
     assert set(said.split(", ")) == names - sys.stdlib_module_names - {"gvz"}
+
+
+def test_the_project_declares_the_libraries_that_it_imports_and_no_other():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = [project["optional-dependencies"][extra] for extra in ("cluster", "segmenter", "video", "wandb")]
+    declared = {re.match(r"[\w-]+", line)[0] for line in sum(extras, project["dependencies"])}
+    libraries = {name.partition(".")[0] for _, file in modules() for name in imports_of(file)}
+    libraries -= sys.stdlib_module_names | set(OURS)
+    libraries -= {"stable_baselines3"}  # gvz.vector.adapters runs where it is installed
+    of = packages_distributions()
+    imported = {distribution for name in libraries for distribution in of.get(name, [name])}
+    declared -= {"flatbuffers"}  # jax.export writes policies with it
+    assert {name.lower().replace("_", "-") for name in imported} == {name.lower() for name in declared}
 
 
 @pytest.mark.parametrize(
