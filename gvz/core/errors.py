@@ -4,6 +4,7 @@ Arguments that are simply wrong raise `ValueError`; a broken own invariant is an
 can go wrong at run time has a class here, and its message says what, where, got, wanted, and what to do.
 """
 
+import signal
 from collections.abc import Iterable
 from difflib import get_close_matches
 
@@ -66,6 +67,16 @@ class WorkerError(GvzError):
 
 class GroupError(GvzError):
     """A process of a group of learners is gone, so that the others cannot go on."""
+
+
+def exit_text(code: int) -> str:
+    """How a process ended that ended badly. A signal is below 0, as Python has it, or above 128, as shells have it."""
+    try:
+        name = signal.Signals(-code if code < 0 else code - 128).name
+    except ValueError:
+        return f"exit code {code}"
+    why = ": perhaps no memory was left" if name == "SIGKILL" else ""
+    return f"exit code {code} ({name}{why})"
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

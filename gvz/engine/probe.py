@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from gvz.core import janitor
-from gvz.core.errors import EngineError, WadError
+from gvz.core.errors import EngineError, WadError, exit_text
 from gvz.core.libraries import import_path
 from gvz.engine.engine import Engine, EngineConfig
 from gvz.engine.process import log_tail, one_of
@@ -67,7 +67,9 @@ def probe_wad(wad: Path, timeout_s: float = _TIMEOUT_S) -> str:
         if done.returncode < 0 and not faults:
             faults = _faults(_output_of_engine_alone(command, environment))
         if done.returncode != 0 or faults:
-            what = f"the engine crashed (exit code {done.returncode})" if done.returncode < 0 else "cannot be played"
+            what = (
+                f"the engine crashed with {exit_text(done.returncode)}" if done.returncode < 0 else "cannot be played"
+            )
             lines = faults[:8] or done.stderr.strip().splitlines()[-1:] or ["it does not say why"]
             raise EngineError(f"{wad}: {what}: {'; '.join(lines)}{log_tail(log)}")
         return text

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gvz.core import records
+from gvz.core.errors import exit_text
 from gvz.core.stop import StopRequest
 from gvz.core.watchdog import AwakeClock
 from gvz.experiments import inventory
@@ -140,7 +141,7 @@ class Schedule:
             self._waiting.appendleft(job)
             return
         else:
-            ended = f"exit code {code}" if code else f"it ended as if all were done, but it has {outlook.text}"
+            ended = exit_text(code) if code else f"it ended as if all were done, but it has {outlook.text}"
             why = running.process.problem or ended
         log = inventory.log_file(job.results, job.id)
         self._failed.append(job)

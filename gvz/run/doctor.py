@@ -21,7 +21,7 @@ from typing import Any, Literal
 from gvz.core import janitor
 from gvz.core.cache import cache_directory
 from gvz.core.control_groups import num_cores
-from gvz.core.errors import GvzError
+from gvz.core.errors import GvzError, exit_text
 from gvz.engine.tuned import TUNED, describe_engine
 from gvz.engine.tuned.build_vizdoom import TUNED_VERSION
 from gvz.run.footprint import ACTOR_MEMORY_BYTES, ENGINE_SHM_BYTES, LEARNER_MEMORY_BYTES, format_bytes
@@ -258,5 +258,5 @@ def _try(name: str, code: str, remedy: str) -> Finding:
         janitor.clean_dead_instances()  # a crashed process cleans up nothing
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        return Finding(name, "bad", f"exit code {done.returncode}: {last}", remedy)
+        return Finding(name, "bad", f"{exit_text(done.returncode)}: {last}", remedy)
     return Finding(name, "ok", done.stdout.strip().splitlines()[-1])

@@ -54,7 +54,7 @@ def test_a_killed_job_sinks_no_other_goes_on_when_run_again_and_every_episode_is
     training_process(runner, RAINBOW).kill()
     _, err = runner.communicate(timeout=900)
     assert runner.returncode == 1, err
-    assert f"exit code 137; log {results}/logs/{RAINBOW}.log): {RAINBOW}" in err
+    assert f"exit code 137 (SIGKILL: perhaps no memory was left); log {results}/logs/{RAINBOW}.log): {RAINBOW}" in err
     assert f"done: {DQN}" in err
     assert "done: players/random" in err
     status = subprocess.run(command("status", "--results", str(results)), capture_output=True, text=True, check=False)

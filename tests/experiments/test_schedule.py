@@ -107,7 +107,7 @@ def test_a_failure_sinks_no_other_job_and_is_named_with_its_log(tmp_path, capsys
     assert f"FAILED (first: exit code 3; log {tmp_path}/logs/bad/one.log): bad/one" in err
     assert "no luck today" in err
     assert "FAILED (first: it ended as if all were done, but it has no first part; log " in err
-    assert "exit code 137" in err
+    assert "FAILED (first: exit code 137 (SIGKILL: perhaps no memory was left); log " in err
     assert "3 jobs failed; the same command tries them again:" in err
     assert progress.job_state(tmp_path, "bad/one", done=False, begun=True) == "failed"
 

@@ -64,7 +64,7 @@ def test_an_engine_that_cannot_play_is_bad_and_its_last_words_are_shown(monkeypa
 def test_a_device_that_kills_the_process_is_bad(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(doctor, "_DEVICES", "import os; os.kill(os.getpid(), 11)")
     finding = doctor.check_devices()
-    assert (finding.state, finding.found) == ("bad", "exit code -11: no message")
+    assert (finding.state, finding.found) == ("bad", "exit code -11 (SIGSEGV): no message")
 
 
 def test_why_jax_fails_is_said(monkeypatch: pytest.MonkeyPatch):
