@@ -15,7 +15,7 @@ from gvz.core.errors import EXIT_INTERRUPTED, GvzError
 from gvz.core.files import NO_ROOM
 from gvz.core.helptext import paragraphs
 from gvz.core.registry import discover
-from gvz.core.stop import StopRequest, say
+from gvz.core.stop import StopRequest, exit_at_once, say, stuck
 
 EXIT_BROKEN_PIPE = 141
 """exit code that a shell shows for a program that SIGPIPE ended"""
@@ -30,6 +30,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command; returns the exit code: 0 done, 1 failed, 2 bad input; 130, 143 and 129 ended by SIGINT, SIGTERM
     and SIGHUP.
     """
+    code = _main(arguments)
+    if any(thread.is_alive() for thread in stuck):
+        exit_at_once(code, "left without waiting for the cluster, whose head does not answer")
+    return code
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     if sys.stdout is None:  # closed by who started us
         sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115
     stop = StopRequest(at_once=True)

@@ -162,6 +162,26 @@ def test_a_signal_gives_one_line_and_the_exit_code_that_shells_expect(number, ca
     assert capsys.readouterr() == ("", "interrupted\n")
 
 
+@pytest.mark.parametrize(("waits", "code"), [(True, 7), (False, 3)])
+def test_a_thread_that_waits_without_end_does_not_keep_the_command_nor_change_its_exit_code(waits, code):
+    script = f"""
+import atexit, os, threading
+from gvz import cli
+from gvz.core import stop
+def run(_):
+    thread = threading.Thread(target=threading.Event().wait if {waits} else int, daemon=True)
+    thread.start()
+    stop.stuck.add(thread)
+    if not {waits}:
+        thread.join()
+    return 7
+cli.run = run
+atexit.register(os._exit, 3)  # what the interpreter's end does
+cli.main([])
+"""
+    assert subprocess.run([sys.executable, "-c", script], timeout=60, check=False).returncode == code
+
+
 def test_an_interrupted_import_is_an_interruption(capsys, monkeypatch):
     def run(_: list[str]) -> int:
         try:

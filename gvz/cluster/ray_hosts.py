@@ -1,7 +1,7 @@
 """Ray as the `Backend` of actor hosts. The only file of actor hosts that imports ray."""
 
 import contextlib
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from actors.pool import PoolConfig
 from gvz.cluster import host
+from gvz.cluster.answer import Answer
 from gvz.cluster.backend import Call, HostError, Machine
 from gvz.cluster.host import Host, HostSpec
 from gvz.core import janitor
@@ -18,6 +19,8 @@ from gvz.transport.messages import ParamsHeader
 
 _RESULT_TIMEOUT_S = 10.0
 """for an answer that has come; it is in this machine's memory"""
+_HEAD_TIMEOUT_S = 10.0
+"""for an answer of the head; the hosts are asked for nothing meanwhile"""
 
 
 class RemoteHost:
@@ -103,6 +106,7 @@ class RayBackend:
     def __init__(self, session: contextlib.ExitStack):
         self._session = session
         self._learner = ray.get_runtime_context().get_node_id()
+        self._asking: Answer | None = None
 
     def machines(self) -> list[Machine]:
         with _as_host_error():
@@ -113,7 +117,7 @@ class RayBackend:
                     cpus=int(node["Resources"].get("CPU", 0)),
                     has_learner=node["NodeID"] == self._learner,
                 )
-                for node in ray.nodes()
+                for node in self._of_head(ray.nodes)
                 if node["Alive"]
             ]
 
@@ -135,8 +139,16 @@ class RayBackend:
 
     def clean(self, machine: str) -> Call:
         place = NodeAffinitySchedulingStrategy(node_id=machine, soft=False)
+        task = ray.remote(janitor.clean_dead_instances).options(num_cpus=0, scheduling_strategy=place)
         with _as_host_error():
-            return ray.remote(janitor.clean_dead_instances).options(num_cpus=0, scheduling_strategy=place).remote()
+            return self._of_head(task.remote)
 
     def close(self) -> None:
         self._session.close()
+
+    def _of_head(self, call: Callable[[], Any]) -> Any:
+        """What a call returns that the head has to answer. A head that hangs is waited for once."""
+        if self._asking is not None and self._asking.is_alive():
+            raise TimeoutError("the cluster's head does not answer")
+        self._asking = Answer(call)
+        return self._asking.result(_HEAD_TIMEOUT_S)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gvz.cluster.answer import Answer
 from gvz.cluster.job_host import JobHost
 from gvz.cluster.nodes import on_nodes
 from gvz.cluster.session import connect, parse_address
@@ -25,8 +26,10 @@ NODES_TIMEOUT_S = 600.0
 """how long to wait for a node that a job fits on, when all those are gone"""
 HEAD_TIMEOUT_S = 20.0
 """a head that takes no connection for this time is gone"""
+ANSWER_S = 5.0
+"""longest wait for the head before signals are looked at again"""
 SILENT_TIMEOUT_S = 60.0
-"""a node that answers nothing for this time is lost: Ray never reports a machine that was only stopped"""
+"""a head or a node that answers nothing for this time is lost: Ray never reports a machine that was only stopped"""
 KILL_TIMEOUT_S = 10.0
 JOB_SHM_BYTES = 4 * ENGINE_SHM_BYTES
 """in /dev/shm, for the games of the smallest job; every job looks itself whether its own fit"""
@@ -162,6 +165,7 @@ class RemoteProcess:
 class ClusterPlaces:
     """The nodes of the cluster that this process is connected to."""
 
+    _asking: Answer | None = None
     settle_s = 90.0
     """NFS keeps what it knows of a directory for up to 60 s"""
 
@@ -175,9 +179,10 @@ class ClusterPlaces:
             raise ConfigError(f"--jobs: got {limit}, want at least 1")
         self._address, self._share, self._limit = address, share, limit
         self._used: list[RemoteProcess] = []
-        self._looked_s = self._answered_s = self._fitted_s = -math.inf
+        self._looked_s = self._fitted_s = -math.inf
+        self._answered_s = time.monotonic()
         self._nodes: list[tuple[float, float]] = []
-        self._look()
+        self._look(SILENT_TIMEOUT_S)
         if not self._capacity("train"):
             raise ConfigError(
                 f"cluster {address}: no node has {share.cores} cores and {share.gpus:g} GPUs for a job; "
@@ -208,23 +213,24 @@ class ClusterPlaces:
     def _capacity(self, step: str | None) -> int:
         return sum(self._share.fits(cores, gpus, step) for cores, gpus in self._nodes)
 
-    def _look(self) -> None:
-        """Which nodes are alive. Ray would end this process if its head is gone, so that is asked first."""
+    def _look(self, wait_s: float = ANSWER_S) -> None:
+        """Which nodes are alive."""
         self._looked_s = now_s = time.monotonic()
+        asking = self._asking = self._asking or Answer(lambda: _nodes(self._address))
         try:
-            socket.create_connection(parse_address(self._address), timeout=HEAD_TIMEOUT_S).close()
+            nodes = asking.result(wait_s)
         except OSError as error:
-            if now_s - self._answered_s > HEAD_TIMEOUT_S:
+            if now_s - self._answered_s > (SILENT_TIMEOUT_S if asking.is_alive() else HEAD_TIMEOUT_S):
                 raise GvzError(
                     f"cluster {self._address}: its head is gone; the jobs save themselves and end. Start the cluster, "
                     "and give the same command again"
                 ) from error
             self._nodes = []  # nothing begins before it answers again: Ray would wait for it
             return
-        import ray
-
+        finally:
+            self._asking = asking if asking.is_alive() else None
         self._answered_s = now_s
-        shares = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        shares = [node["Resources"] for node in nodes if node["Alive"]]
         self._nodes = [(share.get("CPU", 0.0), share.get("GPU", 0.0)) for share in shares]
         if self._capacity("train") or self._fitted_s == -math.inf:
             self._fitted_s = now_s
@@ -233,3 +239,13 @@ class ClusterPlaces:
                 f"cluster {self._address}: no node that a job fits on for {NODES_TIMEOUT_S:.0f} s; start nodes, "
                 "and give the same command again"
             )
+
+
+def _nodes(address: str) -> list[dict[str, Any]]:
+    """Ray's description of its nodes. Raises OSError: the head is gone, which is looked at first: Ray would end this
+    process.
+    """
+    socket.create_connection(parse_address(address), timeout=HEAD_TIMEOUT_S).close()
+    import ray
+
+    return ray.nodes()

@@ -1,5 +1,6 @@
 """The connection to a Ray cluster. Whatever stands against it is one line, said before anything starts there."""
 
+import atexit
 import contextlib
 import importlib.util
 import json
@@ -19,6 +20,7 @@ from typing import Any
 
 import psutil
 
+from gvz.cluster.answer import Answer
 from gvz.cluster.nodes import Node, check_nodes, survey
 from gvz.core.addresses import require_private, resolve
 from gvz.core.errors import ConfigError
@@ -28,6 +30,8 @@ ANSWER_TIMEOUT_S = 10.0
 """for a connection of TCP to the address"""
 PROBE_TIMEOUT_S = 60.0
 """for a process that imports Ray and asks the cluster who it is; a second on an idle core"""
+SHUTDOWN_TIMEOUT_S = 20.0
+"""for the farewell to a cluster, a second where its head is well"""
 NAMESPACE = "gvizdoom"
 _OURS = {"RAY_AUTH_MODE": "token", "RAY_USAGE_STATS_ENABLED": "0"}
 """environment of this process, set before it imports Ray, which reads it once"""
@@ -94,7 +98,20 @@ def connect(address: str, *, shm_bytes: int = 0, public: bool = False, alike: bo
             check_nodes(nodes, shm_bytes=shm_bytes)
         yield Session(address=where, nodes=nodes)
     finally:
-        ray.shutdown()
+        _disconnect()
+
+
+def _disconnect() -> None:
+    """Ends Ray's part of this process. Where the head hangs, Ray waits for it without end."""
+    import ray
+
+    farewell = Answer(ray.shutdown)
+    try:
+        with contextlib.suppress(TimeoutError):
+            farewell.result(SHUTDOWN_TIMEOUT_S)
+    finally:
+        if farewell.is_alive():
+            atexit.unregister(ray.shutdown)
 
 
 def parse_address(address: str) -> tuple[str, int]:

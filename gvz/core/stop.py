@@ -20,6 +20,9 @@ _PATIENCE_S = 1.0
 _AGAIN_S = 0.05
 """until what Python dropped is raised again"""
 
+stuck: set[threading.Thread] = set()
+"""threads that may wait in C++ without end: beside such a one the interpreter cannot end, so the process does"""
+
 
 class StopRequest:
     """Catches SIGNALS while it is entered; SIGHUP only where it is not ignored, as by `nohup`. In another thread than

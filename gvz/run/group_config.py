@@ -35,10 +35,10 @@ class GroupConfig:
                     )
             return
         host, _, port = (self.coordinator or "").rpartition(":")
-        if not host or not port.isdecimal() or not 0 < int(port) < 2**16:
+        if not host or ":" in host or not port.isdecimal() or not 0 < int(port) < 2**16:
             raise ConfigError(
-                f"group.coordinator: got {self.coordinator!r} for {self.num_processes} processes, want HOST:PORT, "
-                "where process 0 can listen and the others reach it, with a port of 1..65535"
+                f"group.coordinator: got {self.coordinator!r} for {self.num_processes} processes, want HOST:PORT, a "
+                "name or IPv4 address where process 0 can listen and the others reach it, with a port of 1..65535"
             )
         if not self.own_id < self.num_processes:
             raise ConfigError(f"group.process_id: got {self.own_id}, want 0..{self.num_processes - 1}")

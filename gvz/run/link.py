@@ -41,6 +41,7 @@ class Link:
         self.stop_signal: int | None = None
         """a process asks all to stop, because of this signal"""
         self._socket = self._connect(address)
+        self._address: tuple[str, int] | None = address  # until something of the group has come from there
         self._write = threading.Lock()
         self._rounds: dict[str, int] = {}
         self._closed = False
@@ -121,7 +122,12 @@ class Link:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError), self._socket.makefile("rb") as lines:
             for line in lines:
                 self._take_in(decode(line))
-        self._fail(0)
+                self._address = None
+        if self._address is None:
+            self._fail(0)
+        else:
+            host, port = self._address
+            self._fail(0, f"has not answered at {host}:{port} (is that group.coordinator right?)")
 
     def _take_in(self, message: dict[str, Any]) -> None:
         kind, process = message["kind"], message["from"]

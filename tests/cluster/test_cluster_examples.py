@@ -31,6 +31,14 @@ def test_a_job_is_requeued_and_told_of_its_end_in_time(script):
     assert all(option.startswith("--") for option in options)
 
 
+def test_each_node_of_ray_in_slurm_has_the_cores_that_it_gives_away():
+    """Since Slurm 22.05 `srun` takes --cpus-per-task no more from the job, and a step may get one core."""
+    steps = [part.split("&\n")[0] for part in (EXAMPLES / "slurm_ray.sbatch").read_text().split("srun --nodes")[1:]]
+    nodes = [step for step in steps if "ray start" in step]
+    assert len(nodes) == 2
+    assert all('--cpus-per-task="$SLURM_CPUS_PER_TASK"' in step.split("ray start")[0] for step in nodes)
+
+
 @pytest.mark.parametrize(
     ("of_its_name", "all_of_it", "head_ip"),
     [
@@ -116,6 +124,7 @@ def test_the_kubernetes_cluster_asks_for_a_token_shares_results_and_has_shared_m
     assert all(isinstance(value, str) for group in groups for value in group["rayStartParams"].values())
     for pod in (group["template"]["spec"] for group in groups):
         (container,) = pod["containers"]
+        assert pod["securityContext"]["fsGroup"] == 1000  # of the Dockerfile's user, for the results
         assert container["image"] == f"registry.example.com/gvizdoom:{version('gvizdoom')}"
         assert {"name": "RAY_USAGE_STATS_ENABLED", "value": "0"} in container["env"]
         mounts = {mount["mountPath"]: mount["name"] for mount in container["volumeMounts"]}

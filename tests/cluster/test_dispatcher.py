@@ -1,5 +1,7 @@
 """What the thread that speaks with the hosts says, without a cluster."""
 
+import threading
+import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -7,11 +9,13 @@ import pytest
 from fake_env import config
 
 from actors.pool import lanes_to_begin_with
-from gvz.cluster.backend import Machine
+from gvz.cluster import ray_hosts
+from gvz.cluster.backend import HostError, Machine
 from gvz.cluster.config import ClusterConfig
 from gvz.cluster.dispatcher import Dispatcher
 from gvz.cluster.hello import Hello
 from gvz.cluster.supervised import SupervisedHost
+from gvz.core import stop
 from gvz.core.errors import ConfigError
 
 
@@ -29,3 +33,25 @@ def test_hosts_that_give_no_answer_are_named_at_the_start(tmp_path):
     dispatcher._round()
     with pytest.raises(ConfigError, match=r"0 of 1 hosts came to play within 0 s, .*; no answer yet from n1; do other"):
         dispatcher.begin(0.0)
+
+
+def test_a_head_that_hangs_is_waited_for_once_and_only_for_a_while(monkeypatch):
+    """Ray waits for it without end, and with it waited the dispatcher, its other hosts and the end of a run."""
+    answers = threading.Event()
+    monkeypatch.setattr(ray_hosts.ray, "nodes", lambda: [] if answers.wait() else None)
+    monkeypatch.setattr(ray_hosts, "_HEAD_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(stop, "stuck", set())
+    backend = ray_hosts.RayBackend.__new__(ray_hosts.RayBackend)  # connecting is the other tests' matter
+    backend._asking = None
+    with pytest.raises(HostError, match="Ray gave no answer within"):
+        backend.machines()
+    (asking,) = stop.stuck
+    begin_s = time.monotonic()
+    monkeypatch.setattr(ray_hosts, "_HEAD_TIMEOUT_S", 30.0)
+    for ask in (backend.machines, lambda: backend.clean("0" * 56)):
+        with pytest.raises(HostError, match="the cluster's head does not answer"):
+            ask()
+    assert time.monotonic() - begin_s < 20.0
+    answers.set()
+    asking.join(10.0)
+    assert backend.machines() == []

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from types import ModuleType
@@ -17,7 +18,7 @@ import pytest
 from gvz.cluster import job_host, ray_jobs
 from gvz.cluster.job_host import hold_cores
 from gvz.cluster.ray_jobs import Share
-from gvz.core import records
+from gvz.core import records, stop
 from gvz.core.errors import ConfigError, GvzError
 from gvz.experiments import inventory
 from gvz.experiments.plan import read_plan
@@ -256,6 +257,29 @@ def test_a_head_that_is_gone_is_named(ip, monkeypatch):
     time.sleep(0.2)
     with pytest.raises(GvzError, match=f"cluster {re.escape(address)}: its head is gone; the jobs save themselves"):
         places._look()
+
+
+def test_a_head_that_takes_connections_but_answers_nothing_is_gone_after_a_while(monkeypatch):
+    """A stopped process, or a machine without memory: Ray itself waits for it without end."""
+    monkeypatch.setattr(ray_jobs, "SILENT_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(stop, "stuck", set())
+    answers = threading.Event()
+    ray = ModuleType("ray")
+    monkeypatch.setattr(ray, "nodes", answers.wait, raising=False)
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    places = ray_jobs.ClusterPlaces.__new__(ray_jobs.ClusterPlaces)
+    places._answered_s = time.monotonic()
+    with socket.create_server(("127.0.0.1", 0)) as head:
+        places._address = f"127.0.0.1:{head.getsockname()[1]}"
+        places._look(0.1)
+        assert places._nodes == []
+        time.sleep(0.2)
+        with pytest.raises(GvzError, match="its head is gone"):
+            places._look(0.1)
+    (asking,) = stop.stuck
+    answers.set()
+    asking.join(10.0)
+    assert not asking.is_alive()
 
 
 def test_a_share_of_nothing_is_refused():

@@ -5,6 +5,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
@@ -12,7 +13,7 @@ import pytest
 
 from gvz.cluster import session
 from gvz.cluster.nodes import Node, check_nodes, describe
-from gvz.core import addresses
+from gvz.core import addresses, stop
 from gvz.core.errors import ConfigError, ResourceError
 from tests.cluster.conftest import RayCluster
 
@@ -97,6 +98,22 @@ def test_ray_gets_an_address_that_it_can_read_and_leaves_sigterm_to_the_command(
         assert [found.address] == got == [address]
     finally:
         signal.signal(signal.SIGTERM, ours)
+
+
+def test_a_cluster_is_left_although_its_head_does_not_answer(monkeypatch):
+    """Ray's own farewell waits without end, also at the end of the process."""
+    answers, ray = threading.Event(), ModuleType("ray")
+    vars(ray).update(shutdown=answers.wait)
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setattr(session, "SHUTDOWN_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(stop, "stuck", set())
+    session._disconnect()
+    (ending,) = stop.stuck
+    assert ending.is_alive()
+    answers.set()
+    ending.join(10.0)
+    session._disconnect()
+    assert stop.stuck == {ending}
 
 
 @pytest.mark.usefixtures("token")

@@ -216,6 +216,21 @@ def test_two_processes_with_one_number_and_strangers_are_turned_away(monkeypatch
     the_relay.close()
 
 
+def test_a_port_of_something_else_is_said_to_be_perhaps_wrong():
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        address = other.getsockname()
+
+        def serve() -> None:
+            with other.accept()[0] as connection:
+                connection.sendall(b"SSH-2.0-OpenSSH_9.2\r\n")
+
+        serving = threading.Thread(target=serve, daemon=True)
+        serving.start()
+        with pytest.raises(GroupError, match=rf"has not answered at 127\.0\.0\.1:{address[1]} \(is that group\.coord"):
+            link.Link(address, 1, 2, {})
+        serving.join(10)
+
+
 def test_waits_for_the_others_are_bounded_and_say_for_whom(monkeypatch):
     monkeypatch.setattr(link, "JOIN_TIMEOUT_S", 0.3)
     address = "127.0.0.1", free_port("127.0.0.1")
@@ -252,6 +267,7 @@ def test_a_process_that_cannot_reach_jax_in_process_0_says_so(monkeypatch):
         ({}, r"group\.coordinator: got None for 2 processes, want HOST:PORT"),
         ({"coordinator": "here", "process_id": 0}, r"group\.coordinator: got 'here'"),
         ({"coordinator": "here:65536", "process_id": 0}, r"group\.coordinator: got 'here:65536'.* port of 1\.\.65535"),
+        ({"coordinator": "[fd00::1]:1", "process_id": 0}, r"got '\[fd00::1\]:1' for 2 processes, .* IPv4 address"),
         ({"coordinator": "here:1", "process_id": 2}, r"group\.process_id: got 2, want 0\.\.1"),
         (
             {"coordinator": "here:1"},
