@@ -9,7 +9,7 @@ import pytest
 from fake_env import config
 
 from actors.pool import lanes_to_begin_with
-from gvz.cluster import ray_hosts
+from gvz.cluster import session
 from gvz.cluster.backend import HostError, Machine
 from gvz.cluster.config import ClusterConfig
 from gvz.cluster.dispatcher import Dispatcher
@@ -37,6 +37,10 @@ def test_hosts_that_give_no_answer_are_named_at_the_start(tmp_path):
 
 def test_a_head_that_hangs_is_waited_for_once_and_only_for_a_while(monkeypatch):
     """Ray waits for it without end, and with it waited the dispatcher, its other hosts and the end of a run."""
+    for name, value in session._OURS.items():
+        monkeypatch.setenv(name, value)  # Ray reads them when it is imported; tests that come later need them
+    from gvz.cluster import ray_hosts
+
     answers = threading.Event()
     monkeypatch.setattr(ray_hosts.ray, "nodes", lambda: [] if answers.wait() else None)
     monkeypatch.setattr(ray_hosts, "_HEAD_TIMEOUT_S", 0.2)
