@@ -70,7 +70,7 @@ class GroupError(GvzError):
 
 
 def exit_text(code: int) -> str:
-    """How a process ended that ended badly. A signal is below 0, as Python has it, or above 128, as shells have it."""
+    """How a process with this exit code ended. Below 0 (Python) and above 128 (shells), a signal ended it."""
     try:
         name = signal.Signals(-code if code < 0 else code - 128).name
     except ValueError:
