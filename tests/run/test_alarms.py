@@ -1,11 +1,19 @@
 """Each condition under which a run may be wasted is said, and nothing else."""
 
 import dataclasses
+import time
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from actors.config import ActorsConfig
+from actors.pool import PoolStatistics
 from gvz.run.alarms import Expected, alarms
+from gvz.run.config import RunConfig
+from gvz.run.monitor import Counts, Monitor
 from gvz.run.progress import TaskStatus
+from learner.ingest import Staleness
 
 EXPECTED = Expected(
     games={"a": 2, "b": 1, "c": 1},
@@ -90,3 +98,59 @@ def test_a_game_that_ends_no_episode_is_named_after_two_time_outs(fill_share: fl
     found = alarms(row, replaced(1, episodes=0, score=float("nan")), larger)
     text = "b has ended no episode in 560 decisions a game; its time-out is at 275"
     assert found == ({"endless/b": text} if said else {})
+
+
+def test_a_row_has_the_rates_and_waits_since_the_last_one_and_a_condition_is_said_once(monkeypatch: pytest.MonkeyPatch):
+    """Of three games, two play the first task."""
+    config = RunConfig(
+        name="x",
+        tasks=("defend_the_center/default", "defend_the_center/gore"),
+        actors=ActorsConfig(num_actors=3, games_per_actor=1),
+    )
+    learner = SimpleNamespace(num_slots=1000, batch_size=32, num_updates_per_call=1)
+    parts: Any = SimpleNamespace(table=config.table, learner=learner, pool_config=SimpleNamespace(ring_capacity=64))
+    rows, said, faults, now_s = list[dict[str, float]](), list[str](), list[str](), [100.0]
+    telemetry: Any = SimpleNamespace(
+        scalars=lambda _, row: rows.append(row),
+        task_statuses=tuple,
+        fault=lambda fault, **_: faults.append(fault.message),
+    )
+    progress: Any = SimpleNamespace(say=said.append, show=lambda _: None)
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
+    metrics = {"learner/loss": 1.0, "replay/fill_share": 0.5, "replay/share/defend_the_center/gore": 0.7}
+    monitor = Monitor(config, parts, progress, telemetry, counts := Counts())
+    for now_s[0], counts.updates, counts.env_steps, for_space_s, for_records_s in (
+        (100.0, 50, 1000, 5.0, 7.0),
+        (110.0, 70, 1400, 17.0, 9.5),
+        (120.0, 70, 1400, 17.0, 9.5),
+    ):
+        statistics = PoolStatistics(
+            env_steps=counts.env_steps,
+            restarts=4,
+            actors_ready=3,
+            waited_for_space_s=for_space_s,
+            waited_for_records_s=for_records_s,
+            more={"host/lag_s": 0.5},
+        )
+        monitor.log(statistics, Staleness(mean=1.5, p95=2, max=3), metrics)
+    rates = {
+        "learner/updates_per_s": 2.0,
+        "learner/samples_per_s": 64.0,
+        "actors/decisions_per_s": 40.0,
+        "actors/frames_per_s": 160.0,
+        "learner/wait_share": 0.25,
+        "actors/wait_share": 0.4,
+    }
+    sizes = {
+        "actors/env_steps": 1400,
+        "actors/restarts": 4,
+        "actors/staleness_mean_versions": 1.5,
+        "actors/staleness_p95_versions": 2,
+        "actors/staleness_max_versions": 3,
+        "run/processor_s": 0.0,
+        "host/lag_s": 0.5,
+    }
+    assert rows[1] == pytest.approx({**rates, **sizes, **metrics})
+    assert rows[2] == pytest.approx({**dict.fromkeys(rates, 0.0), **sizes, **metrics})
+    text = "defend_the_center/gore makes 70% of the records in the replay; by its games 33% are due"
+    assert (said, faults) == ([f"warning: {text}"], [text])

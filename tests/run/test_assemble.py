@@ -8,6 +8,7 @@ from actors.config import ActorsConfig
 from gvz.core.env_config import EnvConfig
 from gvz.run.assemble import assemble
 from gvz.run.config import RunConfig
+from gvz.run.group_config import GroupConfig
 from learner.agents.configs.ppo import PPOConfig
 from learner.agents.configs.rainbow import RainbowConfig
 from learner.config import LearnerConfig, OnPolicyConfig, ReplayConfig
@@ -62,8 +63,13 @@ def test_a_replay_has_every_setting_of_the_run(prioritized: bool, tmp_path: Path
     drawn = {"priority_exponent": 0.7, "min_priority": 0.2} if prioritized else {}
     replay = ReplayConfig(capacity=777, prioritized=prioritized, equal_shares=True, num_newest=3, **drawn)
     learner = LearnerConfig(warmup_steps=100, num_updates_per_call=5)
-    config = run_of(agent=RainbowConfig(**OBSERVED, n_steps=2, sight_weight=0.5), replay=replay, learner=learner)
-    parts = assemble(config, tmp_path).learner
+    agent = RainbowConfig(**OBSERVED, n_steps=2, sight_weight=0.5)
+    group = GroupConfig(num_processes=2, process_id=1, coordinator="here:1")
+    config = run_of(agent=agent, replay=replay, learner=learner, group=group)
+    made = assemble(config, tmp_path)
+    parts, footprint = made.learner, made.footprint
+    assert made.pool_config.seed == config.games_seed != config.seed
+    assert (footprint.num_actors, footprint.num_games, footprint.replay_bytes) == (3, 6, parts.device_bytes())
     assert isinstance(parts, OffPolicyParts)
     assert parts.replay_spec == ReplaySpec(
         **sizes_of(config),

@@ -12,6 +12,7 @@ import pytest
 
 from actors.config import ActorsConfig
 from gvz.actions import UNIFIED_V1
+from gvz.cluster.config import ClusterConfig
 from gvz.core.env_config import EnvConfig
 from gvz.core.errors import ConfigError, TaskError
 from gvz.launch import main, parse, resumed_config
@@ -227,8 +228,12 @@ BAD = {
     "--seed -1": "seed: got -1",
     "--learner.batch-size 0": "learner.batch_size: got 0",
     "--learner.warmup-steps 200000": "learner.warmup_steps: got 200000, more than replay.capacity",
-    "--learner.warmup-steps 20": "learner.batch_size: got 32, more than the 20 decisions",
+    "--learner.warmup-steps 31": "learner.batch_size: got 32, more than the 31 decisions",
+    "--max-processor-s 0": "max_processor_s: got 0, want more than 0",
     "--replay.capacity 70 --learner.warmup-steps 64": "replay.capacity: got 70, want at least",
+    "--actors.num-actors 2 --agent.past-actions 9 --replay.capacity 415 --learner.warmup-steps 64": (
+        "replay.capacity: got 415, want at least 416 for 8 games"
+    ),
     "--learner.learning-rate nan": "learner.learning_rate: got nan",
     "--replay.num-newest 32": "replay.num_newest: got 32, want less than learner.batch_size 32",
     "--actors.num-actors 16 --actors.games-per-actor 4 --learner.warmup-steps 191": (
@@ -348,7 +353,14 @@ def test_every_actor_has_every_task_unless_there_are_many(training_set, actors, 
     assert run.games_per_actor == games
 
 
+def test_games_whose_tasks_change_may_be_fewer_than_tasks(monkeypatch):
+    monkeypatch.setattr("gvz.run.config.num_cores", lambda: 1)
+    assert parse("--curriculum.kind uniform --actors.games-per-actor 1".split()).run.num_lanes == 1
+
+
 def test_derived_numbers_are_saved_explicitly():
+    on_hosts = RunConfig(name="x", cluster=ClusterConfig(address="10.0.0.1:6379", hosts=3))
+    assert config_from_dict(config_to_dict(on_hosts)).num_actors == on_hosts.num_actors
     config = RunConfig(name="x")
     saved = config_from_dict(config_to_dict(config))
     assert saved.actors.num_actors == config.num_actors

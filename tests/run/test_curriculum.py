@@ -2,6 +2,8 @@
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -14,6 +16,8 @@ from gvz.run.assemble import assemble
 from gvz.run.config_files import load_config
 from gvz.run.curriculum import Curriculum
 from gvz.run.curriculum_config import CurriculumConfig, first_tasks, steps_of
+from gvz.run.monitor import Counts
+from gvz.run.train import Trainer
 from gvz.task_table import task_table
 from gvz.transport.messages import EpisodeStats
 
@@ -62,6 +66,26 @@ def test_uniform_draws_every_task_alike():
     assert np.abs(counts - 1_000).max() < 4 * 1_000**0.5
 
 
+def test_the_lane_whose_episode_has_ended_has_the_task_that_was_drawn_and_a_cut_episode_draws_none():
+    assigned, drawn = list[tuple[int, int]](), list[tuple[int, float]]()
+    trainer, silent = Trainer.__new__(Trainer), lambda *_, **__: None
+    told = [msgspec.structs.replace(ended(task), lane=9 - task, score=110.0, cut=task == 1) for task in range(3)]
+    parts: Any = SimpleNamespace(table=TABLE)
+    pool: Any = SimpleNamespace(poll=lambda: told, assign=lambda *given: assigned.append(given))
+    lessons: Any = SimpleNamespace(next_task=lambda end, percent: drawn.append((end.task, percent)) or 3 - end.task)
+    trainer._parts, trainer._pool, trainer._curriculum, trainer._counts = parts, pool, lessons, Counts()
+    trainer._telemetry = SimpleNamespace(episode=silent)  # pyright: ignore
+    trainer._learner = SimpleNamespace(add_episode=silent)  # pyright: ignore
+    trainer._supervise()
+    assert drawn == [(0, 10.0), (2, 10.0)]
+    assert assigned == [(9, 3), (7, 1)]
+
+
+def test_runs_of_other_seeds_draw_other_tasks():
+    drawn = [play(Curriculum(CurriculumConfig(kind="uniform"), TABLE, seed), 0.0, 40) for seed in (7, 7, 8)]
+    assert drawn[0] == drawn[1] != drawn[2]
+
+
 def test_the_next_level_opens_when_every_task_of_the_last_is_learned():
     lessons = curriculum(kind="level", learned_percent=60.0, window_episodes=5)
     assert set(play(lessons, 59.0, 50)) == {0}
@@ -97,8 +121,10 @@ def test_progress_draws_where_the_score_moves_most():
     by_rank = 1 / np.arange(1, 5) / (1 / np.arange(1, 5)).sum()
     assert counts[2] / 2_000 == pytest.approx(by_rank[0], abs=0.06)
     lessons = curriculum(kind="progress", staleness_share=1.0)
-    gaps = np.diff(np.flatnonzero(np.array(play(lessons, 30.0, 2_000)) == 3))
-    assert gaps.max() < 30, "a stale task comes back"
+    drawn = np.array(play(lessons, 30.0, 2_000))
+    assert np.diff(np.flatnonzero(drawn == 3)).max() < 30, "a stale task comes back"
+    since = np.array([np.argmax(drawn[::-1] == task) for task in range(4)])  # the last draw was of one that has 0
+    np.testing.assert_allclose(lessons.probabilities(), since / since.sum())
     lessons = curriculum(kind="progress", staleness_share=0.0, temperature=0.5)
     play(lessons, 30.0, 8)
     squares = np.array([1 / 16, 1 / 9, 1 / 4, 1])  # (1 / rank)^(1 / 0.5)
@@ -138,8 +164,15 @@ def test_a_run_that_goes_on_draws_the_same(settings):
 
 def test_what_cannot_be_is_refused():
     config = load_config("rainbow_quick")
-    for kind, message in (("level", "all tasks have level 0"), ("uniform", "got uniform for one task")):
+    for kind, message in (
+        ("level", "all tasks have level 0"),
+        ("uniform", "got uniform for one task"),
+        ("progress", "got progress for one task"),
+    ):
         with pytest.raises(ConfigError, match=message):
             dataclasses.replace(config, curriculum=CurriculumConfig(kind=kind))
+    for kind, unused in (("uniform", "window_episodes"), ("level", "temperature"), ("progress", "learned_percent")):
+        with pytest.raises(ConfigError, match=rf"curriculum\.{unused}: got 9.*curriculum\.kind {kind}"):
+            CurriculumConfig(kind=kind, **{unused: 9})
     with pytest.raises(ConfigError, match=r"curriculum\.learned_percent: got 101\.0, want 0\.\.100"):
         CurriculumConfig(learned_percent=101.0)

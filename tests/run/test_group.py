@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from gvz.cluster.config import ClusterConfig
 from gvz.core import watchdog
 from gvz.core.errors import ConfigError, GroupError, WaitTimeoutError
 from gvz.core.stop import StopRequest
@@ -18,13 +19,16 @@ from gvz.launch import main
 from gvz.run import link, relay
 from gvz.run.config import CheckpointConfig
 from gvz.run.config_files import config_from_dict, config_to_dict, load_config
-from gvz.run.group import Several
+from gvz.run.group import Several, _settings
 from gvz.run.group_config import GroupConfig
 from gvz.run.relay import Relay, free_port
+from learner.agents.configs.ppo import PPOConfig
 from learner.checkpoint import Restored
+from learner.config import OnPolicyConfig
 from tests.waiting import wait_until
 
 CONFIG = load_config("rainbow_4task")
+HOSTS = ClusterConfig(address="10.0.0.1:6379", hosts=2)
 
 
 class WithoutDevices(Several):
@@ -179,6 +183,8 @@ def test_processes_that_differ_are_refused_on_both_sides_by_the_name_of_what_dif
     until_no_link_is_open()
     for group in joined(2, name="another"):
         group._opened.close()
+    compared = {name.partition(".")[0] for name in _settings(CONFIG)}
+    assert compared >= {"seed", "tasks", "scenario", "env", "agent", "replay", "learner", "curriculum", "checkpoint"}
 
 
 def test_processes_of_different_source_files_are_refused(monkeypatch):
@@ -266,6 +272,7 @@ def test_a_process_that_cannot_reach_jax_in_process_0_says_so(monkeypatch):
     [
         ({}, r"group\.coordinator: got None for 2 processes, want HOST:PORT"),
         ({"coordinator": "here", "process_id": 0}, r"group\.coordinator: got 'here'"),
+        ({"coordinator": "here:0", "process_id": 0}, r"group\.coordinator: got 'here:0'"),
         ({"coordinator": "here:65536", "process_id": 0}, r"group\.coordinator: got 'here:65536'.* port of 1\.\.65535"),
         ({"coordinator": "[fd00::1]:1", "process_id": 0}, r"got '\[fd00::1\]:1' for 2 processes, .* IPv4 address"),
         ({"coordinator": "here:1", "process_id": 2}, r"group\.process_id: got 2, want 0\.\.1"),
@@ -303,6 +310,8 @@ def test_slurm_says_which_process_this_is_and_each_has_a_directory_and_games_of_
     [
         ({"mode": "sync"}, r"mode: got sync with 2 learner processes, want async"),
         ({"max_processor_s": 5.0}, r"max_processor_s: got 5\.0 with 2 learner processes, want none"),
+        ({"cluster": HOSTS}, r"cluster\.hosts: got 2 with 2 learner processes, want 0"),
+        ({"agent": PPOConfig(), "learner": OnPolicyConfig(), "replay": None}, r"agent\.name: got ppo with 2 learner"),
         (
             {"checkpoint": CheckpointConfig(keep=1)},
             r"checkpoint\.keep: got 1 with 2 learner processes, want at least 2",

@@ -17,7 +17,7 @@ from gvz.run import machine
 from gvz.run.config import LogConfig
 from gvz.run.config_files import load_config
 from gvz.run.rundir import RunDir
-from gvz.run.telemetry import Telemetry, start_wandb
+from gvz.run.telemetry import RECENT_EPISODES, Rates, Telemetry, start_wandb
 from gvz.task_table import task_table
 from gvz.transport.messages import EpisodeStats
 from tests.full_disk import full_disk
@@ -129,23 +129,53 @@ def telemetry(run: RunDir) -> Telemetry:
     return Telemetry(run, TABLE, LogConfig(tensorboard=False, wandb=True), 0)
 
 
+CUT = EpisodeStats(
+    lane=0, task=1, episode=0, seed=1, score=9.0, reward=0.0, reward_components={}, length_frames=8,
+    length_steps=2, params_version=0, terminated=False, truncated=True, cut=True,
+)  # fmt: skip
+
+
 def test_an_episode_that_was_cut_is_recorded_and_has_no_part_in_the_score_of_its_task(tmp_path):
-    stats = EpisodeStats(
-        lane=0, task=1, episode=0, seed=1, score=9.0, reward=0.0, reward_components={}, length_frames=8,
-        length_steps=2, params_version=0, terminated=False, truncated=True, cut=True,
-    )  # fmt: skip
     with RunDir(tmp_path) as run:
         telemetry = Telemetry(run, TABLE, LogConfig(tensorboard=False), 0)
-        telemetry.episode(stats, num_updates=0, env_steps=0)
+        telemetry.episode(CUT, num_updates=0, env_steps=0)
         telemetry.scalars(0, {})
         assert [status.episodes for status in telemetry.task_statuses()] == [0, 0]
         for score in (2.0, 4.0):
-            telemetry.episode(msgspec.structs.replace(stats, cut=False, score=score), num_updates=1, env_steps=0)
+            telemetry.episode(msgspec.structs.replace(CUT, cut=False, score=score), num_updates=1, env_steps=0)
         telemetry.scalars(1, {})
     first, second = records.read(tmp_path / "metrics.jsonl")[0]
     assert not [name for name in first if name.startswith("task/")]
     assert {name: second[name] for name in second if name.startswith("task/")} == {f"task/{TASKS[1]}/score": 3.0}
-    assert [row["cut"] for row in records.read(tmp_path / "episodes.jsonl")[0]] == [True, False, False]
+    episodes, _ = records.read(tmp_path / "episodes.jsonl")
+    assert [row["cut"] for row in episodes] == [True, False, False]
+    percents = [100 * score / TABLE.rows[1].upper_bound for score in (9.0, 2.0, 4.0)]
+    assert [row["normalized_score"] for row in episodes] == pytest.approx(percents)
+
+
+def test_a_run_that_goes_on_has_the_episodes_and_the_recent_scores_of_before(tmp_path):
+    with RunDir(tmp_path) as run:
+        before, after = (Telemetry(run, TABLE, LogConfig(tensorboard=False), 0) for _ in range(2))
+
+        def play(telemetry: Telemetry, score: float, episodes: int) -> tuple[int, float]:
+            for _ in range(episodes):
+                telemetry.episode(msgspec.structs.replace(CUT, cut=False, score=score), num_updates=1, env_steps=0)
+            status = telemetry.task_statuses()[1]
+            return status.episodes, status.score
+
+        play(before, 2.0, RECENT_EPISODES)
+        after.restore(msgspec.msgpack.decode(msgspec.msgpack.encode(before.state())))
+        assert play(after, 8.0, RECENT_EPISODES // 2) == (RECENT_EPISODES * 3 // 2, 5.0)
+        assert play(after, 8.0, RECENT_EPISODES) == (RECENT_EPISODES * 5 // 2, 8.0)
+
+
+def test_rates_count_from_the_last_look_and_not_from_the_beginning_of_a_run_that_goes_on(monkeypatch):
+    now_s = [100.0]
+    monkeypatch.setattr("gvz.run.telemetry.time.monotonic", lambda: now_s[0])
+    rates, found = Rates(), []
+    for now_s[0], updates in ((101.0, 5_000), (103.0, 5_010), (113.0, 5_020)):
+        found.append(rates({"updates": updates}))
+    assert found == [{"updates": 0.0}, {"updates": 5.0}, {"updates": 1.0}]
 
 
 def test_wandb_that_is_not_installed_is_an_error_with_its_remedy(tmp_path, monkeypatch):

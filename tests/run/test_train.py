@@ -8,6 +8,7 @@ import re
 import signal
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgpack
@@ -28,9 +29,10 @@ from gvz.core.stop import StopRequest
 from gvz.run import machine
 from gvz.run.config import CheckpointConfig, LogConfig, RunConfig
 from gvz.run.curriculum_config import CurriculumConfig
+from gvz.run.monitor import Counts
 from gvz.run.rundir import RunDir
 from gvz.run.saver import Saver
-from gvz.run.train import train, with_own_segmenters
+from gvz.run.train import Trainer, train, with_own_segmenters
 from gvz.segmentation import segmenter_file
 from learner.agents.configs.dqn import DQNConfig
 from learner.agents.configs.ppo import PPOConfig
@@ -179,10 +181,29 @@ def test_a_run_that_explores_by_epsilon_goes_on_bit_for_bit_between_two_publicat
     assert len(np.unique(whole["['replay'].store.action"])) > 1
     assert [name for name in whole if not np.array_equal(whole[name], cut[name])] == []
     assert (tmp_path / "whole" / "episodes.jsonl").read_bytes() == (tmp_path / "cut" / "episodes.jsonl").read_bytes()
+    hosts = [
+        msgpack.unpackb((tmp_path / name / "checkpoints/80/host.msgpack").read_bytes()) for name in ("whole", "cut")
+    ]
+    for host in hosts:
+        del host["counts"]["processor_s"], host["records"]
+    assert hosts[0] == hosts[1]
     episodes, _ = records.read(tmp_path / "whole" / "episodes.jsonl")
     assert len({(row["lane"], row["task"]) for row in episodes}) > 2, "tasks of games change"
     assert logged_updates(tmp_path / "whole") == [20, 40, 60, 80]
     assert logged_updates(tmp_path / "cut") == [50, 60, 80]
+
+
+def test_parameters_are_published_when_warm_up_ends_and_then_every_period():
+    published, trainer = list[tuple[int, int]](), Trainer.__new__(Trainer)
+    learner = replace(DQN.learner, warmup_steps=60, publish_period_updates=10)
+    parts: Any = SimpleNamespace(pool_config=SimpleNamespace(layout_hash=0))
+    pool: Any = SimpleNamespace(publish=lambda _, header: published.append((header.version, header.num_updates)))
+    trainer._config, trainer._parts, trainer._pool = replace(DQN, learner=learner), parts, pool
+    trainer._learner = SimpleNamespace(acting_params=lambda: None, epsilon=lambda _: 0.5)  # pyright: ignore
+    trainer._counts = counts = Counts()
+    for counts.env_steps, counts.updates in ((59, 0), (60, 0), (70, 9), (80, 11), (90, 19), (99, 40), (120, 49)):
+        trainer._broadcast()
+    assert published == [(1, 0), (2, 11), (3, 40)]
 
 
 def test_a_host_state_that_no_run_can_go_on_from_is_named(tmp_path):

@@ -4,10 +4,13 @@ import importlib
 import os
 import signal
 import sys
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.spaces import Box, Discrete
+from gymnasium.vector import AutoresetMode
 
 import gvz
 from gvz.core.errors import ConfigError
@@ -66,6 +69,7 @@ def test_an_episode_of_stable_baselines3_ends_with_its_own_score(sb3_vec_env):
             if over[game]:
                 assert info["score"] > before[game] > 0
                 assert info["terminal_observation"].shape == envs.envs.single_observation_space.shape
+                assert not info["TimeLimit.truncated"], "it died"
                 ended += 1
             before[game] = 0.0 if over[game] else info["score"]
     assert envs.get_images() == [None, None]
@@ -136,13 +140,46 @@ def test_stable_baselines3_steps_all_games_together(sb3_vec_env):
 @pytest.mark.engine
 def test_stable_baselines3_is_told_that_an_episode_ended_because_its_engine_died(sb3_vec_env):
     envs = sb3_vec_env(gvz.make_vec("defend_the_center/default", 2, num_workers=1, autoreset_mode="SameStep"))
-    envs.reset()
+    before = envs.reset()
     os.kill(envs.envs._crew.pids[0], signal.SIGKILL)
     envs.step_async(np.zeros(2, np.int64))
-    _, _, over, infos = envs.step_wait()
+    frames, _, over, infos = envs.step_wait()
     assert over.all()
     assert [info["engine_crash"] for info in infos] == [True, True]
+    assert [info["TimeLimit.truncated"] for info in infos] == [True, True], "the value of its end is not 0"
+    np.testing.assert_array_equal([info["terminal_observation"] for info in infos], before)
+    assert (frames != before).any(axis=(1, 2, 3)).all(), "the next episode's first"
     envs.close()
+
+
+def test_tianshou_has_the_answers_in_the_order_of_its_games_and_the_newest_frame_last():
+    sent: list[tuple[int, int]] = []
+
+    def recv() -> tuple[Any, ...]:
+        game, action = sent.pop()  # the last one answers first
+        games = np.array([game])
+        infos = {"env_id": games, "score": 2.0 * games, "engine_crash": games == 0}
+        return np.full((1, 1, 1, 1), 10 * game + action, np.uint8), 1.0 * games, games == 1, games == 2, infos
+
+    made: Any = SimpleNamespace(
+        metadata={"autoreset_mode": AutoresetMode.DISABLED},
+        batch_size=1,
+        num_envs=3,
+        single_observation_space=Box(0, 255, (1, 1, 1), np.uint8),
+        single_action_space=Discrete(9),
+        send=lambda actions, games: sent.extend(zip(games.tolist(), actions.tolist(), strict=True)),
+        recv=recv,
+    )
+    envs, games = TianshouVectorEnv(made, num_stack=2), np.array([2, 0, 1])
+    envs.step(np.array([1, 2, 3]), games)
+    stacks, rewards, terminated, truncated, infos = envs.step(np.array([4, 5, 6]), games)
+    assert stacks[..., 0, 0, 0].tolist() == [[21, 24], [2, 5], [13, 16]]
+    assert rewards.tolist() == [2.0, 0.0, 1.0]
+    assert terminated.tolist() == [False, False, True]
+    assert truncated.tolist() == [True, False, False]
+    assert infos.tolist() == [
+        {"env_id": game, "score": 2.0 * game, "engine_crash": game == 0} for game in games.tolist()
+    ]
 
 
 @pytest.mark.engine

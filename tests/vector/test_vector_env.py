@@ -8,6 +8,7 @@ import resource
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -17,8 +18,10 @@ from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoA
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import gvz
+from gvz.core import watchdog
 from gvz.core.errors import ConfigError, TaskError
 from gvz.env import DoomEnv
+from gvz.vector import crew
 from gvz.vector.env import DoomVectorEnv
 from gvz.vector.infos import batch_infos
 
@@ -127,9 +130,20 @@ def test_recv_gives_a_batch_of_those_that_are_ready_and_every_game_its_own_way(e
             num_answers[game] += 1
         envs.send(np.full(2, 1), games)
     assert min(num_answers) > 5
+    assert envs._frames.progress.min() > 5, "else a worker that always has something to do would count as stuck"
     assert envs.reset(seed=4)[0].tobytes() == first.tobytes(), "reset drops what is on its way"
     for env in alone:
         env.close()
+
+
+def test_a_worker_is_silent_from_its_last_decision_on(monkeypatch: pytest.MonkeyPatch):
+    now_s, worker = [0.0], crew._Worker.__new__(crew._Worker)
+    monkeypatch.setattr(watchdog, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    worker.progress, worker.clock = 0, watchdog.AwakeClock(10.0)
+    silent_s = []
+    for now_s[0], progress in ((5.0, 0), (9.0, 3), (10.0, 3), (12.0, 4), (14.0, 4)):
+        silent_s.append(worker.silent_s(progress))
+    assert silent_s == [5.0, 0.0, 1.0, 0.0, 2.0]
 
 
 @pytest.mark.engine
