@@ -234,7 +234,7 @@ class Crew:
                 f"between{worker.log_tail()}"
             )
         worker.start()
-        waiting = set(worker.spec.games) - pending.keys()
+        waiting = self._last_infos.keys() & set(worker.spec.games) - pending.keys()
         self._lost |= dict.fromkeys(waiting, what)
         if again := [one for decision in pending.values() for one in self._cut(decision, what)]:
             worker.send(again)
