@@ -140,6 +140,7 @@ def test_stable_baselines3_steps_all_games_together(sb3_vec_env):
 @pytest.mark.engine
 def test_stable_baselines3_is_told_that_an_episode_ended_because_its_engine_died(sb3_vec_env):
     envs = sb3_vec_env(gvz.make_vec("defend_the_center/default", 2, num_workers=1, autoreset_mode="SameStep"))
+    envs._seeds = [1, 2]
     before = envs.reset()
     os.kill(envs.envs._crew.pids[0], signal.SIGKILL)
     envs.step_async(np.zeros(2, np.int64))
