@@ -14,7 +14,7 @@ from gymnasium.spaces import Discrete, MultiDiscrete
 
 from gvz.actions import AXES_V1, action_buttons, choice_mask
 from gvz.core.env_config import EPISODE_SEEDS, EnvConfig, as_integer, given_episode_seed, typed
-from gvz.core.errors import ConfigError, EngineError
+from gvz.core.errors import ConfigError, EngineError, UnknownOptionError
 from gvz.engine.engine import Engine, EngineConfig, check_config
 from gvz.engine.probe import ensure_loads
 from gvz.observation import (
@@ -396,5 +396,6 @@ def _with_fields(config: EnvConfig | Mapping[str, Any] | None, fields: Mapping[s
         config, fields = EnvConfig(), {**(config or {}), **fields}
     known = [field.name for field in dataclasses.fields(EnvConfig)]
     if unknown := sorted(fields.keys() - set(known)):
-        raise ConfigError(f"env: unknown options {unknown}, want some of {', '.join(known)}")
+        arguments = f"argument{'s' * (len(unknown) > 1)} {', '.join(map(repr, unknown))}"
+        raise UnknownOptionError(f"env: got an unexpected keyword {arguments}, want some of {', '.join(known)}")
     return dataclasses.replace(typed(EnvConfig, config, "config"), **fields)

@@ -116,8 +116,14 @@ def test_an_environment_is_made_again_from_the_json_of_its_spec():
     assert env.spec is not None
     again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
     assert again.unwrapped.config == env.unwrapped.config
-    with pytest.raises(ConfigError, match=r"unknown options \['frame_skp'\]"):
-        gymnasium.make(name, config={"frame_skp": 8})
+    with pytest.raises(ConfigError, match="unexpected keyword arguments 'frame_skp', 'lives', want some of"):
+        gymnasium.make(name, config={"frame_skp": 8}, lives=3)
+
+
+def test_an_unknown_keyword_is_pythons_own_error():
+    """TorchRL's GymEnv tries `frameskip` on every environment, and goes without it after a TypeError of these words."""
+    with pytest.raises(TypeError, match="got an unexpected keyword argument 'frameskip'"):
+        gymnasium.make("GViZDoom/SeekAndKill-Default-v0", frameskip=1)
 
 
 @pytest.mark.parametrize(

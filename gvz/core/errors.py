@@ -25,6 +25,10 @@ class ConfigError(GvzError, ValueError):
     exit_code = 2
 
 
+class UnknownOptionError(ConfigError, TypeError):
+    """A keyword argument that does not exist: a TypeError, as Python's own, which TorchRL's GymEnv expects."""
+
+
 class TaskError(GvzError, ValueError):
     """An unknown scenario, task or attribute, or a set of attributes that cannot be combined."""
 

@@ -48,6 +48,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
     Attributes:
         tasks: id of each game's task.
         batch_size: games that `recv` waits for, B.
+        autoreset_mode: Gymnasium's, as its own vector environments have it.
     """
 
     closed = True
@@ -93,7 +94,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         self.batch_size = arguments.number("batch_size", batch_size, default=self.num_envs, most=self.num_envs)
         cores = min(self.num_envs, num_cores())
         num_workers = arguments.number("num_workers", num_workers, default=cores, most=self.num_envs)
-        self._mode = arguments.autoreset_mode(autoreset_mode)
+        self.autoreset_mode = arguments.autoreset_mode(autoreset_mode)
         if not copy and self.batch_size < self.num_envs:
             raise ConfigError(f"make_vec: got copy=False and batch_size={self.batch_size}, want {self.num_envs}")
         if render_mode not in (None, "rgb_array"):
@@ -104,7 +105,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         check_one_action_set("make_vec", [env.task for env in envs.values()], first.config.action_set)
         self.tasks = tuple(envs[ids[game % len(ids)]].task.id for game in range(self.num_envs))
         self.render_mode = render_mode
-        self.metadata = {**first.metadata, "autoreset_mode": self._mode}
+        self.metadata = {**first.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_observation_space, self.single_action_space = first.observation_space, first.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -118,7 +119,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             env=self._config,
             num_envs=self.num_envs,
             num_workers=num_workers,
-            same_step=self._mode is AutoresetMode.SAME_STEP,
+            same_step=self.autoreset_mode is AutoresetMode.SAME_STEP,
         )
         self._frames = Frames.create(layout)
         specs = [
@@ -214,7 +215,7 @@ class DoomVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         numbers: list[int | list[int] | None] = [*arguments.action_numbers(actions, games, space)]
         self._require_begun("send", games)
         over = self._ended[games]
-        if over.any() and self._mode is AutoresetMode.DISABLED:
+        if over.any() and self.autoreset_mode is AutoresetMode.DISABLED:
             raise ResetNeeded(f"send: the episodes of games {games[over].tolist()} are over; reset them (reset_mask)")
         self._send(games, [None if end else action for action, end in zip(numbers, over.tolist(), strict=True)])
 

@@ -189,16 +189,22 @@ def test_tianshou_seeds_its_games_and_is_told_that_an_episode_ended_because_its_
     first, infos = envs.reset(seed=7)
     assert [info["env_id"] for info in infos] == [0, 1]
     assert (envs.reset(seed=7)[0] == first).all()
-    one, _ = envs.reset([1], options={"episode_seed": 5})
+    seeds = envs.seed(7)
+    assert seeds == [[7], [8]]
+    second = envs.reset()[0]
+    assert (second != first).any()
+    envs.seed(7)
+    assert (envs.reset()[0] == second).all()
+    one, _ = envs.reset(1, options={"episode_seed": 5})
     assert (envs.reset([1], options={"episode_seed": 5})[0] == one).all()
     with pytest.raises(TypeError, match="episode_seed"):
         envs.reset(episode_seed=5)
-    _, _, terminated, truncated, infos = envs.step(np.zeros(2, np.int64), np.array([0, 1]))
+    _, _, terminated, truncated, infos = envs.step(np.zeros(2, np.int64))
     assert not (terminated | truncated).any()
     assert [info["engine_crash"] for info in infos] == [False, False]
     assert [info["score"] for info in infos] == [0.0, 0.0]
     os.kill(envs.envs._crew.pids[0], signal.SIGKILL)
-    _, _, _, truncated, infos = envs.step(np.zeros(1, np.int64), np.array([0]))
+    _, _, _, truncated, infos = envs.step(np.zeros(1, np.int64), 0)
     assert truncated.all()
     assert infos[0]["engine_crash"]
     envs.close()

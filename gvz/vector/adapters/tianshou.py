@@ -12,6 +12,9 @@ from gymnasium.vector import AutoresetMode
 from gvz.core.errors import ConfigError
 from gvz.vector.env import DoomVectorEnv
 
+Games = np.ndarray | Sequence[int] | int | None
+"""numbers of games; None stands for all"""
+
 
 class TianshouVectorEnv:
     """Games in worker processes. Observations are stacks of the last frames, u8[N, num_stack, 84, 84, C], newest last.
@@ -47,7 +50,7 @@ class TianshouVectorEnv:
         return self.env_num
 
     def reset(
-        self, env_id: Sequence[int] | None = None, *, seed: Any = None, options: dict[str, Any] | None = None
+        self, env_id: Games = None, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Begins episodes of these games, of all by default: observations, and infos.
 
@@ -55,18 +58,27 @@ class TianshouVectorEnv:
             env_id: numbers of the games.
             seed, options: as for `DoomVectorEnv.reset`.
         """
-        games = np.arange(self.env_num) if env_id is None else np.asarray(env_id)
+        games = self._games(env_id)
         mask = np.isin(np.arange(self.env_num), games)
         frames, infos = self.envs.reset(seed=seed, options={**(options or {}), "reset_mask": mask})
         self._stacks[games] = frames[games, None]
         return self._stacks[games], np.array([_info(game, infos, game) for game in games])
 
-    def step(self, action: np.ndarray, id: np.ndarray) -> tuple[np.ndarray, ...]:
-        """One decision of each of these games: observations, rewards, terminated, truncated, infos.
+    def seed(self, seed: int | Sequence[int | None] | None = None) -> list[list[int]]:
+        """Begins new sequences of episodes in all games, as Tianshou's own do: game i gets seed + i, or seed[i].
+
+        Returns the seeds; the next `reset` without one begins the second episodes.
+        """
+        self.reset(seed=seed)
+        return [[one] for one in self.envs.np_random_seed]
+
+    def step(self, action: np.ndarray, id: Games = None) -> tuple[np.ndarray, ...]:
+        """One decision of each of these games, of all by default: observations, rewards, terminated, truncated, infos.
 
         An info has the game's `env_id`, the episode's `score` so far, and whether it ended in an `engine_crash`.
         """
-        self.envs.send(np.asarray(action), id)
+        id = self._games(id)
+        self.envs.send(np.atleast_1d(action), id)
         answers = {int(answer[-1]["env_id"][0]): answer for answer in (self.envs.recv() for _ in id)}
         frames, rewards, terminated, truncated = (
             np.concatenate([answers[game][part] for game in id]) for part in range(4)
@@ -79,6 +91,10 @@ class TianshouVectorEnv:
             truncated,
             np.array([_info(game, answers[game][-1], 0) for game in id]),
         )
+
+    def _games(self, given: Games) -> np.ndarray:
+        """int[B]"""
+        return np.arange(self.env_num) if given is None else np.atleast_1d(given)
 
     def render(self) -> Sequence[np.ndarray]:
         """The screens of all games, u8[H, W, 3] each; none without a render mode."""
