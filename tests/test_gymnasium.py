@@ -116,8 +116,8 @@ def test_an_environment_is_made_again_from_the_json_of_its_spec():
     assert env.spec is not None
     again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
     assert again.unwrapped.config == env.unwrapped.config
-    with pytest.raises(ConfigError, match="unexpected keyword arguments 'frame_skp', 'lives', want some of"):
-        gymnasium.make(name, config={"frame_skp": 8}, lives=3)
+    with pytest.raises(ConfigError, match="unexpected keyword argument 'frame_skp', want "):
+        gymnasium.make(name, config={"frame_skp": 8})
 
 
 def test_an_unknown_keyword_is_pythons_own_error():
