@@ -35,7 +35,7 @@ install-cuda: install ## add JAX for NVIDIA GPUs
 train: install   ## run the main job (ARGS="--learner.total-updates 5000 ...")
 	$(BIN)/python -m gvz.launch --config rainbow_4task.py $(ARGS)
 
-test: install    ## all tests but the slow lane, in three processes, since one often waits (some 20 minutes on 2 cores)
+test: install    ## all tests but the slow lane, in three processes (14 to 27 minutes on 2 cores)
 	$(BIN)/python -m pytest -m "not slow and not browser" -n 3 --dist loadfile $(ARGS)
 
 test-fast: install ## unit tests that start no engine

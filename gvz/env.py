@@ -396,5 +396,5 @@ def _with_fields(config: EnvConfig | Mapping[str, Any] | None, fields: Mapping[s
         config, fields = EnvConfig(), {**(config or {}), **fields}
     known = [field.name for field in dataclasses.fields(EnvConfig)]
     if unknown := sorted(fields.keys() - set(known)):
-        raise UnknownOptionError(f"env: got an unexpected keyword argument '{unknown[0]}', want {', '.join(known)}")
+        raise UnknownOptionError(f"env: unexpected keyword argument '{unknown[0]}', want one of {', '.join(known)}")
     return dataclasses.replace(typed(EnvConfig, config, "config"), **fields)

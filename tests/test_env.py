@@ -312,7 +312,7 @@ def test_a_seed_gives_a_sequence_of_episodes(shared: DoomEnv):
     ("options", "error", "message"),
     [
         ({"task": "defend_the_center/blood"}, TaskError, "unknown attribute 'blood'"),
-        ({"frame_skp": 4}, ConfigError, "unexpected keyword argument 'frame_skp', want frame_height"),
+        ({"frame_skp": 4}, ConfigError, "unexpected keyword argument 'frame_skp', want one of frame_height"),
         ({"frame_skip": 0}, ConfigError, r"env.frame_skip: got 0, want 1\.\.35"),
         (
             {"action_set": "all"},

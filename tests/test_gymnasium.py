@@ -116,13 +116,13 @@ def test_an_environment_is_made_again_from_the_json_of_its_spec():
     assert env.spec is not None
     again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
     assert again.unwrapped.config == env.unwrapped.config
-    with pytest.raises(ConfigError, match="unexpected keyword argument 'frame_skp', want "):
+    with pytest.raises(ConfigError, match="unexpected keyword argument 'frame_skp', want one of"):
         gymnasium.make(name, config={"frame_skp": 8})
 
 
 def test_an_unknown_keyword_is_pythons_own_error():
     """TorchRL's GymEnv tries `frameskip` on every environment, and goes without it after a TypeError of these words."""
-    with pytest.raises(TypeError, match="got an unexpected keyword argument 'frameskip'"):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'"):
         gymnasium.make("GViZDoom/SeekAndKill-Default-v0", frameskip=1)
 
 

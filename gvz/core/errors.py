@@ -26,7 +26,7 @@ class ConfigError(GvzError, ValueError):
 
 
 class UnknownOptionError(ConfigError, TypeError):
-    """A keyword argument that does not exist: a TypeError, as Python's own, which TorchRL's GymEnv expects."""
+    """An unknown keyword argument. It is a TypeError, as in Python itself: TorchRL's GymEnv catches that."""
 
 
 class TaskError(GvzError, ValueError):

@@ -199,6 +199,8 @@ def test_tianshou_seeds_its_games_and_is_told_that_an_episode_ended_because_its_
     assert (envs.reset([1], options={"episode_seed": 5})[0] == one).all()
     with pytest.raises(TypeError, match="episode_seed"):
         envs.reset(episode_seed=5)
+    with pytest.raises(ValueError, match="numbers from 0 to 1"):
+        envs.reset(2)
     _, _, terminated, truncated, infos = envs.step(np.zeros(2, np.int64))
     assert not (terminated | truncated).any()
     assert [info["engine_crash"] for info in infos] == [False, False]

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from gvz.core.errors import ConfigError
+from gvz.vector.arguments import game_numbers
 from gvz.vector.env import DoomVectorEnv
 
 Games = np.ndarray | Sequence[int] | int | None
@@ -93,8 +94,8 @@ class TianshouVectorEnv:
         )
 
     def _games(self, given: Games) -> np.ndarray:
-        """int[B]"""
-        return np.arange(self.env_num) if given is None else np.atleast_1d(given)
+        """int[B]; ValueError if there is no such game."""
+        return game_numbers(None if given is None else np.atleast_1d(given), self.env_num)
 
     def render(self) -> Sequence[np.ndarray]:
         """The screens of all games, u8[H, W, 3] each; none without a render mode."""
