@@ -49,14 +49,18 @@ def _bars(bars: Sequence[tuple[str, Spread]], unit: str) -> Figure:
     return figure
 
 
-def growth(rows: Sequence[Row]) -> Figure:
+def growth(measured: Sequence[Row]) -> Figure:
     """One panel for each growing size; both axes are logarithmic, so linear growth has a slope of one."""
     panels: dict[str, list[str]] = {}
-    found = curves(rows)
+    found = curves(measured)
     for name, points in found.items():
         panels.setdefault(points[0]["x_unit"], []).append(name)
-    figure = Figure(figsize=(3.6 * len(panels), 3.2), layout="constrained")
-    for axes, (x_unit, names) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
+    rows, columns = -(-len(panels) // 3), min(3, len(panels))  # a row of more is too small to read on a page
+    figure = Figure(figsize=(3.2 * columns, 3.0 * rows), layout="constrained")
+    all_axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes in all_axes[len(panels) :]:
+        axes.remove()
+    for axes, (x_unit, names) in zip(all_axes, panels.items(), strict=False):
         for name in names:
             points = found[name]
             medians = [point["median"] for point in points]
@@ -73,5 +77,5 @@ def growth(rows: Sequence[Row]) -> Figure:
         )  # the axis's own labels may lie on each other
         axes.set_xticks([], minor=True)
         axes.grid(visible=True, which="both", alpha=0.3)
-        axes.legend(fontsize=7)
+        axes.legend(fontsize=8, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0))  # hides no point
     return figure

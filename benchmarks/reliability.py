@@ -14,6 +14,7 @@ from benchmarks import hosts_soak, record
 from benchmarks.report import between
 from benchmarks.soak import DIRECTORY, SCHEMA, kill_ratios, summary
 from gvz.core.errors import ConfigError
+from gvz.reports.draw import COLOURS
 
 PAGE = record.ROOT / "docs" / "RELIABILITY.md"
 RECORDS = (DIRECTORY / "soak.json", DIRECTORY / "fuzz.json")
@@ -107,16 +108,21 @@ def draw(made: dict[str, Any], out: Path) -> None:
     figure = Figure(figsize=(9.0, 7.0), layout="constrained")
     all_axes = figure.subplots(3, 1, sharex=True)
     for axes, (label, curves) in zip(all_axes, panels.items(), strict=False):
+        axes.set_prop_cycle(color=COLOURS)
         for name, (column, unit) in curves.items():
             axes.plot(minutes, [value / unit for value in made["samples"][column]], label=name, linewidth=1)
         axes.set(ylabel=label, ylim=(0, None))
         axes.legend(loc="lower right", fontsize=8)
-    for stretch in made["stretches"]:
-        colour = "C3" if stretch["kind"] == "kills" else "C2"
-        ends = [stretch["begin_s"] / 60, stretch["end_s"] / 60]
-        all_axes[2].plot(ends, [stretch["updates_per_s"]] * 2, color=colour, linewidth=3)
-    all_axes[2].vlines([kill / 60 for kill in made["kills"]], 0, 0.05, transform=all_axes[2].get_xaxis_transform())
-    all_axes[2].set(xlabel="minutes (ticks: kills)", ylabel="gradient steps/s\ngreen: undisturbed", ylim=(0, None))
+    rates = all_axes[2]
+    for kind, colour in zip(("undisturbed", "kills"), COLOURS, strict=False):
+        mine = [stretch for stretch in made["stretches"] if stretch["kind"] == kind]
+        begins, ends = ([stretch[end] / 60 for stretch in mine] for end in ("begin_s", "end_s"))
+        values = [stretch["updates_per_s"] for stretch in mine]
+        rates.hlines(values, begins, ends, color=colour, linewidth=3, label="with kills" if kind == "kills" else kind)
+    kills = [kill / 60 for kill in made["kills"]]
+    rates.plot(kills, [0.25] * len(kills), "k|", label="kill")
+    rates.set(xlabel="minutes", ylabel="gradient steps/s", ylim=(0, None))
+    rates.legend(loc="center right", bbox_to_anchor=(1.0, 0.35), fontsize=8)
     figure.savefig(out, dpi=110, metadata={"Software": None})
 
 

@@ -341,3 +341,16 @@ def test_the_sizes_below_a_plot_of_growth_do_not_lie_on_each_other(sizes):
     boxes = sorted((label.get_window_extent() for label in labels), key=lambda box: box.x0)
     assert len(boxes) == len(sizes)
     assert all(left.x1 < right.x0 for left, right in itertools.pairwise(boxes))
+
+
+def test_a_plot_of_growth_can_be_read_on_a_page():
+    """Its legends hide no point, and it is less than 10 inches wide."""
+    sizes = [rounds.measured(f"step {n}", "ms", [1.0, 2.0], x=x, x_unit=f"{n}") for n in range(5) for x in (1, 2, 4)]
+    figure = plots.growth(sizes)
+    figure.draw_without_rendering()
+    assert figure.get_figwidth() < 10
+    assert len(figure.axes) == 5
+    for axes in figure.axes:
+        legend = axes.get_legend()
+        assert legend is not None
+        assert not legend.get_window_extent().overlaps(axes.bbox)

@@ -128,8 +128,8 @@ def draw_matrix(out: Path, id: str, title: str, names: Sequence[str], values: np
         axes.imshow(values, cmap="RdBu_r", vmin=-limit, vmax=limit)
         for (row, column), value in np.ndenumerate(values):
             if not np.isnan(value):
-                shade = "white" if abs(value) > 0.6 * limit else "black"
-                axes.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=8, color=shade)
+                shade = "white" if abs(value) > 0.67 * limit else "black"
+                axes.text(column, row, str(round(value)), ha="center", va="center", fontsize=8, color=shade)
         axes.set_xticks(range(len(names)), names, rotation=90)
         axes.set_yticks(range(len(names)), names)
         axes.xaxis.tick_top()
@@ -188,7 +188,7 @@ def draw_heat_map(
         heat.imshow(table, aspect="auto", cmap="viridis", vmin=0, vmax=100)
         for (row, column), value in np.ndenumerate(table):
             text = "-" if np.isnan(value) else f"{value:.0f}"
-            shade = "white" if value < 60 else "black"
+            shade = "white" if value < 44 else "black"
             heat.text(column, row, text, ha="center", va="center", fontsize=8, color=GREY if np.isnan(value) else shade)
         heat.set_xticks(range(num_agents), agents, rotation=90)
         for row, task in enumerate(tasks):

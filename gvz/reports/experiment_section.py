@@ -44,7 +44,7 @@ def experiment_section(results: Results, asked: PlannedExperiment, out: Path) ->
     tables = [result_table(results, asked), aggregate_table(results, asked)]
     if experiment.compares_training:
         tables.insert(1, result_table(results, asked, trained=True))
-    if experiment.columns != "level":
+    if experiment.columns != "level" and len(experiment.column_names) > 1:
         tables.append(comparison_table(results, asked))
     text = (f"**{experiment.question}** Source: {experiment.source}.", budget, *experiment.notes)
     if experiment.max_processor_s is not None:

@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 
 from gvz.evaluation.statistics import Estimate
@@ -53,3 +54,27 @@ def test_a_very_long_name_is_wrapped_and_its_file_can_be_written(tmp_path, recwa
     assert len(list(tmp_path.rglob("*.svg"))) == 4
     assert not recwarn.list
     assert what_id("a (b 0.5)") == "a__b_0_5_"
+
+
+def test_numbers_in_a_heat_map_or_matrix_can_be_read_on_their_colours(tmp_path, monkeypatch):
+    """A small loss is 0, not -0. The contrast of WCAG 2 is 4.5 on the heat map, 4 on the matrix's reds and blues."""
+    drawn: list[tuple[str, str]] = []
+    monkeypatch.setattr(Axes, "text", lambda _, _x, _y, text, color, **__: drawn.append((text, color)))
+    tasks = named_tasks("defend_the_center")
+    scores = {str(first): [100 * (first + n / len(tasks)) / 8 for n in range(len(tasks))] for first in range(8)}
+    draw_heat_map(tmp_path, "tasks", "tasks", tasks, scores, "by task")
+    heat, losses = drawn.copy(), np.linspace(-100.0, 100.0, 400).reshape(20, 20)
+    drawn.clear()
+    losses[0, 0] = -0.3
+    draw_matrix(tmp_path, "pairs", "pairs", [str(n) for n in range(20)], losses, "pairs")
+    assert drawn[0][0] == "0"
+    values = np.array(list(scores.values())).T
+    for numbers, shown, colours, wanted in (
+        (values / 100, heat, "viridis", 4.4),
+        (0.5 + losses / 200, drawn, "RdBu_r", 4.0),
+    ):
+        for number, (text, ink) in zip(numbers.flat, shown, strict=True):
+            rgb = np.array(colormaps[colours](number)[:3])
+            light = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4) @ (0.2126, 0.7152, 0.0722)
+            contrast = 1.05 / (light + 0.05) if ink == "white" else (light + 0.05) / 0.05
+            assert contrast > wanted, (colours, text)

@@ -57,6 +57,13 @@ def test_the_difference_and_its_probability(compared):
     assert probability.text == "1.00 [1.00, 1.00]"
 
 
+def test_an_experiment_of_one_column_has_no_table_of_comparisons(compared, tmp_path):
+    (asked,) = compared.asked
+    alone = dataclasses.replace(asked, experiment=experiment_named("general_segmented_train4_long"))
+    titles = [table.id for block in experiment_section(compared, alone, tmp_path).blocks for table in block.tables]
+    assert titles == ["general_segmented_train4_long", "general_segmented_train4_long_aggregates"]
+
+
 def test_aggregates_have_mean_iqm_and_median(compared):
     table = aggregate_table(compared, compared.asked[0])
     assert table.caption.startswith("The table's tasks of all scenarios together, ")
