@@ -225,6 +225,13 @@ def test_a_file_with_damaged_contents_is_told(run):
             run_directory("zoo:one")
 
 
+def test_a_policy_that_is_too_large_is_not_added(run, monkeypatch):
+    monkeypatch.setattr(zoo, "MAX_BYTES", 999)
+    with pytest.raises(ConfigError, match=r"one would have [\d,]+ bytes, want at most 999; train a smaller network"):
+        pack(run, "one")
+    assert zoo_names() == []
+
+
 def test_a_policy_that_cannot_be_written_leaves_the_one_before(run, monkeypatch):
     pack(run, "one")
     before, copy = (zoo.ZOO_DIRECTORY / "one.zip").read_bytes(), shutil.copy
