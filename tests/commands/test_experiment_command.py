@@ -174,14 +174,13 @@ def test_a_run_of_the_trainer_counts_and_one_of_another_machine_or_with_other_co
 
 
 def test_rates_are_of_the_newest_runs_by_their_last_start_and_of_what_their_own_command_evaluated(results):
-    for age, (cpu, rate) in enumerate([*[(cpu_model(), 10.0)] * 2, ("another", 90.0), (cpu_model(), 1.0)]):
+    for age, (cpu, rate) in enumerate([*[(cpu_model(), 8.0)] * 2, ("another", 90.0), (cpu_model(), 1.0)]):
         run = results / "runs" / "rainbow_4task" / "seek_and_kill" / "train4" / f"seed_{age}"
         write_rows(run / "starts.jsonl", [{"cpu": "first", "cores": CORES}, {"cpu": cpu, "cores": CORES}])
         write_rows(run / "metrics.jsonl", [{"num_updates": 1, "learner/updates_per_s": rate}] * 9)
         write_rows(run / "evaluation.jsonl", [{"length_steps": 9000}])  # by hand: no log says how long it took
         os.utime(run, (0, -age))
-    found = read_rates(results, "rainbow_4task", 1, CORES)
-    assert found == Rates(updates_per_s=10.0, evaluation_steps_per_s=1000.0)
+    assert read_rates(results, "rainbow_4task", 1, CORES) == Rates(updates_per_s=8.0, evaluation_steps_per_s=1000.0)
 
 
 def test_a_cost_counts_the_scaled_warm_up_and_the_time_outs_of_the_run_s_profile():

@@ -38,8 +38,10 @@ def empty_zoo(tmp_path, monkeypatch):
 
 
 def test_a_packed_policy_is_the_runs_rounded(run):
+    exact_player = trained_player(run, read_run_config(run), 20).identity
+    (run / "evaluation.jsonl").write_text(json.dumps({"schema": 1, "task": "t", "episode": 0, **exact_player}) + "\n")
     packed = pack(run, "one", "20")
-    assert packed.num_updates == 20
+    assert (packed.num_updates, packed.num_episodes) == (20, 0), "no episode of the exact parameters"
     assert zoo_names() == ["one"]
     directory = run_directory("zoo:one")
     assert read_run_config(directory).run_dir is None
