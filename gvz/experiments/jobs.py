@@ -61,7 +61,7 @@ class RunJob:
         """What is left, by the run's directory."""
         now = inventory.run_progress(self.results, self.run, self.evaluation)
         total = len(self.evaluation.tasks) * self.evaluation.episodes * self.run.num_checkpoints
-        played = total - sum(now.missing.values()) if now.trained else 0
+        played = total - now.lacking(self.evaluation) if now.trained else 0
         goal, unit, limit_s = self.run.total_updates, "updates", self.run.max_processor_s
         trained = f"{now.num_updates:,}/{goal:,} updates"
         if limit_s is not None:

@@ -1,6 +1,7 @@
 """Where jobs run: shares of this machine's cores and GPUs. `gvz/cluster/ray_jobs.py` has those of a cluster."""
 
 import os
+import re
 import shutil
 import subprocess
 from collections.abc import Sequence
@@ -90,7 +91,7 @@ def gpus() -> tuple[str, ...]:
             f"GPUs: waited {LIST_TIMEOUT_S:g} s for {' '.join(command)}; mend the driver, or set CUDA_VISIBLE_DEVICES "
             "to the GPUs that are to be used, empty for none"
         ) from error
-    return tuple(str(n) for n, line in enumerate(listed.splitlines()) if line.startswith("GPU "))
+    return tuple(re.findall(r"^GPU (\d+):", listed, flags=re.MULTILINE))  # between them, parts of GPUs have lines, too
 
 
 def make_slots(jobs: int | None, cores: Sequence[int], devices: Sequence[str]) -> tuple[Slot, ...]:

@@ -2,9 +2,11 @@
 
 import json
 import socket
+import time
 
 import pytest
 
+from gvz.cluster import checkup
 from gvz.cluster.checkup import closed_ports, security
 from gvz.run import shared_directory
 
@@ -31,6 +33,14 @@ def test_a_cluster_that_cannot_be_entered_is_one_line(refusal, monkeypatch):
     monkeypatch.delenv("RAY_AUTH_MODE", raising=False)
     said = refusal("cluster", "doctor", "ray://10.0.0.1:10001")
     assert said.startswith("error: cluster ray://10.0.0.1:10001: want HOST:PORT")
+
+
+def test_a_clock_that_is_ahead_or_behind_is_noted(monkeypatch):
+    apart_s = {"same": 0.0, "ahead": 60.0, "behind": -60.0}
+    answers = [({"NodeID": name}, time.time() + seconds) for name, seconds in apart_s.items()]
+    monkeypatch.setattr(checkup, "on_nodes", lambda _: answers)
+    found = {one.found.partition(":")[0]: one.state for one in checkup._clocks([])}
+    assert found == {"same": "ok", "ahead": "note", "behind": "note"}
 
 
 def test_closed_ports_are_named():

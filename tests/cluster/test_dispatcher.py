@@ -14,6 +14,7 @@ from gvz.cluster.backend import HostError, Machine
 from gvz.cluster.config import ClusterConfig
 from gvz.cluster.dispatcher import Dispatcher
 from gvz.cluster.hello import Hello
+from gvz.cluster.placement import Placement
 from gvz.cluster.supervised import SupervisedHost
 from gvz.core import stop
 from gvz.core.errors import ConfigError
@@ -33,6 +34,30 @@ def test_hosts_that_give_no_answer_are_named_at_the_start(tmp_path):
     dispatcher._round()
     with pytest.raises(ConfigError, match=r"0 of 1 hosts came to play within 0 s, .*; no answer yet from n1; do other"):
         dispatcher.begin(0.0)
+
+
+def test_a_host_is_started_where_there_is_room_first_on_machines_without_one(tmp_path):
+    sizes = {"a": 2, "b": 4, "c": 2, "d": 1}
+    machines = [Machine(id=name, name=name, cpus=cpus, has_learner=name == "b") for name, cpus in sizes.items()]
+    backend: Any = SimpleNamespace(machines=lambda: machines)
+    pool, cluster = config(tmp_path, {}, num_actors=2), ClusterConfig(address="h:1", hosts=5, min_hosts=5)
+    hosts = [SupervisedHost(n, pool, lanes_to_begin_with(pool, None), cluster) for n in range(5)]
+    placement, chosen = Placement(backend, hosts, cluster), list[str | None]()
+    for host in hosts:
+        host.avoid = "a"  # where its last life ended
+        machine = placement.choose(host)
+        chosen.append(machine and machine.name)
+        life: Any = machine and SimpleNamespace(machine=machine.id)
+        host.incarnation = life
+    assert chosen == ["c", "b", "a", "b", None]
+    with pytest.raises(
+        ConfigError, match="got 5 hosts of 2 cores each, but the cluster's nodes have a 2, b 4, c 2, d 1"
+    ):
+        placement.check_room()
+    ends = [placement.note_end("b", was_stable=stable) for stable in (False, False, True, False, False, False)]
+    assert ends == [False] * 5 + [True], "three in a row"
+    hosts[1].incarnation = hosts[3].incarnation = None
+    assert placement.choose(hosts[4]) is None, "b is set aside"
 
 
 def test_a_head_that_hangs_is_waited_for_once_and_only_for_a_while(monkeypatch):

@@ -131,6 +131,11 @@ def test_the_command_prints_the_plan_and_where_its_constants_are_from(capsys):
     assert RECORDED.source in out
     assert row["costs"]["source"] == RECORDED.source
     assert row["limits"]["actors"] == pytest.approx(64 / (RECORDED.decision_s + RECORDED.pack_s))
+    assert cli.main([*flags, *"--devices 3 --gbit-per-s 2 --publish-period-s 5 --json".split()]) == 0
+    other = json.loads(capsys.readouterr().out)
+    changed = {what: other["limits"][what] / rate for what, rate in row["limits"].items()}
+    assert changed == pytest.approx({"actors": 1, "learner's core": 1, "network": 0.2, "learner's devices": 3})
+    assert row["params_max_age_s"] < 5 < other["params_max_age_s"]
 
 
 def test_the_page_says_how_far_hosts_go(capsys):

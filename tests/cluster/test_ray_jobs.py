@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import psutil
 import pytest
@@ -183,6 +183,22 @@ def test_a_cluster_that_a_job_does_not_fit_on_is_refused(cluster, tmp_path):
 )
 def test_shares_of_a_node_with_16_cores_and_4_gpus(cores, gpus, step, fits):
     assert Share(cores=cores, gpus=gpus).fits(16.0, 4.0, step) == fits
+
+
+@pytest.mark.parametrize(
+    ("used", "train", "evaluate"),
+    [
+        ([], True, True),
+        (["train"], False, True),
+        (["evaluate"] * 2, True, True),
+        (["evaluate"] * 3, False, False),  # the limit
+    ],
+)
+def test_room_is_for_jobs_that_fit_up_to_the_limit(used, train, evaluate):
+    places = ray_jobs.ClusterPlaces.__new__(ray_jobs.ClusterPlaces)
+    places._share, places._limit, places._looked_s = Share(cores=2, gpus=1.0), 3, time.monotonic()
+    places._nodes, places._used = [(8.0, 1.0)], [SimpleNamespace(step=step) for step in used]
+    assert (places.room("train"), places.room("evaluate"), places.room()) == (train, evaluate, evaluate)
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,11 @@ import subprocess
 import sys
 import threading
 from importlib.machinery import ModuleSpec
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from gvz.cluster import session
+from gvz.cluster import nodes, session
 from gvz.cluster.nodes import Node, check_nodes, describe
 from gvz.core import addresses, stop
 from gvz.core.errors import ConfigError, ResourceError
@@ -183,6 +183,18 @@ def test_a_node_with_other_versions_is_refused(what):
     check_nodes([node()])
     with pytest.raises(ConfigError, match=rf"\(10.0.0.1, ababab\): got {what} 1.2.3, want .* as here; use one image"):
         check_nodes([node(), node(**{what: "1.2.3"})])
+
+
+def test_the_digest_of_the_source_is_of_every_python_file_of_our_packages(monkeypatch, tmp_path):
+    monkeypatch.setattr(nodes, "gvz", SimpleNamespace(__file__=str(tmp_path / "gvz" / "__init__.py")))
+    digests = {nodes.source_digest()}
+    for number, name in enumerate(("gvz/__init__.py", "gvz/a/b/deep.py", "learner/c.py", "gvz/a/b/deep.py")):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(f"x = {number}\n")
+        digests.add(nodes.source_digest())
+    assert len(digests) == 5
+    (tmp_path / "gvz" / "notes.txt").touch()
+    assert nodes.source_digest() in digests
 
 
 def test_a_node_with_too_little_shared_memory_is_refused():

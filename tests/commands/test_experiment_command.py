@@ -1,6 +1,8 @@
 """`gvz experiment`: list, plan by earlier records, status; what is bad input. Running is tests/e2e's."""
 
+import dataclasses
 import json
+import os
 
 import pytest
 
@@ -9,8 +11,9 @@ from gvz.commands.experiment import _side_by_side
 from gvz.core.control_groups import num_cores
 from gvz.experiments import inventory
 from gvz.experiments.base import experiments
-from gvz.experiments.costs import Rates, read_rates
-from gvz.experiments.plan import Plan, write_plan
+from gvz.experiments.costs import Rates, read_rates, run_cost
+from gvz.experiments.plan import Evaluation, Plan, write_plan
+from gvz.experiments.scale import scaled
 from gvz.run.machine import cpu_model
 from tests.reports.conftest import write_rows
 
@@ -128,6 +131,8 @@ def test_status_tells_done_failed_and_waiting_apart(tmp_path, capsys):
     assert "algorithm_comparison, scale 0.001: 1 done, 1 failed, 1 waiting" in out
     assert main(["experiment", "status", "--results", str(tmp_path), "--shard", "1/2"]) == 0
     capsys.readouterr()
+    assert main(["experiment", "status", "--results", str(tmp_path), "--shard", "2/2"]) == 1
+    assert "players/" not in capsys.readouterr().out, "the first shard plays them"
     assert main(["experiment", "status", "--results", str(tmp_path), "--json"]) == 1
     rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [(row["job"], row["state"]) for row in rows] == [
@@ -166,6 +171,26 @@ def test_a_run_of_the_trainer_counts_and_one_of_another_machine_or_with_other_co
     )
     assert read_rates(results, "rainbow_4task", 1, CORES) == Rates(updates_per_s=7.0, evaluation_steps_per_s=None)
     assert read_rates(results, "rainbow_4task", 0.001, CORES) == unknown, "its networks are other ones"
+
+
+def test_rates_are_of_the_newest_runs_by_their_last_start_and_of_what_their_own_command_evaluated(results):
+    for age, (cpu, rate) in enumerate([*[(cpu_model(), 8.0)] * 2, ("another", 90.0), (cpu_model(), 1.0)]):
+        run = results / "runs" / "rainbow_4task" / "seek_and_kill" / "train4" / f"seed_{age}"
+        write_rows(run / "starts.jsonl", [{"cpu": "first", "cores": CORES}, {"cpu": cpu, "cores": CORES}])
+        write_rows(run / "metrics.jsonl", [{"num_updates": 1, "learner/updates_per_s": rate}] * 9)
+        write_rows(run / "evaluation.jsonl", [{"length_steps": 9000}])  # by hand: no log says how long it took
+        os.utime(run, (0, -age))
+    assert read_rates(results, "rainbow_4task", 1, CORES) == Rates(updates_per_s=8.0, evaluation_steps_per_s=1000.0)
+
+
+def test_a_cost_counts_the_scaled_warm_up_and_the_time_outs_of_the_run_s_profile():
+    full = experiments()["rainbow_evaluation"]
+    experiment = dataclasses.replace(full, scenarios=("seek_and_kill",), variants={"dense": {"env.profile": "levdoom"}})
+    unknown, evaluation = Rates(updates_per_s=None, evaluation_steps_per_s=1.0), Evaluation(tasks=("t",), episodes=1)
+    (run, *_) = scaled(experiment, 0.5).runs()
+    cost = run_cost(run, evaluation, 0.5, unknown, CORES)
+    assert (cost.env_steps, cost.training_hours) == (5_000 + 16 * 100_000, None)
+    assert cost.evaluation_hours == pytest.approx(20 * (1_250 // 4) / 3600)
 
 
 def test_plan_without_records_says_how_to_get_some(tmp_path, monkeypatch, capsys):

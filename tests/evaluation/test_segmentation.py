@@ -23,6 +23,7 @@ from gvz.core.env_config import LABEL_CLASSES
 from gvz.core.errors import GvzError
 from gvz.env import DoomEnv
 from gvz.evaluation import segmentation
+from gvz.evaluation.players import RandomPlayer, ScriptedPlayer
 from gvz.evaluation.segmentation import BatchSpec
 from gvz.evaluation.workers import _Processes, worker_processes
 from gvz.scenarios.base import Textures
@@ -63,19 +64,29 @@ def test_a_cell_shows_a_class_if_an_eighth_of_its_pixels_do():
     assert segmentation.score(probabilities, labels)["enemy"] == pytest.approx(expected)
 
 
+def test_things_weigh_more_in_the_loss_than_what_covers_the_screen():
+    weights = dict(zip(LABEL_CLASSES, segmentation.CLASS_WEIGHTS.tolist(), strict=True))
+    assert {name for name, weight in weights.items() if weight == 1.0} == {"wall", "plane", "weapon"}
+    assert set(weights.values()) == {1.0, 8.0}
+
+
 @pytest.mark.engine
 def test_frames_of_varied_maps_show_many_of_them(monkeypatch):
-    begun: list[str] = []
+    begun, players = list[str](), list[str]()
 
-    def episode_seed(task_id: str, episode: int, _: int) -> int:
+    def episode_seed(task_id: str, episode: int, base_seed: int) -> int:
+        assert base_seed != 0, "no episodes that evaluations have"
         begun.append(task_id)
         return episode  # and so each its map
 
     monkeypatch.setattr(segmentation, "episode_seed", episode_seed)
+    for kind in (RandomPlayer, ScriptedPlayer):
+        monkeypatch.setattr(segmentation, kind.__name__, lambda of=kind: players.append(of.__name__) or of())
     varied, default = "seek_and_kill/varied-10", "seek_and_kill/default"  # every episode lasts for 60 frames
     assert segmentation.labelled_frames(parse_task(varied), 60).textures is None
     assert segmentation.labelled_frames(parse_task(default), 60).textures is not None
     assert begun == [varied] * 3 + [default]
+    assert players == ["ScriptedPlayer", "RandomPlayer", "ScriptedPlayer", "ScriptedPlayer"]
 
 
 @pytest.mark.engine

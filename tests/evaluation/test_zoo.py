@@ -38,8 +38,10 @@ def empty_zoo(tmp_path, monkeypatch):
 
 
 def test_a_packed_policy_is_the_runs_rounded(run):
+    exact_player = trained_player(run, read_run_config(run), 20).identity
+    (run / "evaluation.jsonl").write_text(json.dumps({"schema": 1, "task": "t", "episode": 0, **exact_player}) + "\n")
     packed = pack(run, "one", "20")
-    assert packed.num_updates == 20
+    assert (packed.num_updates, packed.num_episodes) == (20, 0), "no episode of the exact parameters"
     assert zoo_names() == ["one"]
     directory = run_directory("zoo:one")
     assert read_run_config(directory).run_dir is None
@@ -223,6 +225,13 @@ def test_a_file_with_damaged_contents_is_told(run):
         file.write_bytes(damaged)
         with pytest.raises(ResourceError, match=r"one\.zip is damaged: .*; install GViZDoom again, or add the policy"):
             run_directory("zoo:one")
+
+
+def test_a_policy_that_is_too_large_is_not_added(run, monkeypatch):
+    monkeypatch.setattr(zoo, "MAX_BYTES", 999)
+    with pytest.raises(ConfigError, match=r"one would have [\d,]+ bytes, want at most 999; train a smaller network"):
+        pack(run, "one")
+    assert zoo_names() == []
 
 
 def test_a_policy_that_cannot_be_written_leaves_the_one_before(run, monkeypatch):

@@ -10,7 +10,7 @@ from gvz.core.errors import ConfigError, TaskError
 from gvz.experiments.base import Experiment, TrainingRun, experiment_named, experiments
 from gvz.run.config_files import load_config, with_settings
 from gvz.segmentation import segmenter_file
-from gvz.tasks import named_tasks, parse_task, scenarios
+from gvz.tasks import attribute_tasks, named_tasks, parse_task, scenarios
 
 THESIS_AVERAGES = {
     "training_difficulty": (79.99, 66.23, 42.91, 30.84, 24.81),
@@ -113,6 +113,12 @@ def test_training_difficulty_evaluates_each_run_on_its_own_task():
         assert experiment.evaluation_tasks(run) == run.tasks
     names = {run.training for run in experiment.runs() if run.scenario == "defend_the_center"}
     assert names == {task.name for task in named_tasks("defend_the_center")}
+
+
+def test_the_effects_of_attributes_are_measured_on_each_alone_and_on_pairs():
+    experiment = experiments()["attribute_effects"]
+    run = experiment.runs()[0]
+    assert experiment.evaluation_tasks(run) == tuple(task.id for task in attribute_tasks(run.scenario))
 
 
 def test_the_table_of_a_comparison_is_over_the_test_tasks_and_that_of_levels_over_all():

@@ -119,17 +119,20 @@ def test_a_run_is_trained_then_evaluated_where_episodes_are_missing_then_done(tm
     for step in run.checkpoints:
         (directory / "policies" / str(step)).mkdir(parents=True)
     row = '{"schema": 1, "num_updates": %d, "task": "defend_the_center/default", "episode": %d}\n'
-    (directory / "evaluation.jsonl").write_text(row % (10, 0) + row % (10, 1) + row % (20, 1))
+    (directory / "evaluation.jsonl").write_text(row % (10, 0) + row % (10, 1) + row % (20, 1) + row % (20, 7))
     second = job.outlook()
     assert second.next is not None
     assert second.next.step == "evaluate"
     assert " ".join(second.next.arguments) == (
         f"-m gvz.cli evaluate {directory} --checkpoints 20 --tasks defend_the_center/default --episodes 2"
     )
-    assert job.done_count("evaluate") == 3
+    assert (second.text, job.done_count("evaluate"), second.next.total) == ("0/20 updates, 3/4 episodes", 4, 5)
     with (directory / "evaluation.jsonl").open("a") as stream:
         stream.write(row % (20, 0))
     assert job.outlook().next is None
+    (directory / "policies" / "10").rmdir()  # a checkpoint that could not be saved, and was never evaluated
+    (directory / "evaluation.jsonl").write_text(row % (20, 0) + row % (20, 1))
+    assert (job.outlook().next, job.outlook().text) == (None, "0/20 updates, 2/4 episodes")
 
 
 def test_a_variant_s_settings_reach_the_trainer():

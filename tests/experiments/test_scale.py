@@ -41,6 +41,7 @@ def test_a_scale_makes_nothing_larger_than_the_config_has_it():
 def test_below_a_tenth_there_is_one_seed():
     assert scaled(FULL, 0.05).seeds == (1111,)
     assert len(scaled(FULL, 0.05).scenarios) == 4
+    assert (scaled(FULL, 0.05).num_checkpoints, scaled(FULL, 0.05).table_checkpoints) == (10, 2), "a quarter of them"
 
 
 def test_a_check_of_the_pipeline_has_one_scenario_one_task_a_level_two_checkpoints_and_small_frames():

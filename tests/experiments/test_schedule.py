@@ -5,8 +5,11 @@ import re
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -17,6 +20,7 @@ from gvz.experiments import inventory as progress
 from gvz.experiments import places, schedule
 from gvz.experiments.jobs import Command, Outlook
 from gvz.experiments.places import Machine, Slot, gpus, make_slots
+from gvz.experiments.process import LOST, Process
 from gvz.experiments.schedule import run_jobs
 from tests.waiting import wait_until
 
@@ -243,6 +247,51 @@ def test_two_commands_in_one_directory_are_one_queue(tmp_path):
     assert not begun[0] & begun[1]
 
 
+class Nodes(Machine):
+    """Other machines, on which each command ends at once, by this code."""
+
+    def __init__(self, code: int, settle_s: float = 0.0):
+        self.code, self.settle_s, self.num_started = code, settle_s, 0
+
+    def room(self, step: str | None = None) -> bool:
+        return True
+
+    def start(self, log: Path, command: Command) -> Process:
+        self.num_started += 1
+        ended: Any = SimpleNamespace(where="n7", problem="", poll=lambda: self.code, kill=lambda: None)
+        return ended
+
+    def end(self, process: Process) -> None:
+        pass
+
+
+@dataclass(frozen=True, kw_only=True)
+class Watched(Program):
+    """Its progress is what `looks` gives, one after the other; the last one is that it is done."""
+
+    looks: Iterator[str]
+
+    def outlook(self) -> Outlook:
+        following, text = super().outlook().next, next(self.looks, "done")
+        return Outlook(next=None if text == "done" else following, begun=True, text=text)
+
+
+def test_a_job_that_loses_machines_goes_on_until_it_has_lost_three_without_progress(tmp_path, capsys):
+    """A look before each start, and one after each loss."""
+    looks = iter(["0", "1", "1", "2", "2", "2", "2", "2"])
+    nodes = Nodes(LOST)
+    assert run_jobs([Watched(id="one", results=tmp_path, looks=looks)], nodes) == 1
+    assert nodes.num_started == 4, "the first two made progress"
+    assert "FAILED (first: lost 3 machines without progress, the last was n7; log " in capsys.readouterr().err
+
+
+def test_what_a_command_wrote_elsewhere_may_be_seen_a_while_later(tmp_path, capsys):
+    looks = ["nothing"] * 4
+    assert run_jobs([Watched(id="one", results=tmp_path, looks=iter(looks))], Nodes(0, settle_s=60.0)) == 0
+    assert run_jobs([Watched(id="two", results=tmp_path, looks=iter(looks))], Nodes(0, settle_s=0.0)) == 1
+    assert "it ended as if all were done, but it has nothing" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("jobs", "cores", "devices", "shares"),
     [
@@ -271,6 +320,18 @@ def test_hidden_gpus_are_not_used(monkeypatch):
     assert gpus() == ()
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,5")
     assert gpus() == ("2", "5")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "-1")
+    assert gpus() == ()
+
+
+def test_gpus_have_the_driver_s_numbers_also_where_parts_of_one_are_listed(tmp_path, monkeypatch):
+    parts = "  MIG 1g.10gb     Device  0: (UUID: MIG-b)"
+    listed = f"GPU 0: NVIDIA H100 (UUID: GPU-a)\n{parts}\n{parts}\nGPU 1: NVIDIA H100 (UUID: GPU-c)"
+    (tmp_path / "nvidia-smi").write_text(f"#!/bin/sh\necho '{listed}'\n")
+    (tmp_path / "nvidia-smi").chmod(0o700)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    assert gpus() == ("0", "1")
 
 
 def test_a_driver_that_does_not_answer_is_named(tmp_path, monkeypatch):
