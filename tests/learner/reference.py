@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from learner.config import ValueConfig
+from learner.config import EpsilonConfig
 
 
 def softmax(x):
@@ -29,7 +29,7 @@ def convolve(x, kernel, bias, stride):
     return out
 
 
-def network(config: ValueConfig, params: Any, obs, num_actions: int, num_tasks: int):
+def network(config: EpsilonConfig, params: Any, obs, num_actions: int, num_tasks: int):
     """Logits [B, A, N] by the means of the weights: thesis 4.1.5, eq. 4.10 and 4.18."""
     p = {layer: {name: np.asarray(w, np.float64) for name, w in leaves.items()} for layer, leaves in params.items()}
     x = np.asarray(obs.frames, np.float64) / 255
@@ -44,7 +44,11 @@ def network(config: ValueConfig, params: Any, obs, num_actions: int, num_tasks: 
 
     def stream(name: str):
         hidden, output = p[f"{name}_hidden"], p[f"{name}_output"]
-        return np.maximum(x @ hidden["kernel"].T + hidden["bias"], 0) @ output["kernel"].T + output["bias"]
+        h = x @ hidden["kernel"].T + hidden["bias"]
+        if norm := p.get(f"{name}_norm"):
+            h = (h - h.mean(1, keepdims=True)) / np.sqrt(h.var(1, keepdims=True) + 1e-6)
+            h = h * norm["scale"] + norm["bias"]
+        return np.maximum(h, 0) @ output["kernel"].T + output["bias"]
 
     if not getattr(config, "dueling", False):
         return stream("q").reshape(len(x), num_actions, -1)

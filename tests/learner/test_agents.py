@@ -122,7 +122,9 @@ def test_only_the_online_network_sees_augmented_frames_and_hidden_inputs(agent_n
     params, target = (made_up_params(jitted(plain)[0], seed) for seed in (0, 1))
     found = [jitted(config)[3](params, target, jax.random.key(3), batch()) for config in (plain, none, changed)]
     jax.tree.map(np.testing.assert_array_equal, found[0], found[1])
-    assert np.abs(np.asarray(found[0].q_tm1 - found[2].q_tm1)).max() > 0.01
+    again = jitted(changed)[3](params, target, jax.random.key(4), batch())
+    for other in (found[0], again):  # clean, and augmented with other noise
+        assert np.abs(np.asarray(other.q_tm1 - found[2].q_tm1)).max() > 0.01
     before, after = (np.asarray(result.td_error + result.q_tm1) for result in (found[0], found[2]))
     np.testing.assert_allclose(before, after, rtol=1e-4, atol=1e-5)
 
@@ -241,6 +243,14 @@ def test_epsilon_is_the_share_of_uniformly_random_actions():
     for epsilon in (0.3, 1.0):
         counts = np.bincount(draw(jax.random.key(1), q, jnp.float32(epsilon)), minlength=3) / 6000
         np.testing.assert_allclose(counts, [epsilon / 3, epsilon / 3, 1 - 2 * epsilon / 3], atol=0.025)
+
+
+def test_a_game_alone_explores_all_its_allowed_actions_alike():
+    """The numbers that choose the action are others than the one that says whether it is by chance."""
+    q, mask = jnp.zeros((1, 3)).at[0, 2].set(1.0), jnp.ones((1, 3), bool)
+    draw = jax.jit(jax.vmap(lambda key: epsilon_greedy(key, q, jnp.float32(0.3), mask)[0]))
+    counts = np.bincount(draw(jax.random.split(jax.random.key(1), 6000)), minlength=3) / 6000
+    np.testing.assert_allclose(counts, [0.1, 0.1, 0.8], atol=0.025)
 
 
 def test_noise_can_have_random_actions_beside_it():

@@ -158,12 +158,15 @@ def test_noise_moves_weights_by_sigma_times_epsilon(noisy):
         "kernel_sigma": jnp.full((200, 300), 2.0),
         "bias_sigma": jnp.full(200, 3.0),
     }
-    params = {"params": {"hidden": layer, "conv": {"kernel": jnp.ones((1, 1, 1, 1))}}}
+    params = {"params": {"hidden": layer, "other": layer, "conv": {"kernel": jnp.ones((1, 1, 1, 1))}}}
     moved = jax.jit(add_noise, static_argnums=2)(params, jax.random.key(3), noisy)["params"]
     np.testing.assert_array_equal(moved["conv"]["kernel"], params["params"]["conv"]["kernel"])
     eps_w, eps_b = np.asarray(moved["hidden"]["kernel"] / 2.0), np.asarray(moved["hidden"]["bias"] / 3.0)
+    others = np.asarray(moved["other"]["kernel"] / 2.0)
+    assert abs(np.corrcoef(eps_w.ravel(), others.ravel())[0, 1]) < 0.1, "each layer has noise of its own"
     if noisy == "independent":
         assert np.linalg.matrix_rank(eps_w) == 200
+        assert np.abs(np.corrcoef(eps_b, eps_w.T)[0, 1:]).max() < 0.5, "no weight's noise is that of its bias"
         assert abs(eps_w.std() - 1) < 0.02
     else:
         # f(e_out) f(e_in)^T has rank 1, and its bias noise is f(e_out): every column is a multiple of eps_b.

@@ -13,6 +13,7 @@ from learner.agents.base import AgentSpec, OnPolicyAgent, RolloutSteps, Samples,
 from learner.agents.configs.pqn import PQNConfig
 from learner.config import agent_config_class
 from learner.observation import Observation
+from tests.learner import reference
 from tests.learner.small_agents import SPEC, A, B, made_up_params
 
 MASKED = replace(SPEC, masked=True)
@@ -101,7 +102,9 @@ def test_masked_actions_are_never_taken_and_have_finite_gradients(name: str):
         for seed in range(40):
             action, _ = act(params, jax.random.key(seed), obs, jnp.float32(epsilon))
             assert MASK[np.arange(B), action].all()
-    assert MASK[np.arange(B), evaluate(params, obs).action].all()
+    evaluation = evaluate(params, obs)
+    assert MASK[np.arange(B), evaluation.action].all()
+    assert evaluation.policy is None or not np.asarray(evaluation.policy)[~MASK].any()
     batch = samples(agent, params, obs, act)
     grads = jax.jit(jax.grad(lambda p: agent.losses(p, batch).loss.mean()))(params)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grads))
@@ -125,6 +128,12 @@ def test_ppo_samples_its_policy_and_records_value_and_probability(epsilon: float
     taken = probabilities[np.arange(B), np.asarray(actions)]
     np.testing.assert_allclose(np.exp(extras[:, :, 1]), taken, rtol=1e-4)
     np.testing.assert_allclose(extras[0, :, 0], evaluation.value, rtol=1e-5, atol=1e-6)
+
+
+def test_ppo_records_of_a_random_action_its_share_of_the_allowed():
+    agent, act, _, _ = jitted("ppo", MASKED)
+    _, extras = act(made_up_params(agent, 0), jax.random.key(0), observation(MASK), jnp.float32(1.0))
+    np.testing.assert_allclose(np.exp(extras[:, 1]), 1 / MASK.sum(1), rtol=1e-5)
 
 
 def test_pqn_records_the_largest_value_among_the_allowed():
@@ -151,6 +160,11 @@ def test_pqn_normalizes_its_hidden_layer():
     config = SMALL_PQN
     assert layers(config) - layers(replace(config, layer_norm=False)) == {"q_norm"}
     assert "norm_0" in layers(config), "its encoder's convolutions, too"
+    config = replace(config, encoder="nature")
+    agent, obs = make_agent(config, SPEC), observation()
+    params = made_up_params(agent, 0)
+    wanted = reference.network(config, params["params"], obs, A, SPEC.num_tasks)[:, :, 0]
+    np.testing.assert_allclose(jax.jit(agent.evaluate)(params, obs).q_values, wanted, rtol=1e-4, atol=1e-5)
 
 
 def test_epsilon_falls_in_a_line_and_ppo_has_none():

@@ -355,6 +355,7 @@ def test_the_last_rollout_is_learnt_from_until_the_run_has_its_gradient_steps(mo
     assert int(state.num_updates) == 4
     jax.tree.map(np.testing.assert_array_equal, learner.params, state.average_params)
     np.testing.assert_array_equal(learner.acting_params(), state.params["w"].ravel())
+    assert learner.epsilon(25_000) == PQN_.epsilon(25_000) < learner.epsilon(0)
 
 
 def test_the_state_is_donated():
