@@ -8,6 +8,8 @@ import pytest
 
 from gvz.cluster import checkup
 from gvz.cluster.checkup import closed_ports, security
+from gvz.cluster.nodes import Node
+from gvz.cluster.ray_jobs import JOB_SHM_BYTES
 from gvz.run import shared_directory
 
 
@@ -49,6 +51,12 @@ def test_closed_ports_are_named():
         wanted = [("127.0.0.1", s.getsockname()[1], what) for s, what in ((open_port, "open"), (closed, "a node"))]
         (found,) = closed_ports(wanted)
     assert found == f"127.0.0.1:{wanted[1][1]} (a node: Connection refused)"
+
+
+def test_a_node_with_too_little_shared_memory_is_bad():
+    here = {"host": "n1", "ip": "10.0.0.1", "cores": 1.0, "gpus": 0.0, "python": "3", "ray": "2", "gvizdoom": "0"}
+    nodes = [Node(id="1", shm_free_bytes=JOB_SHM_BYTES - lacking, **here) for lacking in (0, 1)]
+    assert [checkup._memory(node).state for node in nodes] == ["ok", "bad"]
 
 
 def test_tokens_that_are_not_asked_for_or_not_private_are_found(tmp_path):

@@ -5,6 +5,8 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
+import numpy as np
 import pytest
 from fake_env import config
 
@@ -18,6 +20,7 @@ from gvz.cluster.placement import Placement
 from gvz.cluster.supervised import SupervisedHost
 from gvz.core import stop
 from gvz.core.errors import ConfigError
+from gvz.transport.messages import ParamsHeader
 
 
 def test_hosts_that_give_no_answer_are_named_at_the_start(tmp_path):
@@ -37,7 +40,7 @@ def test_hosts_that_give_no_answer_are_named_at_the_start(tmp_path):
 
 
 def test_a_host_is_started_where_there_is_room_first_on_machines_without_one(tmp_path):
-    sizes = {"a": 2, "b": 4, "c": 2, "d": 1}
+    sizes = {"a": 2, "b": 4, "c": 2, "d": 1, "e": 1}
     machines = [Machine(id=name, name=name, cpus=cpus, has_learner=name == "b") for name, cpus in sizes.items()]
     backend: Any = SimpleNamespace(machines=lambda: machines)
     pool, cluster = config(tmp_path, {}, num_actors=2), ClusterConfig(address="h:1", hosts=5, min_hosts=5)
@@ -51,13 +54,56 @@ def test_a_host_is_started_where_there_is_room_first_on_machines_without_one(tmp
         host.incarnation = life
     assert chosen == ["c", "b", "a", "b", None]
     with pytest.raises(
-        ConfigError, match="got 5 hosts of 2 cores each, but the cluster's nodes have a 2, b 4, c 2, d 1"
+        ConfigError, match="got 5 hosts of 2 cores each, but the cluster's nodes have a 2, b 4, c 2, d 1, e 1"
     ):
         placement.check_room()
     ends = [placement.note_end("b", was_stable=stable) for stable in (False, False, True, False, False, False)]
     assert ends == [False] * 5 + [True], "three in a row"
     hosts[1].incarnation = hosts[3].incarnation = None
     assert placement.choose(hosts[4]) is None, "b is set aside"
+
+
+@pytest.fixture
+def greeted(tmp_path) -> Dispatcher:
+    """Of one host, which has other source files, answers at once and notes the parameters that it is sent."""
+    ours = Hello(versions={}, code="a", schemas=(0, 0), maps={})
+    answers = {"greet": msgspec.msgpack.encode(msgspec.structs.replace(ours, code="b")), "begin": None}
+    remote = SimpleNamespace(greet=lambda _: "greet", begin=lambda _: "begin", kill=lambda: None)
+    backend: Any = SimpleNamespace(
+        machines=lambda: [Machine(id="1", name="n1", cpus=8, has_learner=False)],
+        start=lambda *_: remote,
+        wait=lambda calls, _: calls,
+        result=answers.get,
+        put=lambda params: params.tolist(),
+    )
+    pool, cluster = config(tmp_path, {}), ClusterConfig(address="h:1", hosts=1, publish_period_s=30.0)
+    return Dispatcher(backend, [SupervisedHost(0, pool, lanes_to_begin_with(pool, None), cluster)], cluster, ours)
+
+
+def test_other_source_files_are_refused_before_the_run_alone(greeted):
+    """Later somebody may have edited them: an actor that is restarted on one machine takes these, too."""
+    with pytest.raises(ConfigError, match="cluster node n1: source files of GViZDoom: got digest b, want a; install"):
+        greeted.begin(10.0)
+    greeted._greeting = False
+    greeted._hosts[0].incarnation = None
+    greeted._hosts[0].start_at_s = 0.0
+    greeted._round()
+    greeted._round()
+    assert greeted.num_playing == 1
+
+
+def test_the_newest_parameters_go_out_once_a_period_and_age_from_their_publication(greeted):
+    greeted._hosts[0].incarnation = SimpleNamespace(playing_s=0.0)
+    sent = []
+    for version, waited_s in ((1, 0.0), (2, 0.0), (3, 31.0), (4, 29.0)):
+        greeted._sent_s -= waited_s
+        greeted.publish([version], ParamsHeader(version=version, num_updates=0, layout_hash=0))
+        greeted._put_params()
+        sent.append(greeted._sent[0])
+    assert sent == [[1], [1], [3], [3]]
+    greeted._published_s = {version: time.monotonic() - 10.0 * (5 - version) for version in (3, 4)}
+    batch: Any = SimpleNamespace(block=SimpleNamespace(steps={"params_version": np.array([1, 3, 4, 4])}))
+    assert greeted._params_age_s(batch) == pytest.approx((20 + 20 + 10 + 10) / 4, abs=1.0), "1 is as old as 3, or older"
 
 
 def test_a_head_that_hangs_is_waited_for_once_and_only_for_a_while(monkeypatch):

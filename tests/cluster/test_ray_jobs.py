@@ -21,6 +21,7 @@ from gvz.cluster.ray_jobs import Share
 from gvz.core import records, stop
 from gvz.core.errors import ConfigError, GvzError
 from gvz.experiments import inventory
+from gvz.experiments.jobs import Command
 from gvz.experiments.plan import read_plan
 from tests.processes import arguments
 from tests.waiting import wait_until
@@ -186,19 +187,33 @@ def test_shares_of_a_node_with_16_cores_and_4_gpus(cores, gpus, step, fits):
 
 
 @pytest.mark.parametrize(
-    ("used", "train", "evaluate"),
+    ("limit", "used", "train", "evaluate"),
     [
-        ([], True, True),
-        (["train"], False, True),
-        (["evaluate"] * 2, True, True),
-        (["evaluate"] * 3, False, False),  # the limit
+        (None, [], True, True),
+        (None, ["train"], False, True),  # the one GPU is taken
+        (None, ["train", *["evaluate"] * 3], False, False),  # four jobs on eight cores
+        (None, ["evaluate"] * 3, True, True),
+        (None, ["evaluate"] * 4, False, False),
+        (2, ["evaluate"], True, True),
+        (2, ["evaluate"] * 2, False, False),
     ],
 )
-def test_room_is_for_jobs_that_fit_up_to_the_limit(used, train, evaluate):
-    places = ray_jobs.ClusterPlaces.__new__(ray_jobs.ClusterPlaces)
-    places._share, places._limit, places._looked_s = Share(cores=2, gpus=1.0), 3, time.monotonic()
-    places._nodes, places._used = [(8.0, 1.0)], [SimpleNamespace(step=step) for step in used]
+def test_a_job_has_room_where_its_step_the_cores_and_the_limit_allow_one_more(limit, used, train, evaluate):
+    places = ray_jobs.ClusterPlaces.__new__(ray_jobs.ClusterPlaces)  # connecting is the other tests' matter
+    places._share, places._limit, places._looked_s = Share(cores=2, gpus=1.0), limit, time.monotonic() + 60.0
+    places._nodes = [(4.0, 1.0), (4.0, 0.0)]
+    places._used = [SimpleNamespace(step=step) for step in used]
     assert (places.room("train"), places.room("evaluate"), places.room()) == (train, evaluate, evaluate)
+
+
+def test_a_job_on_a_part_of_a_gpu_takes_that_part_of_its_memory(monkeypatch):
+    ray, got = ModuleType("ray"), []
+    actor = SimpleNamespace(start=SimpleNamespace(remote=lambda *given: got.append(given[-1])))
+    vars(ray).update(remote=lambda **_: lambda _: SimpleNamespace(remote=lambda: actor))
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    for step, gpus in (("train", 0.5), ("train", 1.0), ("evaluate", 0.5)):
+        ray_jobs.RemoteProcess(Path("log"), Command(step=step, arguments=(), total=1), Share(gpus=gpus))
+    assert got == [{"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.450"}, {}, {"CUDA_VISIBLE_DEVICES": ""}]
 
 
 @pytest.mark.parametrize(
@@ -260,7 +275,8 @@ def test_a_head_that_is_gone_is_named(ip, monkeypatch):
     if family == socket.AF_INET6 and not Path("/proc/net/if_inet6").exists():
         pytest.skip("this machine has no IPv6")
     ray = ModuleType("ray")
-    monkeypatch.setattr(ray, "nodes", lambda: [{"Alive": True, "Resources": {"CPU": 2.0}}], raising=False)
+    nodes = [{"Alive": alive, "Resources": {"CPU": 2.0}} for alive in (True, False)]
+    monkeypatch.setattr(ray, "nodes", lambda: nodes, raising=False)
     monkeypatch.setitem(sys.modules, "ray", ray)
     places = ray_jobs.ClusterPlaces.__new__(ray_jobs.ClusterPlaces)  # connecting is the other tests' matter
     places._share, places._answered_s = Share(), time.monotonic()

@@ -197,6 +197,19 @@ def test_the_walls_of_rooms_go_round_them_with_the_open_side_on_the_right():
     }
 
 
+def test_a_number_varies_over_a_range_that_grows_with_the_strength():
+    for strength, low, high in ((1.0, 96, 240), (0.5, 100, 172), (0.0, 104, 104)):
+        draws = [layout.vary(random.Random(seed), strength, 104, 96, 240) for seed in range(200)]
+        assert low <= min(draws) <= low + 2
+        assert high - 2 <= max(draws) <= high
+
+
+def test_a_map_at_a_quarter_of_the_strength_has_a_quarter_of_the_decorations():
+    quarter = MapSet("train", strengths=(("layout", 0.0), ("decorations", 0.25)))
+    things = [whole_map(SCENARIOS[-1], FIRST + n, quarter).things for n in range(12)]
+    assert 3 < max(sum(t["type"] in {*SOLID, *LOOSE} for t in one) for one in things) <= 6, "of 24"
+
+
 def test_rooms_stay_inside_the_map_and_apart():
     for seed in range(40):
         rooms = layout.draw_rooms(random.Random(seed), size=24, across=4, shrink=0.8, loops=0.3, corridor=(2, 3))

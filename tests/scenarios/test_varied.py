@@ -220,6 +220,21 @@ def test_the_places_of_a_square_are_inside_it_and_know_how_far_its_walls_are():
     assert {(x, y): to_wall for x, y, to_wall in places}[16, 32] == 16
 
 
+def test_a_strength_in_between_changes_fewer_maps_and_moves_numbers_a_share_of_their_way():
+    """Of 300 maps of Seek and Kill at a fifth of the strength; the standard errors of the counts are 5."""
+    scenario, strengths = SCENARIOS[-1], (("decorations", 0.0), ("lights", 0.2), ("entities", 0.2))
+    default, maps = task_content(Task(scenario), "thesis"), MapSet("test", strengths=strengths)
+    rooms = [UdmfMap(sectors=[{"lightlevel": 152}]) for _ in range(300)]
+    drawn = [looks.draw_look(scenario, default, room, maps, n) for n, room in enumerate(rooms)]
+    assert {room.sectors[0]["lightlevel"] for room in rooms} == set(range(160, 174))
+    assert min(min(int(room.sectors[0]["lightcolor"]).to_bytes(3)) for room in rooms) == 233
+    sizes, styles, alphas = ([c.entity[n] for c in drawn if n in c.entity] for n in ("ScaleX", "RenderStyle", "Alpha"))
+    assert 0.96 <= min(sizes) < 0.97 < 1.04 < max(sizes) <= 1.05
+    assert 0.94 <= min(alphas) < max(alphas) <= 0.98
+    tinted = [content for content in drawn if "Tint" in str(content.parameters["classes"])]
+    assert [15 <= len(sizes) <= 45, 10 <= len(styles) <= 40, 15 <= len(tinted) <= 45] == [True] * 3
+
+
 # ------------------------------------------------------------------------------------------------ the same everywhere
 
 
