@@ -52,7 +52,10 @@ def test_a_packed_policy_is_the_runs_rounded(run):
     for exact, rounded in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
         np.testing.assert_allclose(rounded, exact, rtol=2.0**-8)
         assert (rounded.view(np.uint32) % 2**16 == 0).all()
-    pack(directory, "one")
+    row = {"schema": 1, "task": "t", "episode": 0, **trained_player(directory, CONFIG, 20).identity}
+    rows = (json.dumps(row | {"base_seed": seed}) + "\n" for seed in (0, 1))
+    (directory / "evaluation.jsonl").write_text("".join(rows))
+    assert pack(directory, "one").num_episodes == 1, "scores are published of base seed 0"
     _, twice = read_params(run_directory("zoo:one"), CONFIG, 20)
     assert all(np.array_equal(*pair) for pair in zip(jax.tree.leaves(after), jax.tree.leaves(twice), strict=True))
 
