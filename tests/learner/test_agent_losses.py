@@ -181,8 +181,8 @@ def test_augmentations_of_sight_change_the_frames_of_the_loss_of_sight_alone():
     seen = np.random.default_rng(5).integers(0, 2, (B, C), dtype=np.uint8)
     b = replace(batch(), sight_tm1=jnp.asarray(seen))
     inverted = replace(b, obs_tm1=replace(b.obs_tm1, frames=255 - b.obs_tm1.frames))
-    clean_loss, key = jax.jit(clean_agent.loss), jax.random.key(3)
-    found, clean = jax.jit(agent.loss)(params, target, key, b), clean_loss(params, target, key, b)
+    augmented_loss, clean_loss, key = jax.jit(agent.loss), jax.jit(clean_agent.loss), jax.random.key(3)
+    found, clean = augmented_loss(params, target, key, b), clean_loss(params, target, key, b)
     for name in ("priority", "q_tm1", "td_error"):
         np.testing.assert_allclose(getattr(found, name), getattr(clean, name), rtol=1e-5, atol=1e-6)
 
@@ -195,6 +195,9 @@ def test_augmentations_of_sight_change_the_frames_of_the_loss_of_sight_alone():
     is_inverted = np.isclose(change, wanted, rtol=1e-3, atol=1e-5)
     assert (is_inverted | np.isclose(change, 0, atol=1e-5)).all()
     assert 0 < is_inverted.sum() < B
+    other = jax.random.key(4)
+    again = np.asarray(augmented_loss(params, target, other, b).loss - clean_loss(params, target, other, b).loss)
+    assert (is_inverted != np.isclose(again, wanted, rtol=1e-3, atol=1e-5)).any(), "each key chooses others"
     assert np.abs(wanted).min() > 1e-3, "the two cannot be told apart"
 
 
