@@ -120,7 +120,7 @@ class PlanCommand:
         ]
         together = f"together, shared runs once: {len(plan.runs())} runs"
         _print_costs([*of_experiments, (together, sum(costs.values(), Cost()))])
-        jobs = f"shard {index}/{count}, {len(slots)} jobs at once on this machine"
+        jobs = f"shard {index}/{count}, {len(slots)} {'job' if len(slots) == 1 else 'jobs'} at once on this machine"
         if whole.training_hours is None or whole.evaluation_hours is None:
             print(f"\n{jobs}: hours are not known yet; begin with gvz experiment run, and ask again after a while")
         else:

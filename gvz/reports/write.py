@@ -67,6 +67,7 @@ def to_html(document: Document) -> str:
     )
     environment.filters["data_uri"] = _data_uri
     environment.filters["strong"] = _strong
+    environment.filters["breakable"] = _breakable
     return environment.get_template("report.html.j2").render(document=document)
 
 
@@ -78,6 +79,11 @@ def _strong(text: str) -> Markup:
     """**bold** as in Markdown; everything else is escaped."""
     escaped = str(escape(text))
     return Markup(re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", escaped))
+
+
+def _breakable(text: str) -> Markup:
+    """Names of tasks, agents, runs and settings may take several lines; everything is escaped."""
+    return Markup(re.sub(r"[_+/]|\.(?=[a-z])", r"\g<0><wbr>", str(escape(text))))
 
 
 def to_markdown(document: Document) -> str:

@@ -8,11 +8,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 from rich.table import Column
 
-from gvz.run.progress import format_duration, stderr_console
+from gvz.run.progress import LEAST_WIDTH, format_duration, stderr_console
 
 DRAW_PERIOD_S = 0.1
-LEAST_WIDTH = 60
-"""columns of a terminal with room for bars and their names"""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -20,6 +20,8 @@ from gvz.tasks import parse_task
 
 PLAIN_PERIOD_S = 10.0
 """seconds between lines when the output is not a terminal"""
+LEAST_WIDTH = 60
+"""columns of a terminal with room for bars and their names, or for all columns of the panel's table"""
 MAX_TASK_ROWS = 24
 """with more tasks than that, the tasks of a level are shown together"""
 
@@ -120,7 +122,7 @@ def plain_line(status: Status) -> str:
 
 
 def panel(status: Status, width: int) -> Group:
-    """The live panel."""
+    """The live panel; on a terminal of fewer than LEAST_WIDTH columns, tasks have their scores alone."""
     head = Text.assemble(
         (f"{status.phase}  ", "bold"),
         "".join(f"{scenario}  " for scenario in _scenarios(status)),
@@ -129,14 +131,15 @@ def panel(status: Status, width: int) -> Group:
     bar = Table.grid()  # puts the bar on a line of its own
     bar.add_row(ProgressBar(total=status.total_updates, completed=status.num_updates, width=min(width, 100)))
     rates = Columns(_figures(status), padding=(0, 3))
-    tasks = Table(box=None, padding=(0, 2))
+    tasks = Table(box=None, padding=(0, 1))
     tasks.add_column("task", overflow="fold")
-    tasks.add_column("episodes", justify="right")
-    tasks.add_column("recent score", justify="right")
-    tasks.add_column("% of bound", justify="right")
+    wide = width >= LEAST_WIDTH
+    for name in ("episodes", "recent score", "% of bound") if wide else ("score",):
+        tasks.add_column(name, justify="right", no_wrap=True)
     for t in _rows(status):
         percent = f"{100 * t.score / t.upper_bound:.1f}" if t.episodes else "-"
-        tasks.add_row(_short_name(t, status), f"{t.episodes:,}", _short_score(t), percent)
+        numbers = (f"{t.episodes:,}", _short_score(t), percent) if wide else (_short_score(t),)
+        tasks.add_row(_short_name(t, status), *numbers)
     num_restarts = int(status.row["actors/restarts"])
     restarts = [Text(f"{num_restarts} actor restarts", style="yellow")] if num_restarts else []
     return Group(head, bar, rates, *restarts, tasks)

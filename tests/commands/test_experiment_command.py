@@ -83,7 +83,7 @@ def test_plan_prints_runs_steps_episodes_and_hours_and_counts_shared_runs_once(r
 def test_jobs_side_by_side_take_as_long_as_the_slot_that_ends_last(results, capsys):
     arguments = ["experiment", "plan", "rainbow_evaluation", "--scenario", "defend_the_center", "--jobs", "1"]
     assert main([*arguments, "--results", str(results)]) == 0
-    assert "1 jobs at once on this machine: at most 24.97 hours" in capsys.readouterr().out
+    assert "1 job at once on this machine: at most 24.97 hours" in capsys.readouterr().out
     for hours, slots, want in (([3.0], 2, 3.0), ([3.0, 3.0, 3.0], 2, 6.0), ([4.0, 1.0, 2.0, 1.0], 2, 4.0)):
         assert _side_by_side(hours, slots) == want
 

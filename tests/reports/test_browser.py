@@ -19,7 +19,13 @@ addEventListener("load", () => {
   const root = document.documentElement;
   const text = Math.min(...[...document.querySelectorAll("p, td, figcaption")].map(e =>
     parseFloat(getComputedStyle(e).fontSize)));
-  const said = {width: innerWidth, overflow: root.scrollWidth - root.clientWidth, images, text};
+  const scrolled = [...document.querySelectorAll(".scroll")].filter(e => e.scrollWidth > e.clientWidth);
+  const names = scrolled.map(box => {
+    box.scrollLeft = box.scrollWidth;
+    const cell = box.querySelector("tbody th").getBoundingClientRect(), frame = box.getBoundingClientRect();
+    return [box.ariaLabel, cell.left - frame.left, cell.width / frame.width];
+  });
+  const said = {width: innerWidth, overflow: root.scrollWidth - root.clientWidth, images, text, names};
   parent.postMessage(JSON.stringify(said), "*");
 });
 </script>
@@ -61,6 +67,10 @@ def test_the_page_is_whole_and_readable(report_of_all, width, tmp_path):
     assert console == ""
     assert said["overflow"] <= 0
     assert said["text"] >= 11  # CSS pixels
+    for caption, left, share in said["names"]:  # of the rows of a table that is too wide, scrolled to its end
+        assert 0 <= left < 2, caption
+        assert share < 0.5, caption
+    assert said["names"] or width > 400
     assert len(said["images"]) == len(list((report_of_all / "figures").glob("*.svg")))
     for caption, own_width, shown_width in said["images"]:
         assert own_width > 0, caption

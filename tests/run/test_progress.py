@@ -5,6 +5,7 @@ import dataclasses
 import io
 import math
 import os
+import re
 import subprocess
 import sys
 import time
@@ -134,3 +135,17 @@ def test_on_a_terminal_the_panel_has_every_number(width):
 
 def test_durations():
     assert [format_duration(s) for s in (None, 0, 61, 3723)] == ["--:--", "00:00", "01:01", "1:02:03"]
+
+
+def test_on_a_narrow_terminal_the_panel_has_whole_names_and_scores():
+    tasks = tuple(
+        TaskStatus(task=task.id, episodes=12, score=1234.0, upper_bound=2100.0)
+        for task in named_tasks("health_gathering", split="train8")
+    )
+    out = io.StringIO()
+    with Progress(Console(file=out, width=40, force_terminal=True, color_system=None)) as progress:
+        progress.show(dataclasses.replace(STATUS, tasks=tasks))
+    text = out.getvalue()
+    assert "…" not in text
+    for task in tasks:
+        assert re.search(rf"{task.task.partition('/')[2]} +1234/2100", text)
