@@ -91,7 +91,7 @@ def test_the_findings_say_what_six_times_the_time_gave_on_four_training_tasks(sc
             assert f"| mean | {called} | {seconds} | {cells} |" in WORDS
     for (name, called), of_agent in longer.items():
         title, short = scenario_named(name).title, scores[name, called]
-        assert len(of_agent.runs) == (3 if called == "8 tasks" else 2)
+        assert len(of_agent.runs) == (3 if called == "8 tasks" or name == "dodge_projectiles" else 2)
         assert f"| {title} | {called} | 900 s | {score_cells(short, name, 'train4')} |" in WORDS
         assert f"| {title} | {called} | 5,400 s | {score_cells(of_agent, name, 'train4')} |" in WORDS
 
@@ -118,10 +118,10 @@ def test_the_findings_say_what_six_times_the_time_gave_on_four_training_tasks(sc
         said = f"`{task}` has {four:.0f} (after 900 seconds {four_short:.0f}, with eight tasks {eight:.0f})"
         assert said in WORDS
     steps = last_updates("general_train4_long/runs/**")
-    without_avx512 = ("health_gathering/*/seed_1111", "[ds]*/*/seed_2222")
+    without_avx512 = ("health_gathering/*/seed_1111", "[ds]*/*/seed_2222", "*/*/seed_3333")
     slow = sorted(one for run in without_avx512 for one in last_updates(f"general_train4_long/runs/*/{run}"))
     assert slow == steps[: len(slow)]
-    assert f"2222; {slow[0]:,} to {steps[-1]:,} gradient steps, 50 episodes a task" in WORDS
+    assert f"3333; {slow[0]:,} to {steps[-1]:,} gradient steps, 50 episodes a task" in WORDS
     assert f"had no AVX-512; they have {slow[0]:,} to {slow[-1]:,} gradient steps." in WORDS
 
 
