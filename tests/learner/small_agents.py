@@ -48,9 +48,9 @@ def batch(seed: int = 0) -> Transitions:
 
 
 @cache
-def jitted(config: ValueConfig):
+def jitted(config: ValueConfig, spec: AgentSpec = SPEC):
     """The agent, and its functions compiled when first called."""
-    agent = make_agent(config, SPEC)
+    agent = make_agent(config, spec)
     return agent, jax.jit(agent.act), jax.jit(agent.evaluate), jax.jit(agent.loss)
 
 

@@ -9,7 +9,8 @@ import pytest
 
 from gvz.core.env_config import SIGHT_CLASSES
 from learner import losses
-from learner.agents.base import OffPolicyAgent, make_agent
+from learner.agents.base import make_agent
+from learner.agents.configs.rainbow import Noisy
 from learner.agents.rainbow import Rainbow
 from learner.config import ValueConfig, change_agent
 from learner.networks import add_noise
@@ -17,6 +18,9 @@ from learner.replay import Transitions
 from tests.learner import reference
 from tests.learner.small_agents import ALL_OFF, RAINBOW, SPEC, A, B, batch, jitted, made_up_params
 
+SIGHT = replace(RAINBOW, sight_weight=0.7, stack_size=2), replace(SPEC, num_sights=len(SIGHT_CLASSES) * 4)
+"""configuration and sizes of an agent that learns what is in sight"""
+SEEN = jnp.asarray(np.random.default_rng(5).integers(0, 2, (B, len(SIGHT_CLASSES) * 4), dtype=np.uint8))
 with_noise = jax.jit(add_noise, static_argnums=2)
 
 
@@ -44,13 +48,18 @@ def test_dqn_loss_is_algorithm_1_with_the_huber_loss_in_float64(task_conditioned
 
 @pytest.mark.isa
 @pytest.mark.parametrize(
-    ("double", "distributional", "dueling"), [(True, True, True), (False, True, False), (True, False, True)]
+    ("double", "distributional", "dueling", "noisy"),
+    [
+        (True, True, True, "factorized"),
+        (False, True, False, "independent"),
+        (True, False, True, "factorized"),
+    ],
 )
 def test_rainbow_loss_is_its_equations_in_float64_with_a_noise_each_for_online_target_and_choice(
-    double: bool, distributional: bool, dueling: bool
+    double: bool, distributional: bool, dueling: bool, noisy: Noisy
 ):
     """A network whose means are the noisy weights, applied without noise, is the noisy network."""
-    config = replace(RAINBOW, double=double, distributional=distributional, dueling=dueling)
+    config = replace(RAINBOW, double=double, distributional=distributional, dueling=dueling, noisy=noisy)
     agent, _, _, loss = jitted(config)
     params, target, b = made_up_params(agent, 0), made_up_params(agent, 1), batch()
     result = loss(params, target, jax.random.key(7), b)
@@ -58,8 +67,7 @@ def test_rainbow_loss_is_its_equations_in_float64_with_a_noise_each_for_online_t
     key_online, key_target, key_selector = jax.random.split(jax.random.key(7), 3)
     atoms = np.linspace(SPEC.v_min, SPEC.v_max, config.num_atoms) if distributional else None
     online, moved_target, chooser = (
-        with_noise(p, key, "factorized")
-        for p, key in ((params, key_online), (target, key_target), (params, key_selector))
+        with_noise(p, key, noisy) for p, key in ((params, key_online), (target, key_target), (params, key_selector))
     )
     logits_tm1, q_tm1 = values(config, online, b.obs_tm1, atoms)
     logits_t, q_t = values(config, moved_target, b.obs_t, atoms)
@@ -148,40 +156,34 @@ def test_quantiles_and_munchausen_are_their_equations_in_float64(num_quantiles: 
 @pytest.mark.isa
 def test_the_loss_of_sight_is_the_cross_entropy_of_logits_on_the_encoders_features():
     """In float64 numpy. It is added to the loss alone: priorities and actions are those of the agent without it."""
-    C = len(SIGHT_CLASSES) * 4
-    agent = make_agent(replace(RAINBOW, sight_weight=0.7), replace(SPEC, num_sights=C))
+    agent, sight_act, _, sight_loss = jitted(*SIGHT)
     _, act, _, plain_loss = jitted(RAINBOW)
-    assert isinstance(agent, OffPolicyAgent)
     params, target = made_up_params(agent, 0), made_up_params(agent, 1)
     plain, plain_target = ({"params": {k: v for k, v in p["params"].items() if k != "sight"}} for p in (params, target))
-    seen = np.random.default_rng(5).integers(0, 2, (B, C), dtype=np.uint8)
-    key, b = jax.random.key(3), replace(batch(), sight_tm1=jnp.asarray(seen))
-    found, without = jax.jit(agent.loss)(params, target, key, b), plain_loss(plain, plain_target, key, batch())
+    key, b = jax.random.key(3), replace(batch(), sight_tm1=SEEN)
+    found, without = sight_loss(params, target, key, b), plain_loss(plain, plain_target, key, batch())
 
     conv, head = ({k: np.asarray(w, np.float64) for k, w in params["params"][n].items()} for n in ("conv_0", "sight"))
     x = reference.convolve(np.asarray(b.obs_tm1.frames, np.float64) / 255, conv["kernel"], conv["bias"], 2)
     x = np.maximum(x, 0).reshape(B, -1)
     x = (x - x.mean(1, keepdims=True)) / np.sqrt(x.var(1, keepdims=True) + 1e-6)
     p = 1 / (1 + np.exp(-(x @ head["kernel"] + head["bias"])))
-    nats = -np.where(seen, np.log(p), np.log(1 - p)).reshape(B, len(SIGHT_CLASSES), 4).mean(axis=2).sum(axis=1)
+    nats = -np.where(SEEN, np.log(p), np.log(1 - p)).reshape(B, len(SIGHT_CLASSES), 4).mean(axis=2).sum(axis=1)
     np.testing.assert_allclose(found.loss, without.loss + 0.7 * nats, rtol=1e-4, atol=1e-5)
     for name in ("priority", "q_tm1", "td_error"):
         np.testing.assert_allclose(getattr(found, name), getattr(without, name), rtol=1e-4, atol=1e-5)
-    acted = [f(p, key, b.obs_tm1, jnp.float32(0)) for f, p in ((jax.jit(agent.act), params), (act, plain))]
+    acted = [f(p, key, b.obs_tm1, jnp.float32(0)) for f, p in ((sight_act, params), (act, plain))]
     jax.tree.map(np.testing.assert_array_equal, *acted)
 
 
 def test_augmentations_of_sight_change_the_frames_of_the_loss_of_sight_alone():
     """Each sample's loss of sight is that of its clean or of its inverted frames; values and priorities stay."""
-    C = len(SIGHT_CLASSES) * 4
-    clean_config = replace(RAINBOW, sight_weight=0.7, stack_size=2)
-    config = replace(clean_config, sight_augmentations=("inversion",), augmentation_clean_share=0.0)
-    agent, clean_agent = (Rainbow(config=c, spec=replace(SPEC, num_sights=C)) for c in (config, clean_config))
+    config, spec = SIGHT
+    agent = Rainbow(replace(config, sight_augmentations=("inversion",), augmentation_clean_share=0.0), spec)
     params, target = made_up_params(agent, 0), made_up_params(agent, 1)
-    seen = np.random.default_rng(5).integers(0, 2, (B, C), dtype=np.uint8)
-    b = replace(batch(), sight_tm1=jnp.asarray(seen))
+    b = replace(batch(), sight_tm1=SEEN)
     inverted = replace(b, obs_tm1=replace(b.obs_tm1, frames=255 - b.obs_tm1.frames))
-    augmented_loss, clean_loss, key = jax.jit(agent.loss), jax.jit(clean_agent.loss), jax.random.key(3)
+    augmented_loss, clean_loss, key = jax.jit(agent.loss), jitted(*SIGHT)[3], jax.random.key(3)
     found, clean = augmented_loss(params, target, key, b), clean_loss(params, target, key, b)
     for name in ("priority", "q_tm1", "td_error"):
         np.testing.assert_allclose(getattr(found, name), getattr(clean, name), rtol=1e-5, atol=1e-6)
@@ -190,7 +192,7 @@ def test_augmentations_of_sight_change_the_frames_of_the_loss_of_sight_alone():
     logits, inverted_logits = (agent.outputs_and_sight(params, x.obs_tm1)[1] for x in (b, inverted))
     assert logits is not None
     assert inverted_logits is not None
-    sight, inverted_sight = (losses.sight(x, jnp.asarray(seen), len(SIGHT_CLASSES)) for x in (logits, inverted_logits))
+    sight, inverted_sight = (losses.sight(x, SEEN, len(SIGHT_CLASSES)) for x in (logits, inverted_logits))
     wanted = 0.7 * np.asarray(inverted_sight - sight)
     is_inverted = np.isclose(change, wanted, rtol=1e-3, atol=1e-5)
     assert (is_inverted | np.isclose(change, 0, atol=1e-5)).all()
@@ -202,9 +204,10 @@ def test_augmentations_of_sight_change_the_frames_of_the_loss_of_sight_alone():
 
 
 def test_gradient_of_the_whole_rainbow_loss_equals_finite_differences():
-    """Through noise, dueling streams and convolutions, along random directions; a rectifier's kink is rarely met."""
-    agent, _, _, loss = jitted(RAINBOW)
-    params, target, b = made_up_params(agent, 0), made_up_params(agent, 1), batch()
+    """Through noise, both streams, sight and convolutions, along random directions; a rectifier's kink is rare."""
+    agent, _, _, loss = jitted(*SIGHT)
+    params, target = made_up_params(agent, 0), made_up_params(agent, 1)
+    b = replace(batch(), sight_tm1=SEEN)
 
     def mean_loss(params):
         return loss(params, target, jax.random.key(3), b).loss.mean()

@@ -98,10 +98,13 @@ def test_no_gradient_reaches_the_target_parameters(agent_name: str):
 
 
 def test_rainbow_with_every_part_off_is_dqn_to_the_last_bit():
-    for config in (ALL_OFF, replace(ALL_OFF, task_conditioned=True)):
+    for config, masked in ((ALL_OFF, False), (replace(ALL_OFF, task_conditioned=True), True)):
         rainbow, dqn = jitted(config), jitted(change_agent(config, "dqn"))
         assert jax.eval_shape(rainbow[0].init, jax.random.key(0)) == jax.eval_shape(dqn[0].init, jax.random.key(0))
         params, target, b = made_up_params(dqn[0], 0), made_up_params(dqn[0], 1), batch()
+        if masked:
+            best = np.asarray(dqn[2](target, b.obs_t).action)
+            b = replace(b, obs_t=replace(b.obs_t, mask=jnp.asarray(best[:, None] != np.arange(A))))
         for epsilon in (0.0, 0.5):
             args = (params, jax.random.key(5), b.obs_t, jnp.float32(epsilon))
             np.testing.assert_array_equal(rainbow[1](*args)[0], dqn[1](*args)[0])
@@ -198,8 +201,8 @@ def test_distribution_masses_sum_to_one_and_their_mean_is_q():
 
 def test_a_fresh_agent_gives_every_state_and_action_the_initial_value(agent_name: str):
     """2.5 is far from the middle of the atoms, 0.5. That the default is 0 is a part of the agents' contract."""
-    flat = [replace(RAINBOW, dueling=False)] if agent_name == "rainbow" else []
-    for config in (plain_config(agent_name), *flat):
+    more = [replace(RAINBOW, dueling=False), replace(RAINBOW, num_quantiles=5)] if agent_name == "rainbow" else []
+    for config in (plain_config(agent_name), *more):
         agent, _, evaluate, _ = jitted(replace(config, initial_value=2.5))
         fresh = evaluate(jax.jit(agent.init)(jax.random.key(1)), batch().obs_t)
         np.testing.assert_allclose(fresh.q_values, 2.5, atol=2e-6)

@@ -1,5 +1,6 @@
 """The Q-network: sizes against the thesis, noise against its definition, dueling against eq. 4.10."""
 
+import itertools
 from dataclasses import replace
 from functools import cache
 
@@ -96,14 +97,17 @@ def test_without_task_conditioning_the_task_is_ignored():
     np.testing.assert_array_equal(apply(params, of_task(obs, 0)), apply(params, of_task(obs, 1)))
 
 
-def test_weights_start_he_uniform_and_biases_zero_below_the_output():
-    params = jax.jit(Rainbow(FLAT, spec((84, 84, 12), 1)).init)(jax.random.key(0))
+def test_weights_start_he_uniform_and_biases_zero_below_the_output_and_all_sigmas_as_configured():
+    config = replace(FLAT, noisy="factorized", noisy_sigma=0.25)
+    params = jax.jit(Rainbow(config, spec((84, 84, 12), 1)).init)(jax.random.key(0))
     for name, fan_in in (("conv_0", 768), ("conv_1", 512), ("conv_2", 576), ("q_hidden", 3136)):
         kernel, bound = np.asarray(params["params"][name]["kernel"]), np.sqrt(6 / fan_in)
         assert np.abs(kernel).max() <= bound
         assert abs(kernel.std() / (bound / np.sqrt(3)) - 1) < 0.03, name
         assert not np.any(params["params"][name]["bias"])
     assert not np.any(params["params"]["q_output"]["kernel"])
+    for layer, name in itertools.product(("q_hidden", "q_output"), ("kernel_sigma", "bias_sigma")):
+        assert (np.asarray(params["params"][layer][name]) == 0.25).all()
 
 
 @pytest.mark.parametrize(
