@@ -186,7 +186,7 @@ def test_cutout_fills_one_rectangle_with_one_colour(strength: float):
     frames = np.tile(stacks(1, 3), (400, 1, 1, 1))
     cut = apply("cutout", frames, 3, strength)
     changed = (cut != frames.reshape(cut.shape)).any((3, 4))
-    sides, places = [], np.zeros((H, W))
+    sides, colours, places = [], [], np.zeros((H, W))
     for sample, mask in zip(cut, changed, strict=True):
         if not mask.any():
             continue
@@ -194,9 +194,12 @@ def test_cutout_fills_one_rectangle_with_one_colour(strength: float):
         inside = sample[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         assert (inside == inside[0, 0, 0]).all()
         sides.append((len(rows) / H, len(columns) / W))
+        colours.append(inside[0, 0, 0])
         places += mask
     assert np.max(sides) <= strength / 2
     assert np.min(np.max(sides, axis=0)) > 0.8 * strength / 2
+    assert abs(np.corrcoef(*np.transpose(sides))[0, 1]) < 0.3, "a side says nothing of the other"
+    assert np.abs(np.corrcoef(np.transpose(colours)) - np.eye(3)).max() < 0.3, "colours are drawn for every sample"
     assert strength < 1 or places.min() > 0, "some pixel is never covered"
 
 

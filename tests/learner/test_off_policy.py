@@ -52,6 +52,15 @@ def test_scores_of_episodes_weigh_the_losses_of_tasks_also_after_a_resume(tmp_pa
         np.testing.assert_allclose(found["learner/loss"], easy + 2 * hard, rtol=1e-4)
 
 
+def test_metrics_say_how_full_the_replay_is_and_of_which_tasks_its_records_are(tmp_path: Path):
+    learner, stored = parts_of(1).make(jax.random.key(5), TASKS, tmp_path), records(60)
+    learner.add([step_block(stored)], 0)
+    found = learner.take_metrics()
+    assert found["replay/fill_share"] == 60 / (4 * 40)
+    shares = [sum(record.task == i for record in stored) / 60 for i in range(len(TASKS))]
+    np.testing.assert_allclose([found[f"replay/share/{task}"] for task in TASKS], shares, rtol=1e-6)
+
+
 def test_warm_up_is_by_chance_and_the_agents_epsilon_begins_at_its_end(tmp_path: Path):
     learner = make_learner(tmp_path, warmup_steps=200)
     assert [learner.epsilon(env_steps) for env_steps in (0, 199, 200, 300)] == [1.0, 1.0, 0.5, 0.4]

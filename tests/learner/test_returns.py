@@ -90,6 +90,9 @@ def test_no_gradient_flows_into_targets_and_advantages():
     ends = (b["terminated"], b["truncated"], 0.9, 0.65)
     assert not jax.grad(lambda v: returns.lambda_returns(b["r_t"], v, *ends).sum())(b["v_t"]).any()
     assert not jax.grad(lambda v: returns.generalized_advantages(b["r_t"], v, v, *ends)[0].sum())(b["v_t"]).any()
+    one, constants = jnp.ones(1), (jnp.zeros(1), jnp.full(1, -3.0))
+    for loss in (returns.value_loss, returns.clipped_surrogate_loss):
+        assert not np.any(jax.grad(lambda x, loss=loss: loss(one, *x, 0.5).sum())(constants))
 
 
 # --- generalized advantages ---------------------------------------------------------------------------------------

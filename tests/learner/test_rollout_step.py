@@ -6,6 +6,7 @@ The agents are the real ones with a linear network, whose numbers are worked out
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -219,6 +220,20 @@ def test_updates_are_those_of_the_equations_in_float64(name: str, loss, tmp_path
         np.testing.assert_allclose(metrics[key], value, rtol=1e-3, atol=1e-5, err_msg=key)
     assert metrics.keys() - wanted.keys() == set(state.metrics.agent)
     assert float(state.metrics.loss) == 0.0
+
+
+@pytest.mark.parametrize("name", ["adam", "radam"])
+def test_both_optimizers_divide_by_their_epsilon_too(name: Literal["adam", "radam"]):
+    """Where all gradients are 1, both moments are 1, and an epsilon of 1 halves a step: of RAdam from the sixth on."""
+    steps = []
+    for eps in (1e-16, 1.0):
+        adam = rollout_step.optimizer(replace(CONFIG, optimizer=name, adam_eps=eps, max_grad_norm=None))
+        step = one = jnp.ones(())
+        state = adam.init(one)
+        for _ in range(6):
+            step, state = adam.update(one, state)
+        steps.append(step)
+    np.testing.assert_allclose(steps[1], steps[0] / 2, rtol=1e-4)
 
 
 def test_settings_of_ppos_loss_are_those_of_its_configuration(tmp_path: Path):
