@@ -1,5 +1,6 @@
 """The defaults are the thesis's tables, and every ready configuration is Rainbow less what its name says."""
 
+import json
 import re
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -8,7 +9,7 @@ import pytest
 
 from gvz.core.errors import ConfigError
 from gvz.run.config import RunConfig
-from gvz.run.config_files import configs_directory, load_config
+from gvz.run.config_files import config_to_dict, configs_directory, load_config
 from gvz.run.curriculum_config import CurriculumConfig
 from learner.agents.configs.ppo import PPOConfig
 from learner.agents.configs.pqn import PQNConfig
@@ -16,6 +17,7 @@ from learner.agents.configs.rainbow import RainbowConfig
 from learner.config import LearnerConfig, OnPolicyConfig, ReplayConfig
 
 PAGE = (Path(__file__).parents[2] / "docs" / "AGENTS.md").read_text()
+RESULTS = Path(__file__).parents[2] / "results"
 
 
 def settings(config: RunConfig) -> dict[str, object]:
@@ -96,6 +98,31 @@ def test_parts_beyond_the_thesis_are_off_in_its_configurations(name: str):
     on = {flag: value for flag, value in values.items() if value}
     assert on == {"agent.encoder": "nature", "learner.adam_eps": 1e-7} | without_effect
     assert config.env.frames == "screen"
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        "rainbow_quick/*",
+        "rainbow_4task/*",
+        "rainbow_all",
+        "general/**",
+        "general_gpu/**",
+        "general_on_policy/**",
+        "gates/runs/p*_quick+plain/**",
+    ],
+)
+def test_a_configuration_has_the_settings_of_its_published_runs(pattern: str):
+    """But for the number of gradient steps: processor time ends these runs. Variants of an experiment have a plus."""
+    saved = [json.loads(file.read_text())["config"] for file in RESULTS.glob(f"{pattern}/config.json")]
+    plain = [run for run in saved if "+" not in run["name"].removesuffix("+plain")]
+    assert plain
+    for run in plain:
+        task = (run["tasks"] or [run["scenario"]])[0]
+        config = config_to_dict(load_config(run["name"].removesuffix("+plain"), task.partition("/")[0]))["config"]
+        for part in ("env", "agent", "replay", "learner"):
+            now = json.loads(json.dumps(config[part])) or {}
+            assert now | (run[part] or {}) | {"total_updates": 0} == now | {"total_updates": 0}, run["name"]
 
 
 def test_the_page_says_what_each_configuration_has_of_the_recipe():
