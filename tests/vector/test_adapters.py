@@ -187,6 +187,7 @@ def test_tianshou_has_the_answers_in_the_order_of_its_games_and_the_newest_frame
 def test_tianshou_seeds_its_games_and_is_told_that_an_episode_ended_because_its_engine_died():
     envs = TianshouVectorEnv(gvz.make_vec("seek_and_kill/default", 2, batch_size=1, autoreset_mode="Disabled"))
     first, infos = envs.reset(seed=7)
+    assert [space.contains(stack) for space, stack in zip(envs.observation_space, first, strict=True)] == [True, True]
     assert [info["env_id"] for info in infos] == [0, 1]
     assert (envs.reset(seed=7)[0] == first).all()
     seeds = envs.seed(7)

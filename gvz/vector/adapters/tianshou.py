@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 
 from gvz.core.errors import ConfigError
 from gvz.vector.arguments import game_numbers
@@ -45,6 +46,7 @@ class TianshouVectorEnv:
             raise ConfigError("TianshouVectorEnv: got envs with buffers, want none: it stacks the frames of the screen")
         self.envs, self.env_num = envs, envs.num_envs
         self.action_space = [envs.single_action_space] * envs.num_envs
+        self.observation_space = [batch_space(envs.single_observation_space, num_stack)] * envs.num_envs
         self._stacks = np.zeros((envs.num_envs, num_stack, *shape), np.uint8)
 
     def __len__(self) -> int:
