@@ -76,7 +76,7 @@ def greeted(tmp_path) -> Dispatcher:
         result=answers.get,
         put=lambda params: params.tolist(),
     )
-    pool, cluster = config(tmp_path, {}), ClusterConfig(address="h:1", hosts=1, publish_period_s=30.0)
+    pool, cluster = config(tmp_path, {}), ClusterConfig(address="h:1", hosts=1, publish_period_s=3000.0)
     return Dispatcher(backend, [SupervisedHost(0, pool, lanes_to_begin_with(pool, None), cluster)], cluster, ours)
 
 
@@ -95,15 +95,15 @@ def test_other_source_files_are_refused_before_the_run_alone(greeted):
 def test_the_newest_parameters_go_out_once_a_period_and_age_from_their_publication(greeted):
     greeted._hosts[0].incarnation = SimpleNamespace(playing_s=0.0)
     sent = []
-    for version, waited_s in ((1, 0.0), (2, 0.0), (3, 31.0), (4, 29.0)):
+    for version, waited_s in ((1, 0.0), (2, 0.0), (3, 3100.0), (4, 2900.0)):
         greeted._sent_s -= waited_s
         greeted.publish([version], ParamsHeader(version=version, num_updates=0, layout_hash=0))
         greeted._put_params()
         sent.append(greeted._sent[0])
     assert sent == [[1], [1], [3], [3]]
-    greeted._published_s = {version: time.monotonic() - 10.0 * (5 - version) for version in (3, 4)}
+    greeted._published_s = {version: time.monotonic() - 1000.0 * (5 - version) for version in (3, 4)}
     batch: Any = SimpleNamespace(block=SimpleNamespace(steps={"params_version": np.array([1, 3, 4, 4])}))
-    assert greeted._params_age_s(batch) == pytest.approx((20 + 20 + 10 + 10) / 4, abs=1.0), "1 is as old as 3, or older"
+    assert greeted._params_age_s(batch) == pytest.approx(1500, abs=100), "1 is as old as 3, or older"
 
 
 def test_a_head_that_hangs_is_waited_for_once_and_only_for_a_while(monkeypatch):

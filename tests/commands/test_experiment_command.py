@@ -179,7 +179,7 @@ def test_rates_are_of_the_newest_runs_by_their_last_start_and_of_what_their_own_
         write_rows(run / "starts.jsonl", [{"cpu": "first", "cores": CORES}, {"cpu": cpu, "cores": CORES}])
         write_rows(run / "metrics.jsonl", [{"num_updates": 1, "learner/updates_per_s": rate}] * 9)
         write_rows(run / "evaluation.jsonl", [{"length_steps": 9000}])  # by hand: no log says how long it took
-        os.utime(run, (0, -age))
+        os.utime(run, (0, 100 - age))
     assert read_rates(results, "rainbow_4task", 1, CORES) == Rates(updates_per_s=8.0, evaluation_steps_per_s=1000.0)
 
 
