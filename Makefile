@@ -38,8 +38,8 @@ install-cuda: install ## add JAX for NVIDIA GPUs
 train: install   ## run the main job (ARGS="--learner.total-updates 5000 ...")
 	$(BIN)/python -m gvz.launch --config rainbow_4task.py $(ARGS)
 
-test: install    ## all tests but the slow lane, in two processes (14 to 28 minutes on 2 cores)
-	$(BIN)/python -m pytest -m "not slow and not browser" -n 2 --dist loadfile $(ARGS)
+test: install    ## all tests but the slow lane, in three processes (14 to 28 minutes on 2 cores)
+	$(BIN)/python -m pytest -m "not slow and not browser" -n 3 --dist loadfile $(ARGS)
 
 test-fast: install ## unit tests that start no engine
 	$(BIN)/python -m pytest -m "not slow and not engine and not e2e and not browser" -n 2 --dist loadfile $(ARGS)
