@@ -91,7 +91,7 @@ def test_the_findings_say_what_six_times_the_time_gave_on_four_training_tasks(sc
             assert f"| mean | {called} | {seconds} | {cells} |" in WORDS
     for (name, called), of_agent in longer.items():
         title, short = scenario_named(name).title, scores[name, called]
-        assert len(of_agent.runs) == (3 if called == "8 tasks" or name == "dodge_projectiles" else 2)
+        assert len(of_agent.runs) == 3
         assert f"| {title} | {called} | 900 s | {score_cells(short, name, 'train4')} |" in WORDS
         assert f"| {title} | {called} | 5,400 s | {score_cells(of_agent, name, 'train4')} |" in WORDS
 
